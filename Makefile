@@ -1,0 +1,65 @@
+# Everything runs from one environment, .venv, made from scratch when PYTHON changes version
+# and brought up to date when pyproject.toml or constraints.txt change.
+
+PYTHON ?= python3
+PYTHONS ?= python3.11 python3.13
+
+BIN := .venv/bin
+INSTALL := -m pip install --quiet --quiet --disable-pip-version-check
+VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
+CREATED := .venv/.python$(VERSION)
+
+.PHONY: help demo test bench constraints clean
+.NOTPARALLEL:
+
+help:  ## Show this list
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' Makefile | expand -t 14
+
+demo: .venv/.demo  ## Run the demonstration and write its report to out/
+	$(BIN)/heliograph demo --out out
+
+test: .venv/.test  ## Lint, check types and run the tests
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy --strict src
+	$(BIN)/pytest -n 2
+
+bench: .venv/.test  ## Run the benchmarks
+	$(BIN)/python benchmarks/run.py
+
+clean:  ## Remove the environment and everything made by the other targets
+	rm -rf .venv out build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find src tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+
+$(CREATED):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+	  { echo "heliograph needs Python 3.11 or newer and '$(PYTHON)' is not: try make PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -m venv --clear .venv >/dev/null 2>&1 || \
+	  { echo "'$(PYTHON) -m venv .venv' failed: install venv and pip for it (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
+	@touch $@
+
+.venv/.demo: $(CREATED) pyproject.toml constraints.txt
+	@echo "Installing heliograph into .venv (the first time: a minute or so) ..."
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings]'
+	@touch $@
+
+.venv/.test: $(CREATED) pyproject.toml constraints.txt
+	@echo "Installing heliograph and its tools into .venv (the first time: a minute or two) ..."
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
+	@touch .venv/.demo $@
+
+# The newest of everything on the oldest and on a newer Python. jax, numpy, scipy and zarr have left 3.11 behind,
+# so 3.11 has versions of its own and every later Python shares the others.
+constraints:  ## Pin the newest versions in constraints.txt (needs Python 3.11 and 3.13)
+	@set -e; work=$$(mktemp -d); trap 'rm -rf "$$work"' EXIT; export LC_ALL=C; \
+	for python in $(PYTHONS); do \
+	  "$$python" -m venv "$$work/venv" --clear; \
+	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all]'; \
+	  "$$work/venv/bin/python" -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[^ ]+$$' \
+	    | sort > "$$work/$$(echo "$$python" | tr / _).txt"; \
+	done; \
+	set -- $(subst /,_,$(PYTHONS)); old="$$work/$$1.txt"; new="$$work/$$2.txt"; \
+	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all] resolves to.'; \
+	  { comm -12 "$$old" "$$new"; \
+	    comm -23 "$$old" "$$new" | sed 's/$$/; python_version < "3.12"/'; \
+	    comm -13 "$$old" "$$new" | sed 's/$$/; python_version >= "3.12"/'; } | sort -f; } > constraints.txt

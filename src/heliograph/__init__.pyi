@@ -1,0 +1,85 @@
+"""Public names, in the order data flows. The package loads them when first used; this list is the only one."""
+
+from .over_time import (
+    OverTime as OverTime,
+    over_time as over_time,
+)
+from .random_affine import (
+    AbstractRandomAffine as AbstractRandomAffine,
+    Constant as Constant,
+    Discrete as Discrete,
+    FiniteSupport as FiniteSupport,
+    GainAndNoise as GainAndNoise,
+    Gaussian as Gaussian,
+    GivenMoments as GivenMoments,
+    Lift as Lift,
+    LogNormal as LogNormal,
+    Mixture as Mixture,
+    Nakagami as Nakagami,
+    Rayleigh as Rayleigh,
+    Rician as Rician,
+    Series as Series,
+    Stack as Stack,
+    bernoulli as bernoulli,
+    known as known,
+    second_order as second_order,
+    square as square,
+)
+from .plant import (
+    LinearPlant as LinearPlant,
+    Plant as Plant,
+)
+from .sensor import (
+    LinearSensor as LinearSensor,
+    Sensor as Sensor,
+)
+from .channel import (
+    amplify_and_forward as amplify_and_forward,
+    dropout as dropout,
+    hop as hop,
+    mean_gain as mean_gain,
+    parallel as parallel,
+    perfect as perfect,
+    silent as silent,
+    with_direct_link as with_direct_link,
+)
+from .filter.base import (
+    AbstractFilter as AbstractFilter,
+    Estimate as Estimate,
+)
+from .filter.update import (
+    Polytope as Polytope,
+    Scalars as Scalars,
+    ZeroMean as ZeroMean,
+)
+from .filter.gaussian import (
+    cubature_filter as cubature_filter,
+    extended_filter as extended_filter,
+    mean_gain_filter as mean_gain_filter,
+)
+from .filter.linear import (
+    linear_filter as linear_filter,
+    open_loop_filter as open_loop_filter,
+)
+from .network import (
+    Network as Network,
+    Node as Node,
+)
+from .simulate import (
+    monte_carlo as monte_carlo,
+    run as run,
+)
+from .stream import (
+    Stream as Stream,
+)
+from .record import (
+    Record as Record,
+    Trajectories as Trajectories,
+)
+from .consistency import (
+    ErrorStatistics as ErrorStatistics,
+    Statistics as Statistics,
+    error_statistics as error_statistics,
+)
+
+__version__: str
