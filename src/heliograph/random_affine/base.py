@@ -1,0 +1,92 @@
+"""What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.random_affine.monomials import exponents, monomials
+
+
+class Moments(eqx.Module):
+    """Joint moments of (G, n) of one order: the matrix E[Sym^k(H)].
+
+    It takes the monomials of (y, 1) of degree k to the conditional expectations of those of (z, 1),
+    E[mono_k(z) | y] = matrix mono_k(y). A map in series is the product of the matrices.
+
+    Shapes: matrix (C(outputs + k, k), C(inputs + k, k)).
+    """
+
+    matrix: np.ndarray
+    outputs: int = eqx.field(static=True)
+    inputs: int = eqx.field(static=True)
+    order: int = eqx.field(static=True)
+
+    @property
+    def mean(self) -> np.ndarray:
+        """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
+        rows = [i for i, powers in enumerate(exponents(self.outputs + 1, self.order)) if powers[-1] >= self.order - 1]
+        columns = [i for i, powers in enumerate(exponents(self.inputs + 1, self.order)) if powers[-1] >= self.order - 1]
+        return self.matrix[np.ix_(rows, columns)]
+
+    def expect(self, y_moments: Any) -> Any:
+        """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
+        return self.matrix @ y_moments
+
+
+class AbstractRandomAffine(eqx.Module):
+    """A random affine map z = G y + n, drawn anew and independently at each step.
+
+    Laws: `sample` and `moments` describe one distribution (heliograph.testing.check_random_affine compares them);
+    (G, n) are independent of y and over time, but not of each other: a shared hop makes them dependent.
+    """
+
+    @property
+    def outputs(self) -> int:
+        """Length of z."""
+        raise NotImplementedError
+
+    @property
+    def inputs(self) -> int:
+        """Length of y."""
+        raise NotImplementedError
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw H of shape (outputs + 1, inputs + 1)."""
+        raise NotImplementedError
+
+    def moments(self, order: int) -> Moments:
+        """Return the nominal E[Sym^order(H)].
+
+        Raises:
+            ValueError: the matrix would need more than the stated memory.
+        """
+        raise NotImplementedError
+
+    def extremes(self) -> tuple["AbstractRandomAffine", ...]:
+        """The maps at the corners of what is possible where probabilities are uncertain; itself when known."""
+        return (self,)
+
+    def corner_count(self) -> int:
+        """Number of maps that `extremes` lists."""
+        return len(self.extremes())
+
+    def mean_gain(self) -> "AbstractRandomAffine":
+        """The map that trusts each mean gain as the truth; noises stay."""
+        raise NotImplementedError
+
+    def example_input(self, generator: np.random.Generator) -> np.ndarray:
+        """A point at which moments can be compared with samples (a lifted map takes only lifted points)."""
+        return generator.normal(size=self.inputs)
+
+
+def apply(h: jax.Array, y: jax.Array) -> jax.Array:
+    """z = G y + n for a drawn H."""
+    return h[:-1, :-1] @ y + h[:-1, -1]
+
+
+def conditional_moments(channel: AbstractRandomAffine, y: np.ndarray, order: int) -> np.ndarray:
+    """E[mono_order(z) | y] for a given point y."""
+    result: np.ndarray = channel.moments(order).expect(monomials(np.asarray(y, dtype=np.float64), order))
+    return result

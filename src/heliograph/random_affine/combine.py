@@ -1,0 +1,271 @@
+"""Maps made of maps: in series, mixed, stacked, and lifted to monomials."""
+
+from collections.abc import Sequence
+from functools import reduce
+from itertools import product
+from math import prod
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.check import fail
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.monomials import (
+    count,
+    exponents,
+    monomials,
+    multiply,
+    position,
+    refuse_if_too_large,
+    symmetric_power,
+)
+from heliograph.random_affine.noise import Gaussian
+
+
+class Series(AbstractRandomAffine):
+    """One map after another, independent: z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k]."""
+
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        self.maps = tuple(maps)
+        if not self.maps:
+            raise fail("series", "at least one map", "none")
+        for first, second in zip(self.maps, self.maps[1:], strict=False):
+            if first.outputs != second.inputs:
+                raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the last map."""
+        return self.maps[-1].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the first map."""
+        return self.maps[0].inputs
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw each map and multiply."""
+        keys = jax.random.split(key, len(self.maps))
+        return reduce(lambda h, pair: pair[0].sample(pair[1]) @ h, zip(self.maps[1:], keys[1:], strict=True),
+                      self.maps[0].sample(keys[0]))  # fmt: skip
+
+    def moments(self, order: int) -> Moments:
+        """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        matrix = reduce(lambda done, part: part.moments(order).matrix @ done, self.maps[1:],
+                        self.maps[0].moments(order).matrix)  # fmt: skip
+        return Moments(matrix, self.outputs, self.inputs, order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """All combinations of the parts' extremes: moments are linear in the law of each part."""
+        return tuple(Series(parts) for parts in product(*(m.extremes() for m in self.maps)))
+
+    def corner_count(self) -> int:
+        """Product of the parts' counts."""
+        return prod(m.corner_count() for m in self.maps)
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Each part with its mean gain."""
+        return Series([m.mean_gain() for m in self.maps])
+
+
+class Mixture(AbstractRandomAffine):
+    """One of several maps, chosen at random at each step; moments are linear in the (possibly uncertain) weights."""
+
+    maps: tuple[AbstractRandomAffine, ...]
+    choice: Discrete
+
+    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: Any, radius: Any = 0.0):
+        self.maps = tuple(maps)
+        self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
+        if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
+            raise fail("mixture", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw which map, and the map."""
+        choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
+        drawn = jnp.stack([m.sample(k) for m, k in zip(self.maps, keys, strict=True)])
+        return drawn[self.choice.sample(choice_key).astype(int)]
+
+    def moments(self, order: int) -> Moments:
+        """sum_i p_i E[Sym^k(H_i)]."""
+        parts = [m.moments(order).matrix for m in self.maps]
+        return Moments(np.tensordot(self.choice.probabilities, parts, axes=1), self.outputs, self.inputs, order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Extreme weights combined with the extremes of each map."""
+        corners = [law for law in self.choice.extremes() if isinstance(law, Discrete)]
+        return tuple(
+            Mixture(parts, law.probabilities)
+            for law in corners
+            for parts in product(*(m.extremes() for m in self.maps))
+        )
+
+    def corner_count(self) -> int:
+        """Extreme weights times the product of the maps' counts."""
+        return len(self.choice.extremes()) * prod(m.corner_count() for m in self.maps)
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
+        moments = self.moments(2)
+        mean = moments.mean
+        n, last = self.outputs, count(self.inputs + 1, 2) - 1
+        second = np.zeros((n, n))
+        for powers, row in position(n + 1, 2).items():
+            used = [i for i in range(n) for _ in range(powers[i])]
+            if len(used) == 2:
+                second[used[0], used[1]] = second[used[1], used[0]] = moments.matrix[row, last]
+        offset = mean[:-1, -1]
+        return GainAndNoise(Constant(1.0), mean[:-1, :-1], Gaussian(second - np.outer(offset, offset), offset))
+
+
+class Stack(AbstractRandomAffine):
+    """Independent maps that hear the same y, their outputs one above the other; moments are products of polynomials."""
+
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def __init__(self, maps: Sequence[AbstractRandomAffine]):
+        self.maps = tuple(maps)
+        if len({m.inputs for m in self.maps}) != 1:
+            raise fail("stack", "at least one map, all of one number of inputs", [m.inputs for m in self.maps])
+
+    @property
+    def outputs(self) -> int:
+        """Sum of the maps' outputs."""
+        return sum(m.outputs for m in self.maps)
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw each map and stack the rows."""
+        keys = jax.random.split(key, len(self.maps))
+        rows = [m.sample(k)[:-1] for m, k in zip(self.maps, keys, strict=True)]
+        return jnp.concatenate([*rows, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
+
+    def moments(self, order: int) -> Moments:
+        """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
+        refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
+        tables = [[m.moments(k).matrix if k else None for k in range(order + 1)] for m in self.maps]
+        rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
+        return Moments(np.array(rows), self.outputs, self.inputs, order)
+
+    def _row(self, powers: tuple[int, ...], tables: list[list[np.ndarray | None]]) -> np.ndarray:
+        variables, start = self.inputs + 1, 0
+        result, degree = np.ones(1), 0
+        for m, table in zip(self.maps, tables, strict=True):
+            a = powers[start : start + m.outputs]
+            start += m.outputs
+            k = sum(a)
+            part = table[k]
+            if part is not None:
+                polynomial = part[position(m.outputs + 1, k)[(*a, 0)]]
+                result, degree = multiply(result, degree, polynomial, k, variables), degree + k
+        constant = np.zeros(count(variables, powers[-1]))
+        constant[-1] = 1.0  # 1^(order - |a|)
+        return multiply(result, degree, constant, powers[-1], variables)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """All combinations of the parts' extremes."""
+        return tuple(Stack(parts) for parts in product(*(m.extremes() for m in self.maps)))
+
+    def corner_count(self) -> int:
+        """Product of the parts' counts."""
+        return prod(m.corner_count() for m in self.maps)
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Each part with its mean gain."""
+        return Stack([m.mean_gain() for m in self.maps])
+
+
+class Lift(AbstractRandomAffine):
+    """The map between monomials: from those of y up to `degree` to those of z; degree 2 is the square.
+
+    Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of
+    moments is one of several with the same value at every lifted point; the one given divides by the repetitions.
+    """
+
+    base: AbstractRandomAffine
+    degree: int = eqx.field(static=True)
+
+    def __init__(self, base: AbstractRandomAffine, degree: int):
+        if degree < 1:
+            raise fail("lift", "a degree of at least 1", degree)
+        self.base, self.degree = base, degree
+
+    @property
+    def outputs(self) -> int:
+        """Monomials of z of degree 1 to `degree`."""
+        return count(self.base.outputs + 1, self.degree) - 1
+
+    @property
+    def inputs(self) -> int:
+        """Monomials of y of degree 1 to `degree`."""
+        return count(self.base.inputs + 1, self.degree) - 1
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw Sym^degree(H)."""
+        return jnp.asarray(symmetric_power(self.base.sample(key), self.degree))
+
+    def moments(self, order: int) -> Moments:
+        """Rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
+        inner = self.base.moments(order * self.degree).matrix
+        rows = _products(self.base.outputs + 1, self.degree, order)
+        columns = _products(self.base.inputs + 1, self.degree, order)
+        refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
+        repetitions = np.bincount(columns)
+        return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Lifts of the base map's extremes."""
+        return tuple(Lift(m, self.degree) for m in self.base.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the base map."""
+        return self.base.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Lift of the base map with its mean gain."""
+        return Lift(self.base.mean_gain(), self.degree)
+
+    def example_input(self, generator: np.random.Generator) -> np.ndarray:
+        """A lifted point: the monomials of an input of the base map."""
+        lifted: np.ndarray = monomials(self.base.example_input(generator), self.degree)[:-1]
+        return lifted
+
+
+def _products(variables: int, degree: int, order: int) -> np.ndarray:
+    """Position of each product of `order` monomials of `degree` among the monomials of degree * order."""
+    parts = exponents(variables, degree)
+    target = position(variables, degree * order)
+    return np.array([
+        target[tuple(sum(power * parts[i][v] for i, power in enumerate(powers) if power) for v in range(variables))]
+        for powers in exponents(len(parts), order)
+    ])  # fmt: skip
+
+
+def square(base: AbstractRandomAffine) -> Lift:
+    """The map between all monomials up to degree 2 (the quadratic lift).
+
+    Raises:
+        ValueError: when asked for moments whose matrix would need more than the stated memory.
+    """
+    return Lift(base, 2)

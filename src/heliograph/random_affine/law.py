@@ -1,0 +1,241 @@
+"""Laws of a scalar gain: each samples itself and knows its moments E[g^k].
+
+A law may be known only roughly: its probabilities may move within |dp| <= radius, sum dp = 0, 0 <= p + dp <= 1. Then
+`moment` is nominal, and `extremes` lists the laws at the corners of that polytope, among which every expectation that
+is linear in p has its worst case.
+"""
+
+from itertools import product
+from math import exp
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import special
+
+from heliograph.check import array, fail, probabilities, radii, scalar
+
+CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
+
+
+class AbstractLaw(eqx.Module):
+    """A law of a real random gain, independent over time."""
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw one gain; shape ()."""
+        raise NotImplementedError
+
+    def moment(self, order: int) -> float:
+        """Return E[g^order] under the nominal law."""
+        raise NotImplementedError
+
+    def extremes(self) -> tuple["AbstractLaw", ...]:
+        """Laws at the corners of what is possible; the law itself when it is known."""
+        return (self,)
+
+    def mean_law(self) -> "Constant":
+        """The law that a filter trusts which takes the mean gain as the truth."""
+        return Constant(self.moment(1))
+
+
+class Constant(AbstractLaw):
+    """A gain that is always `value`."""
+
+    value: np.ndarray
+
+    def __init__(self, value: Any):
+        self.value = scalar("constant gain", value)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Return the value; the key is unused."""
+        return jnp.asarray(self.value)
+
+    def moment(self, order: int) -> float:
+        """Return value^order."""
+        return float(self.value**order)
+
+
+class Discrete(AbstractLaw):
+    """Gains `values` with `probabilities`, each known within its `radius`."""
+
+    values: np.ndarray
+    probabilities: np.ndarray
+    radius: np.ndarray
+
+    def __init__(self, values: Any, probabilities_: Any, radius: Any = 0.0):
+        self.values = array("gain values", values, (None,))
+        self.probabilities = probabilities("gain probabilities", probabilities_, len(self.values))
+        self.radius = radii("probability radius", radius, self.probabilities)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Invert the distribution function at a uniform draw."""
+        edges = jnp.cumsum(jnp.asarray(self.probabilities))[:-1]
+        return jnp.asarray(self.values)[jnp.sum(jax.random.uniform(key, dtype=float) > edges)]
+
+    def moment(self, order: int) -> float:
+        """Return sum_i p_i v_i^order."""
+        return float(self.probabilities @ self.values**order)
+
+    def worst(self, payoff: Any) -> float:
+        """Exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
+
+        Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the
+        fractional knapsack, which solves this linear programme).
+        """
+        gain = array("payoff", payoff, self.values.shape)
+        low = np.maximum(self.probabilities - self.radius, 0.0)
+        high = np.minimum(self.probabilities + self.radius, 1.0)
+        left, total = 1.0 - low.sum(), float(low @ gain)
+        for i in np.argsort(-gain, kind="stable"):
+            step = min(left, high[i] - low[i])
+            total, left = total + step * gain[i], left - step
+        return total
+
+    def extremes(self) -> tuple[AbstractLaw, ...]:
+        """Laws at all corners of the polytope: every probability but one at an end of its interval.
+
+        Raises:
+            ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
+        """
+        free = np.flatnonzero(self.radius > 0)
+        if len(free) < 2:  # a single uncertain probability cannot move: the others hold the sum
+            return (Discrete(self.values, self.probabilities),)
+        if len(free) > CORNER_LIMIT:
+            raise fail("uncertain probabilities of one gain", f"at most {CORNER_LIMIT}", len(free))
+        low = np.maximum(self.probabilities - self.radius, 0.0)
+        high = np.minimum(self.probabilities + self.radius, 1.0)
+        corners = set()
+        for slack in free:
+            others = [i for i in free if i != slack]
+            for ends in product(*((low[i], high[i]) for i in others)):
+                corner = self.probabilities.copy()
+                corner[others] = ends
+                corner[slack] = 0.0
+                corner[slack] = 1.0 - corner.sum()
+                if low[slack] - 1e-12 <= corner[slack] <= high[slack] + 1e-12:
+                    corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
+        return tuple(Discrete(self.values, np.array(c) / sum(c)) for c in sorted(corners))
+
+
+def bernoulli(probability: Any, radius: Any = 0.0) -> Discrete:
+    """A link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
+
+    Raises:
+        ValueError: a probability outside [0, 1], or a radius that it does not allow.
+    """
+    p = scalar("probability that a link works", probability, 0.0, 1.0)
+    return Discrete([0.0, 1.0], [1 - p, p], radius)
+
+
+class Rayleigh(AbstractLaw):
+    """Rayleigh fading: the length of a centred complex Gaussian with standard deviation `scale` per part."""
+
+    scale: np.ndarray
+
+    def __init__(self, scale: Any):
+        self.scale = scalar("Rayleigh scale", scale, 0.0)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw scale * sqrt(-2 log u)."""
+        return jax.random.rayleigh(key, jnp.asarray(self.scale), dtype=float)
+
+    def moment(self, order: int) -> float:
+        """Return scale^k 2^(k/2) Gamma(1 + k/2)."""
+        return float((self.scale * np.sqrt(2)) ** order * special.gamma(1 + order / 2))
+
+
+class Rician(AbstractLaw):
+    """Rician fading: a line of sight of amplitude `sight` plus scatter of standard deviation `scale` per part."""
+
+    sight: np.ndarray
+    scale: np.ndarray
+
+    def __init__(self, sight: Any, scale: Any):
+        self.sight = scalar("Rician line of sight", sight, 0.0)
+        self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the length of (sight + scale n1, scale n2)."""
+        parts = jax.random.normal(key, (2,), dtype=float) * self.scale
+        return jnp.hypot(self.sight + parts[0], parts[1])
+
+    def moment(self, order: int) -> float:
+        """Return scale^k 2^(k/2) Gamma(1 + k/2) 1F1(-k/2; 1; -sight^2 / (2 scale^2))."""
+        shape = special.hyp1f1(-order / 2, 1.0, -((self.sight / self.scale) ** 2) / 2)
+        return float((self.scale * np.sqrt(2)) ** order * special.gamma(1 + order / 2) * shape)
+
+
+class Nakagami(AbstractLaw):
+    """Nakagami-m fading with `shape` m >= 1/2 and mean power `power` = E[g^2]."""
+
+    shape: np.ndarray
+    power: np.ndarray
+
+    def __init__(self, shape: Any, power: Any = 1.0):
+        self.shape = scalar("Nakagami shape", shape, 0.5)
+        self.power = scalar("Nakagami power", power, 0.0)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw the root of a gamma variable with shape m and mean `power`."""
+        return jnp.sqrt(jax.random.gamma(key, jnp.asarray(self.shape), dtype=float) * self.power / self.shape)
+
+    def moment(self, order: int) -> float:
+        """Return Gamma(m + k/2) / Gamma(m) (power / m)^(k/2)."""
+        ratio = np.exp(special.gammaln(self.shape + order / 2) - special.gammaln(self.shape))
+        return float(ratio * (self.power / self.shape) ** (order / 2))
+
+
+class LogNormal(AbstractLaw):
+    """Shadowing: log g is Gaussian with `log_mean` and `log_deviation`."""
+
+    log_mean: np.ndarray
+    log_deviation: np.ndarray
+
+    def __init__(self, log_mean: Any, log_deviation: Any):
+        self.log_mean = scalar("log-normal mean", log_mean)
+        self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw exp(log_mean + log_deviation n)."""
+        return jnp.exp(self.log_mean + self.log_deviation * jax.random.normal(key, dtype=float))
+
+    def moment(self, order: int) -> float:
+        """Return exp(k mu + k^2 sigma^2 / 2)."""
+        return exp(order * float(self.log_mean) + (order * float(self.log_deviation)) ** 2 / 2)
+
+
+class GivenMoments(AbstractLaw):
+    """A gain of which only the moments E[g], E[g^2], ... are known, from measurements or from a data sheet.
+
+    It designs filters but cannot be sampled: many laws share these moments.
+
+    Raises:
+        ValueError: no distribution on the real line has these moments (a Hankel matrix is indefinite), or a moment of
+            higher order than given is asked for.
+    """
+
+    moments: np.ndarray
+
+    def __init__(self, moments: Any):
+        self.moments = array("gain moments", moments, (None,))
+        sequence = np.concatenate([[1.0], self.moments])
+        half = (len(sequence) - 1) // 2
+        hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
+        scale = np.sqrt(np.maximum(np.diag(hankel), np.finfo(float).tiny))
+        smallest = np.linalg.eigvalsh(hankel / np.outer(scale, scale))[0]
+        if np.any(np.diag(hankel) < 0) or smallest < -1e-10:  # rounding of a correlation matrix
+            raise fail("gain moments", "those of some distribution", f"{self.moments.tolist()}, which none has")
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Refuse: the law itself is unknown."""
+        raise fail("simulating a gain known by its moments only", "a law that can be sampled", "GivenMoments")
+
+    def moment(self, order: int) -> float:
+        """Return the given E[g^order]."""
+        if order == 0:
+            return 1.0
+        if order > len(self.moments):
+            raise fail("gain moments", f"moments up to order {order}", f"{len(self.moments)} of them")
+        return float(self.moments[order - 1])

@@ -1,0 +1,134 @@
+"""Monomials of (y, 1) of one total degree: the half-vectorised basis in which joint moments are stored.
+
+With Y = (y_1, ..., y_p, 1), the monomials of degree k in Y are all monomials of y up to degree k. The symmetric power
+Sym^k(H) of a homogeneous matrix H takes the monomials of Y to those of Z = H Y, and Sym^k(H2 H1) = Sym^k(H2) Sym^k(H1).
+"""
+
+from functools import cache
+from itertools import combinations_with_replacement
+from math import comb, factorial, prod
+from typing import Any
+
+import numpy as np
+
+from heliograph.check import fail
+
+MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
+
+Exponents = tuple[int, ...]
+
+
+@cache
+def exponents(variables: int, degree: int) -> tuple[Exponents, ...]:
+    """Exponents of all monomials of total degree `degree` in `variables` variables; degree 1 gives y_1, ..., y_p, 1."""
+    result = []
+    for choice in combinations_with_replacement(range(variables), degree):
+        powers = [0] * variables
+        for index in choice:
+            powers[index] += 1
+        result.append(tuple(powers))
+    return tuple(result)
+
+
+@cache
+def position(variables: int, degree: int) -> dict[Exponents, int]:
+    """Position of each monomial in `exponents`."""
+    return {powers: i for i, powers in enumerate(exponents(variables, degree))}
+
+
+def count(variables: int, degree: int) -> int:
+    """Number of monomials of total degree `degree`: C(variables + degree - 1, degree)."""
+    return comb(variables + degree - 1, degree)
+
+
+def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
+    """Raise if a moment matrix would need more than the stated memory.
+
+    Raises:
+        ValueError: naming the number of entries and what to do.
+    """
+    if rows * columns > MEMORY_LIMIT_ENTRIES:
+        got = f"{rows * columns:,} entries; use a lower order, or fewer states, outputs or stacked sensors at once"
+        raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
+
+
+def monomials(y: Any, degree: int) -> Any:
+    """All monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
+    values: list[Any] = [*y, 1.0]
+    terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
+             for powers in exponents(len(values), degree)]  # fmt: skip
+    if isinstance(y, np.ndarray):
+        return np.array(terms, dtype=np.float64)
+    import jax.numpy as jnp
+
+    return jnp.stack([jnp.asarray(t, dtype=float) for t in terms])
+
+
+@cache
+def _raise_table(variables: int, degree: int) -> np.ndarray:
+    """Entry (i, c): position at degree - 1 of monomial i divided by variable c; one past the end if it has no c."""
+    lower = position(variables, degree - 1)
+    table = np.full((count(variables, degree), variables), len(lower), dtype=np.int64)
+    for i, powers in enumerate(exponents(variables, degree)):
+        for c, power in enumerate(powers):
+            if power:
+                table[i, c] = lower[(*powers[:c], power - 1, *powers[c + 1 :])]
+    return table
+
+
+@cache
+def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
+    """For each monomial a variable c that divides it, and the position of the quotient at degree - 1."""
+    table = _raise_table(variables, degree)
+    divisor = np.array([max(c for c, power in enumerate(powers) if power) for powers in exponents(variables, degree)])
+    return divisor, table[np.arange(len(divisor)), divisor]
+
+
+def symmetric_power(h: Any, degree: int) -> Any:
+    """Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
+
+    Row of z_a z_b...: the product of linear forms, built degree by degree,
+    S_k[a, g] = sum_c H[i, c] S_{k-1}[a / z_i, g / y_c]. Works on NumPy and on JAX arrays.
+
+    Shapes: (m + 1, p + 1) -> (C(m + k, k), C(p + k, k)).
+    """
+    outputs, inputs = h.shape
+    refuse_if_too_large(count(outputs, degree), count(inputs, degree), f"moments of order {degree}")
+    power = h
+    for k in range(2, degree + 1):
+        divisor, parent = _last_factor(outputs, k)
+        table = _raise_table(inputs, k)
+        padded = _append_zero_column(power)[parent]
+        power = sum(h[divisor, c][:, None] * padded[:, table[:, c]] for c in range(inputs))
+    return power
+
+
+def _append_zero_column(a: Any) -> Any:
+    if isinstance(a, np.ndarray):
+        return np.pad(a, ((0, 0), (0, 1)))
+    import jax.numpy as jnp
+
+    return jnp.pad(a, ((0, 0), (0, 1)))
+
+
+@cache
+def product_table(variables: int, first: int, second: int) -> np.ndarray:
+    """Entry (i, j): position at degree first + second of the product of monomial i and monomial j."""
+    target = position(variables, first + second)
+    rows = [
+        [target[tuple(a + b for a, b in zip(p, q, strict=True))] for q in exponents(variables, second)]
+        for p in exponents(variables, first)
+    ]
+    return np.array(rows, dtype=np.int64).reshape(count(variables, first), count(variables, second))
+
+
+def multiply(a: np.ndarray, first: int, b: np.ndarray, second: int, variables: int) -> np.ndarray:
+    """Product of two homogeneous polynomials given by coefficients."""
+    result = np.zeros(count(variables, first + second))
+    np.add.at(result, product_table(variables, first, second), np.outer(a, b))
+    return result
+
+
+def multinomial(powers: Exponents) -> int:
+    """Number of orderings of a monomial's factors: (sum a)! / prod a!."""
+    return factorial(sum(powers)) // prod(factorial(a) for a in powers)

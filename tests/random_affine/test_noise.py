@@ -1,0 +1,46 @@
+import jax
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.random_affine.noise import as_noise, noise_moments
+
+COVARIANCE = np.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.8]])
+
+
+def test_gaussian_moments_are_gauss_hermite_quadrature():
+    noise = hg.Gaussian(COVARIANCE, [0.2, -0.1, 0.4])
+    nodes, weights = np.polynomial.hermite_e.hermegauss(5)  # exact to degree 9
+    grid = np.array(np.meshgrid(nodes, nodes, nodes)).reshape(3, -1)
+    weight = np.prod(np.array(np.meshgrid(weights, weights, weights)).reshape(3, -1), axis=0) / (2 * np.pi) ** 1.5
+    points = noise.mean[:, None] + np.linalg.cholesky(COVARIANCE) @ grid
+    for powers, value in noise_moments(noise, 4).items():
+        quadrature = weight @ np.prod(points ** np.array(powers)[:, None], axis=0)
+        assert value == pytest.approx(quadrature, abs=1e-12)
+
+
+def test_finite_support_knows_its_mean_and_covariance():
+    noise = hg.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
+    np.testing.assert_allclose(noise.mean, [-0.5, 1.5], rtol=1e-15)
+    np.testing.assert_allclose(noise.covariance, [[0.75, -0.75], [-0.75, 0.75]], rtol=1e-14)
+
+
+def test_a_singular_covariance_is_sampled_on_its_subspace():
+    noise = hg.Gaussian([[1.0, 1.0], [1.0, 1.0]])
+    with jax.enable_x64(True):
+        drawn = np.asarray(jax.vmap(noise.sample)(jax.random.split(jax.random.key(0), 100)))
+    np.testing.assert_allclose(drawn[:, 0], drawn[:, 1], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ([[1.0, 0.5], [0.4, 1.0]], "symmetric"),
+        ([[1.0, 2.0], [2.0, 1.0]], "positive semidefinite matrix, got smallest eigenvalue -1"),
+        ([[np.inf, 0.0], [0.0, 1.0]], "finite"),
+        (hg.Gaussian(np.eye(3)), "dimension 2, got dimension 3"),
+    ],
+)
+def test_what_is_no_covariance_is_refused(value, message):
+    with pytest.raises(ValueError, match=message):
+        as_noise("noise", value, 2)
