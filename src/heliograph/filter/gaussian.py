@@ -1,0 +1,184 @@
+"""The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.channel import Channel, check_link, mean_gain
+from heliograph.check import array, covariance
+from heliograph.filter.base import AbstractFilter, Claim, Estimate
+from heliograph.filter.transform import AbstractTransform, Cubature, Linearization
+from heliograph.filter.update import AbstractUpdate, Polytope, Signal
+from heliograph.float64 import compiled, in_float64
+from heliograph.over_time import OverTime, at, first, over_time, unstack
+from heliograph.plant import AnyPlant
+from heliograph.random_affine.second_order import SecondOrder
+from heliograph.sensor import AnySensor, is_linear
+
+
+class Belief(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the state given the data so far."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+class GaussianFilter(AbstractFilter):
+    """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
+
+    `channel` is what the filter believes; the world may have another. Built by `cubature_filter`, `extended_filter`
+    and `mean_gain_filter`.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+    transform: AbstractTransform
+    update: AbstractUpdate
+    initial_mean: np.ndarray
+    initial_covariance: np.ndarray
+    claim: Claim = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Belief:
+        """The prior."""
+        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
+
+    @compiled
+    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
+        """Predict over step k, then use what arrived of z."""
+        after = self.correct(self.predict(state, u, k), z, k)
+        return after, Estimate(after.mean, after.covariance, self.claim)
+
+    @compiled
+    def predict(self, state: Belief, u: Any = (), k: Any = 0) -> Belief:
+        """Mean and covariance of f(x, u) + w."""
+        plant, u = at(self.plant, k), jnp.asarray(u, dtype=float)
+        moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
+        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+
+    @compiled
+    def correct(self, prior: Belief, z: Any, k: Any = 0) -> Belief:
+        """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
+        sensor, channel = at(self.sensor, k), at(self.channel, k)
+        measured = self.transform.apply(sensor.measure, *prior)
+        mean = measured.mean + sensor.noise.mean
+        spread = measured.covariance + sensor.noise.covariance
+        signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
+        return corrected(prior, signal, channel, self.update, jnp.asarray(z, dtype=float))
+
+
+def corrected(prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array) -> Belief:
+    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
+    present = ~jnp.isnan(z)
+    gain, bound = update.correct(prior.covariance, signal, channel, present)
+    expected = channel.gain @ signal.mean + channel.offset
+    innovation = jnp.where(present, z - expected, 0.0)
+    covariance_after = jnp.where(jnp.any(present), bound, prior.covariance)
+    return Belief(prior.mean + gain @ innovation, covariance_after)
+
+
+def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
+    """The channel as an update reads it, for each step where it varies."""
+    if isinstance(channel, OverTime):
+        return over_time([update.describe(c) for c in unstack(channel)])
+    return update.describe(channel)
+
+
+def _build(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate,
+    initial_mean: Any,
+    initial_covariance: Any,
+    trusted: bool,
+) -> GaussianFilter:
+    start = first(plant)
+    n = len(start.states)
+    check_link(first(sensor), first(channel), n)
+    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    spread = start.initial_covariance
+    if initial_covariance is not None:
+        spread = covariance("filter's initial covariance", initial_covariance, n)
+    described = describe(channel, update)
+    linear = is_linear(plant, sensor) and not bool(np.any([s.random_gain for s in _each(described)]))
+    claim: Claim = "exact" if linear and trusted else "nominal"
+    return GaussianFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        transform=transform,
+        update=update,
+        initial_mean=mean,
+        initial_covariance=spread,
+        claim=claim,
+    )
+
+
+def _each(item: SecondOrder | OverTime) -> list[SecondOrder]:
+    return unstack(item) if isinstance(item, OverTime) else [item]
+
+
+def cubature_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """Cubature Kalman filter that knows its channel's moments.
+
+    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
+    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    rule = Polytope() if update is None else update
+    return _build(plant, sensor, channel, Cubature(), rule, initial_mean, initial_covariance, trusted=True)
+
+
+def extended_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """Extended Kalman filter that knows its channel's moments; Jacobians by automatic differentiation.
+
+    Claims, arguments and errors as `cubature_filter`.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
+    """
+    rule = Polytope() if update is None else update
+    return _build(plant, sensor, channel, Linearization(), rule, initial_mean, initial_covariance, trusted=True)
+
+
+def mean_gain_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """The cubature filter that most people would write: it takes the mean gain as the truth.
+
+    Claim: "nominal", and badly so where gains are random; it is here to be compared with.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
+    """
+    believed = mean_gain(channel)
+    return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)

@@ -1,0 +1,349 @@
+"""Oracle: cubature Kalman fusion filter under amplify-and-forward relays, in the notation of the paper.
+
+Plant x+ = f(x)+w (R), y_i = C_i x+v (Q); node i receives ybar = c xi gamma y + alpha sqrt(Er) xi m + n with
+c = alpha sqrt(El Er). Leading axes are free, the nodes last: x (..., n), P (..., n, n), C (..., m, n).
+Source: Li, Wang, Hu, Dong, Liu, "Cubature Kalman Fusion Filtering Under Amplify-and-Forward Relays with
+Randomly Varying Channel Parameters", (10)-(34), Algorithm 1, section IV; departures are stated in place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import LinearConstraint, minimize
+
+Array = NDArray[np.float64]
+Setting = dict[str, Any]
+Law = tuple[Array, Array, Array]  # values, nominal probabilities, radii of the probabilities
+Scalar = float | Array
+
+_ROWS = [(-4.448, 1.11), (-4.428, 1.21), (-4.435, 1.05), (-4.441, 1.14)]  # (b7, b8) ... (b13, b14)
+_X0 = np.array([0.25, -0.55, -0.4, 0.2, 0.15])
+_I2, _I5 = np.eye(2), np.eye(5)
+
+
+def _law(values: list[float], p: list[float], radius: float) -> Law:
+    return np.array(values), np.array(p), np.full(len(p), radius)
+
+
+PRINTED: Setting = {
+    "b1": -0.186, "b2": -1.778, "b3": 6.125, "b4": -6.234, "b5": 0.081, "b6": 4.643,
+    "h": 0.1, "k1": 2.0, "k2": 0.1, "k3": 0.55, "T": 40,
+    "C": np.array([[[p, 0, q, 0, 0], [0, p, 0, q, 0]] for p, q in _ROWS]),
+    "R": 1e-6 * _I5, "Q": 0.25 * _I2, "Qm": 0.2 * _I2, "Qn": 0.1 * _I2, "P0": 1e-4 * _I5, "Xi0": 1.25 * _I5,
+    "alpha": 0.25, "El": 0.05, "Er": 0.05, "beta": (1e-6, 1e-4), "xbar0": _X0,
+    "xi": _law([0.1, 0.5, 1], [0.2, 0.3, 0.5], 0.01), "gamma": _law([0.1, 0.5, 1], [0.4, 0.3, 0.3], 0.01),
+    "xhat0": np.array([[0.22, -0.45, -0.54, 0.23, 0.22], [0.21, -0.38, -0.54, 0.32, 0.19],
+                       [0.42, -0.55, -0.51, 0.31, 0.21], [0.09, -0.62, -0.52, 0.33, 0.21]]),
+}  # fmt: skip
+# x5 stays bounded (k3 = 0), the voltage keeps exciting (k2 = 2), the channel is strong: measurements matter.
+STRONG: Setting = {
+    **PRINTED, "k2": 2.0, "k3": 0.0, "T": 100, "R": 1e-5 * _I5, "Q": 1e-3 * _I2, "Qm": 1e-3 * _I2,
+    "Qn": 1e-3 * _I2, "alpha": 2.0, "El": 1.0, "Er": 1.0, "beta": (1e-3, 1e-2),
+    "xi": _law([0.8, 0.9, 1], [0.2, 0.3, 0.5], 0.02), "gamma": _law([0.7, 0.85, 1], [0.3, 0.3, 0.4], 0.02),
+    "P0": 0.02 * _I5, "Xi0": 0.02 * _I5, "xhat0": np.tile(_X0, (4, 1)),
+}  # fmt: skip
+
+
+def f(x: Array, s: Setting) -> Array:
+    """Induction machine, one Euler step."""
+    x1, x2, x3, x4, x5 = np.moveaxis(x, -1, 0)
+    d1 = s["b1"] * x1 + s["k1"] * x2 + s["b2"] * x3 + s["k2"]
+    d2 = -s["k1"] * x1 + s["b1"] * x2 + s["b2"] * x4
+    d3 = s["b3"] * x1 + s["b4"] * x3 + (s["k1"] - x5) * x4
+    d4 = s["b3"] * x2 - (s["k1"] - x5) * x3 + s["b4"] * x4
+    d5 = s["b5"] * (x1 * x4 - x2 * x3) + s["b6"] * s["k3"]
+    return np.asarray(x + s["h"] * np.stack([d1, d2, d3, d4, d5], -1))
+
+
+def hessians(s: Setting) -> Array:
+    """H[i] = d2 f_i / dx dx', constant because f is quadratic; shape (5, 5, 5)."""
+    H = np.zeros((5, 5, 5))
+    for i, j, k, value in [(2, 3, 4, -1.0), (3, 2, 4, 1.0), (4, 0, 3, s["b5"]), (4, 1, 2, -s["b5"])]:
+        H[i, j, k] = H[i, k, j] = s["h"] * value
+    return H
+
+
+def jacobian(x: Array, s: Setting) -> Array:
+    """df/dx = A + (H_i x)', where A = df/dx at zero."""
+    b1, b2, b3, b4, k1 = (s[k] for k in ("b1", "b2", "b3", "b4", "k1"))
+    A = np.array([[b1, k1, b2, 0, 0], [-k1, b1, 0, b2, 0], [b3, 0, b4, k1, 0], [0, b3, -k1, b4, 0], [0] * 5])
+    return np.asarray(np.eye(5) + s["h"] * A + np.einsum("ijk,...k->...ij", hessians(s), x))
+
+
+class Terms(NamedTuple):
+    """Of a bound: mu, V >= E(xi gamma - mu)^2, d >= |E xi gamma - mu|, M2 >= E(xi gamma)^2, X2 >= E xi^2."""
+
+    mu: float
+    V: float
+    d: float
+    M2: float
+    X2: float
+
+
+def amplitude(s: Setting) -> float:
+    """c = alpha sqrt(El Er)."""
+    return float(s["alpha"] * np.sqrt(s["El"] * s["Er"]))
+
+
+def nominal_and_radii(law: Law) -> tuple[float, float, float, float]:
+    """First and second nominal moments and the radii of (11), (18)."""
+    v, p, r = law
+    return float(v @ p), float(v**2 @ p), float(np.abs(v) @ r), float(v**2 @ r)
+
+
+def box_terms(s: Setting, sign: int) -> Terms:
+    """(11): Var xi = E xi^2 - (E xi)^2 <= xi2 + kappa2 - max(|xi1| - kappa1, 0)^2; sign 1 is the print."""
+    x1, x2, kx1, kx2 = nominal_and_radii(s["xi"])
+    g1, g2, kg1, kg2 = nominal_and_radii(s["gamma"])
+    lows = [m - r if sign > 0 else max(abs(m) - r, 0) for m, r in ((x1, kx1), (g1, kg1))]
+    vx, vg = x2 + kx2 + sign * lows[0] ** 2, g2 + kg2 + sign * lows[1] ** 2
+    aV = vx * (g2 + kg2) + (abs(x1) + kx1) ** 2 * vg
+    d = abs(x1) * kg1 + kx1 * abs(g1) + kx1 * kg1
+    return Terms(x1 * g1, aV + d**2, d, (x2 + kx2) * (g2 + kg2), x2 + kx2)
+
+
+printed_terms, tight_terms = partial(box_terms, sign=1), partial(box_terms, sign=-1)
+
+
+def vertices(law: Law) -> Array:
+    """Vertices of {q : |q - p| <= r, sum q = 1, 0 <= q <= 1}: all coordinates but one at an end."""
+    lo, hi = np.maximum(law[1] - law[2], 0.0), np.minimum(law[1] + law[2], 1.0)
+    n, found = len(lo), []
+    for free in range(n):
+        for ends in product(*[(lo[j], hi[j]) for j in range(n) if j != free]):
+            q = np.insert(np.array(ends), free, 1.0 - sum(ends))
+            if lo[free] - 1e-12 <= q[free] <= hi[free] + 1e-12:
+                found.append(q)
+    return np.unique(np.round(found, 14), axis=0)
+
+
+def poly_terms(s: Setting) -> Terms:
+    """Exact worst case over the probability polytopes: convex in either law, so at vertices."""
+    mu = nominal_and_radii(s["xi"])[0] * nominal_and_radii(s["gamma"])[0]
+    vx, vg = s["xi"][0], s["gamma"][0]
+    worst = np.full(4, -np.inf)
+    for q, p in product(vertices(s["xi"]), vertices(s["gamma"])):
+        a1, a2, c1, c2 = vx @ q, vx**2 @ q, vg @ p, vg**2 @ p
+        worst = np.maximum(worst, [a2 * c2 - 2 * mu * a1 * c1 + mu**2, abs(a1 * c1 - mu), a2 * c2, a2])
+    return Terms(float(mu), *map(float, worst))
+
+
+def cubature_points(x: Array, P: Array) -> Array:
+    """x +- sqrt(n) S e_j with S the lower Cholesky factor of P; shape (..., 2n, n)."""
+    S = float(np.sqrt(x.shape[-1])) * np.linalg.cholesky(P).mT
+    return np.asarray(x[..., None, :] + np.concatenate([S, -S], -2))
+
+
+def predict_cubature(x: Array, Xi: Array, s: Setting) -> tuple[Array, Array]:
+    """Algorithm 1, Steps 2-3."""
+    chi = f(cubature_points(x, Xi), s)
+    m = chi.mean(-2)
+    D = chi - m[..., None, :]
+    return m, D.mT @ D / D.shape[-2] + s["R"]
+
+
+def predict_extended(x: Array, Xi: Array, s: Setting) -> tuple[Array, Array]:
+    """f(x), J Xi J' + R: the linearised prediction."""
+    J = jacobian(x, s)
+    return f(x, s), J @ Xi @ J.mT + s["R"]
+
+
+def predict_exact(x: Array, Xi: Array, s: Setting) -> tuple[Array, Array]:
+    """Gaussian moments of the quadratic f: f + 1/2 tr(H_i Xi), J Xi J' + 1/2 tr(H_i Xi H_j Xi) + R."""
+    H, (m, P) = hessians(s), predict_extended(x, Xi, s)
+    HX = np.einsum("iab,...bc->...iac", H, Xi)
+    return m + 0.5 * np.einsum("...iaa->...i", HX), P + 0.5 * np.einsum("...iab,...jba->...ij", HX, HX)
+
+
+class Innovation(NamedTuple):
+    """What an update sees: prior P, Y = E[yy'], Pyy and Pxy of the innovation."""
+
+    P: Array
+    Y: Array
+    Pyy: Array
+    Pxy: Array
+
+
+def measure(x: Array, P: Array, C: Array, s: Setting) -> tuple[Array, Innovation]:
+    """yhat and moments, all from points redrawn at (x, P); printed Pxy mixes in the propagated ones."""
+    chi = cubature_points(x, P)
+    y = chi @ C.mT
+    yhat = y.mean(-2)
+    D, E = chi - x[..., None, :], y - yhat[..., None, :]
+    Pyy = E.mT @ E / E.shape[-2] + s["Q"]
+    return yhat, Innovation(P, Pyy + yhat[..., :, None] * yhat[..., None, :], Pyy, D.mT @ E / E.shape[-2])
+
+
+def _tr(A: Array) -> Array:
+    return np.asarray(np.trace(A, axis1=-2, axis2=-1))
+
+
+def _correct(x: Array, K: Array, ybar: Array, yhat: Array, gain: Scalar) -> Array:
+    return np.asarray(x + np.einsum("...ij,...j->...i", K, ybar - gain * yhat))
+
+
+def relay_noise(X2: Scalar, s: Setting) -> Array:
+    """Covariance of alpha sqrt(Er) xi m + n with E xi^2 = X2."""
+    return np.asarray(s["alpha"] ** 2 * s["Er"] * X2 * s["Qm"] + s["Qn"])
+
+
+def omega(v: Innovation, b1: Scalar, b2: Scalar, t: Terms, s: Setting) -> Array:
+    """(30), with Y in the terms of the law and Pyy in the (1 + beta2) term."""
+    b1, b2 = np.asarray(b1)[..., None, None], np.asarray(b2)[..., None, None]
+    cross = t.d**2 * (1 / b1 + 1 / b2) if t.d > 0 else 0.0
+    law = (t.V + cross) * v.Y + (1 + b2) * t.mu**2 * v.Pyy
+    return np.asarray(amplitude(s) ** 2 * law + relay_noise(t.X2, s))
+
+
+def theorem2(v: Innovation, b1: Scalar, b2: Scalar, t: Terms, s: Setting) -> tuple[Array, Array]:
+    """Gain (29) and minimum bound (31)."""
+    g = amplitude(s) * t.mu
+    K = g * v.Pxy @ np.linalg.inv(omega(v, b1, b2, t, s))
+    return K, (1 + np.asarray(b1)[..., None, None]) * v.P - g * K @ v.Pxy.mT
+
+
+def theorem1(K: Array, v: Innovation, b1: Scalar, b2: Scalar, t: Terms, s: Setting) -> Array:
+    """Bound (10) at any gain K."""
+    A = amplitude(s) * t.mu * v.Pxy @ K.mT
+    return (1 + np.asarray(b1)[..., None, None]) * v.P + K @ omega(v, b1, b2, t, s) @ K.mT - A - A.mT
+
+
+def optimal_betas(v: Innovation, t: Terms, s: Setting) -> tuple[Array, Array]:
+    """argmin tr Xi over (beta1, beta2) > 0: alternate Theorem 2 and its minimisers (jointly convex)."""
+    b = np.ones((2, *v.P.shape[:-2]))
+    for _ in range(500 if t.d > 0 else 0):
+        K, old = theorem2(v, b[0], b[1], t, s)[0], b
+        y = t.d * np.sqrt(_tr(K @ v.Y @ K.mT))
+        b = np.stack([amplitude(s) * y / np.sqrt(_tr(v.P)), y / (abs(t.mu) * np.sqrt(_tr(K @ v.Pyy @ K.mT)))])
+        if np.max(np.abs(b / old - 1)) < 1e-10:
+            break
+    return (b[0], b[1]) if t.d > 0 else (0 * b[0], 0 * b[1])
+
+
+Update = Callable[[Array, Array, Array, Array, Setting], tuple[Array, Array]]  # x, P, C, ybar -> xhat, Xi
+
+
+def bounded(terms: Terms, optimise: bool) -> Update:
+    """Theorem 2 update with the given terms; beta of the setting, or optimal for each run, node and step."""
+
+    def update(x: Array, P: Array, C: Array, ybar: Array, s: Setting) -> tuple[Array, Array]:
+        yhat, v = measure(x, P, C, s)
+        b1, b2 = optimal_betas(v, terms, s) if optimise else s["beta"]
+        K, Xi = theorem2(v, b1, b2, terms, s)
+        return _correct(x, K, ybar, yhat, amplitude(s) * terms.mu), Xi
+
+    return update
+
+
+def orthogonal_step(v: Innovation, b: Scalar, t: Terms, s: Setting) -> tuple[Array, Array]:
+    """K, Xi if E[e yhat'] = 0: Omega = c^2 ((M2 + d^2/b) Pyy + V yhat yhat') + noise."""
+    c, b = amplitude(s), np.asarray(b)[..., None, None]
+    W = (t.M2 + (t.d**2 / b if t.d > 0 else 0.0)) * v.Pyy + t.V * (v.Y - v.Pyy)
+    K = c * t.mu * v.Pxy @ np.linalg.inv(c**2 * W + relay_noise(t.X2, s))
+    return K, v.P + b * v.Pxy @ np.linalg.inv(v.Pyy) @ v.Pxy.mT - c * t.mu * K @ v.Pxy.mT
+
+
+def optimal_beta(v: Innovation, t: Terms, s: Setting) -> Array:
+    """argmin tr Xi of the orthogonal bound: iterate b = c d sqrt(tr K Pyy K' / tr Pxy Pyy^-1 Pxy')."""
+    G = _tr(v.Pxy @ np.linalg.inv(v.Pyy) @ v.Pxy.mT)
+    b = np.ones(v.P.shape[:-2])
+    for _ in range(500 if t.d > 0 else 0):
+        K, old = orthogonal_step(v, b, t, s)[0], b
+        b = amplitude(s) * t.d * np.sqrt(_tr(K @ v.Pyy @ K.mT) / G)
+        if np.max(np.abs(b / old - 1)) < 1e-10:
+            break
+    return b if t.d > 0 else 0 * b
+
+
+def orthogonal(terms: Terms) -> Update:
+    """The bound that uses E[e yhat'] = 0, with its one scalar optimal for each run, node and step."""
+
+    def update(x: Array, P: Array, C: Array, ybar: Array, s: Setting) -> tuple[Array, Array]:
+        yhat, v = measure(x, P, C, s)
+        K, Xi = orthogonal_step(v, optimal_beta(v, terms, s), terms, s)
+        return _correct(x, K, ybar, yhat, amplitude(s) * terms.mu), Xi
+
+    return update
+
+
+def known_gains(xi: Array, gamma: Array) -> Update:
+    """Textbook update when xi and gamma (...) are known: the genie."""
+
+    def update(x: Array, P: Array, C: Array, ybar: Array, s: Setting) -> tuple[Array, Array]:
+        yhat, v = measure(x, P, C, s)
+        g, xi2 = (amplitude(s) * xi * gamma)[..., None, None], xi[..., None, None] ** 2
+        K = g * v.Pxy @ np.linalg.inv(g**2 * v.Pyy + relay_noise(xi2, s))
+        return _correct(x, K, ybar, yhat, g[..., 0]), P - g * K @ v.Pxy.mT
+
+    return update
+
+
+def naive(x: Array, P: Array, C: Array, ybar: Array, s: Setting) -> tuple[Array, Array]:
+    """Textbook update that takes the mean gains for the true ones."""
+    mean = [np.asarray(nominal_and_radii(s[k])[0]) for k in ("xi", "gamma")]
+    return known_gains(*mean)(x, P, C, ybar, s)
+
+
+def open_loop(x: Array, P: Array, C: Array, ybar: Array, s: Setting) -> tuple[Array, Array]:
+    """K = 0."""
+    return x, P
+
+
+def central(x: Array, P: Array, ybar: Array, update: Update, s: Setting) -> tuple[Array, Array]:
+    """Sequential central update: the posterior of node i is the prior of node i + 1; ybar (..., M, m)."""
+    for i in range(ybar.shape[-2]):
+        x, P = update(x, P, s["C"][i], ybar[..., i, :], s)
+    return x, P
+
+
+def intersect(x: Array, Xi: Array, w: Array) -> tuple[Array, Array]:
+    """(8) corrected: P = (sum w Xi^-1)^-1, xhat = P sum w Xi^-1 x; x (..., M, n)."""
+    J = w[..., None, None] * np.linalg.inv(Xi)
+    P = np.linalg.inv(J.sum(-3))
+    return np.einsum("...ij,...kjl,...kl->...i", P, J, x), P
+
+
+def trace_weights(Xi: Array) -> Array:
+    """(34) by SLSQP, one problem at a time: slow reference, scaled so that its tolerance is relative."""
+    J, w = np.linalg.inv(Xi / np.min(_tr(Xi), -1)[..., None, None, None]), np.empty(Xi.shape[:-2])
+    for index in np.ndindex(Xi.shape[:-3]):
+        w[index] = _simplex_minimum(J[index])
+    return w
+
+
+def _simplex_minimum(J: Array) -> Array:
+    def cost(v: Array) -> tuple[float, Array]:  # d tr P / dw_k = -tr P J_k P
+        P = np.linalg.inv(np.einsum("k,kij->ij", v, J))
+        return float(np.trace(P)), np.asarray(-np.einsum("ij,kjl,li->k", P, J, P))
+
+    w, box = np.full(len(J), 1 / len(J)), [(0.0, 1.0)] * len(J)
+    total = LinearConstraint(np.ones((1, len(J))), 1.0, 1.0)
+    return np.asarray(minimize(cost, w, (), "SLSQP", True, bounds=box, constraints=total, tol=1e-15).x)
+
+
+def inverse_intersection(a: Array, A: Array, b: Array, B: Array, w: float) -> tuple[Array, Array]:
+    """Inverse covariance intersection of two: P^-1 = A^-1 + B^-1 - G with G = (wA + (1-w)B)^-1."""
+    Ai, Bi, G = np.linalg.inv(A), np.linalg.inv(B), np.linalg.inv(w * A + (1 - w) * B)
+    P = np.linalg.inv(Ai + Bi - G)
+    z = np.einsum("...ij,...j->...i", Ai - w * G, a) + np.einsum("...ij,...j->...i", Bi - (1 - w) * G, b)
+    return np.einsum("...ij,...j->...i", P, z), P
+
+
+def simulate(s: Setting, runs: int, rng: np.random.Generator, laws: tuple[Array, Array]) -> dict[str, Array]:
+    """x (run, T+1, n); ybar (run, T, M, m), xi and gamma (run, T, M) at 1..T under the true laws given."""
+    M, m, n = s["C"].shape
+    x = np.empty((runs, s["T"] + 1, n))
+    x[:, 0] = rng.multivariate_normal(s["xbar0"], s["P0"], runs)
+    for k in range(s["T"]):
+        x[:, k + 1] = f(x[:, k], s) + rng.multivariate_normal(np.zeros(n), s["R"], runs)
+    shape = (runs, s["T"], M)
+    xi, gamma = (rng.choice(s[k][0], shape, p=q) for k, q in zip(("xi", "gamma"), laws, strict=True))
+    v, m, n = (rng.multivariate_normal(np.zeros(m), s[k], shape) for k in ("Q", "Qm", "Qn"))
+    z = np.sqrt(s["El"]) * gamma[..., None] * (np.einsum("iab,rtb->rtia", s["C"], x[:, 1:]) + v) + m
+    return {"x": x, "ybar": s["alpha"] * np.sqrt(s["Er"]) * xi[..., None] * z + n, "xi": xi, "gamma": gamma}
