@@ -1,0 +1,195 @@
+"""The one scan: it simulates the world, feeds every filter, and serves Monte Carlo runs and recordings alike."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.check import array, check_count, fail
+from heliograph.float64 import compiled, to_numpy
+from heliograph.groups import Group, NodeSteps, groups, scatter
+from heliograph.network import Network
+from heliograph.over_time import at
+from heliograph.random_affine.base import apply
+from heliograph.record import AbstractReducer, Record, Trajectories, trajectories_record
+
+Progress = Callable[[int, int], None]
+
+# What a key is for: folded in last, so that each use has its own stream.
+INITIAL, PROCESS, SENSOR, CHANNEL = range(4)
+WORLD = 0  # the plant's place among the node checksums
+
+BLOCK = 64  # runs simulated side by side: wide enough for vector units, small enough for the cache
+
+
+def monte_carlo(
+    network: Network,
+    horizon: int,
+    runs: int,
+    key: int | jax.Array,
+    keep: AbstractReducer | None = None,
+    inputs: Any = None,
+    chunk: int = 512,
+    progress: Progress | None = None,
+) -> Any:
+    """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
+
+    `key` is a seed or a JAX key; a run's draws depend on the key, the run, the step and the node's name alone, so
+    neither the chunk size nor another node changes a bit of them. `keep` says what is kept: `Trajectories()` (all,
+    the default) or `Statistics()` (bounded memory). `inputs` (horizon, inputs) are common to all runs.
+    `progress(done, total)` is called after each chunk of runs.
+
+    Returns a `Record` for trajectories, else what the reducer makes.
+
+    Raises:
+        ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one.
+    """
+    for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
+        check_count(name, count)
+    network.check_horizon(horizon)
+    reducer = Trajectories() if keep is None else keep
+    u = _check_inputs(network, inputs, horizon)
+    base = jax.random.key(key) if isinstance(key, int | np.integer) else key
+    chunk = BLOCK * -(-min(chunk, runs) // BLOCK)
+    with jax.enable_x64(True):
+        carry, parts = _initial(network, u, base, reducer), []
+        for start in range(0, runs, chunk):
+            blocks = np.arange(start, start + chunk).reshape(-1, BLOCK)
+            done = min(start + chunk, runs)
+            carry, kept = _chunk(network, u, base, blocks, np.asarray(runs), reducer, carry)
+            parts.append(jax.tree.map(lambda leaf: _flat(leaf)[: done - start], to_numpy(kept)))  # noqa: B023
+            if progress is not None:
+                progress(done, runs)
+    return reducer.finish(to_numpy(carry), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), network)
+
+
+def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, time: Any = None) -> Record:
+    """Run every filter of the network over recorded measurements.
+
+    measurements: for each node an array (steps, received), NaN where a component did not arrive. inputs: (steps,
+    inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given.
+
+    Raises:
+        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
+    """
+    unknown = sorted(set(measurements) ^ set(network.nodes))
+    if unknown:
+        raise fail("measurements", f"arrays for the nodes {sorted(network.nodes)}", f"a mismatch in {unknown}")
+    steps = len(next(iter(measurements.values())))
+    if steps == 0:
+        raise fail("measurements", "at least one row", "none")
+    z = {
+        name: _check_measurement(name, measurements[name], steps, node.received) for name, node in network.nodes.items()
+    }
+    network.check_horizon(steps)
+    u = _check_inputs(network, inputs, steps)
+    clock = np.arange(steps, dtype=np.float64) if time is None else array("time", time, (steps,))
+    if np.any(np.diff(clock) < 0):
+        row = int(np.flatnonzero(np.diff(clock) < 0)[0]) + 1
+        raise fail(
+            "time", "times that do not go backwards", f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
+        )
+    estimates = _run_filters(network, z, u)
+    return trajectories_record(network, {"truth": None, "measurements": z, "estimates": estimates}, clock)
+
+
+@compiled
+def _run_filters(network: Network, z: dict[str, Any], u: Any) -> Any:
+    parts = groups(network)
+    steps = NodeSteps(parts)
+
+    def body(states: Any, item: tuple[Any, ...]) -> tuple[Any, Any]:
+        k, u_k, z_k = item
+        gathered = [jnp.stack([z_k[name] for name in part.names]) for part in parts]
+        return steps(states, gathered, u_k, k)
+
+    length = u.shape[0]
+    _, estimates = jax.lax.scan(body, steps.init(), (jnp.arange(length), u, z))
+    return scatter(parts, estimates, axis=1)
+
+
+def _flat(leaf: np.ndarray) -> np.ndarray:
+    return leaf.reshape(-1, *leaf.shape[2:])
+
+
+def _block(network: Network, u: Any, key: jax.Array, runs: jax.Array) -> Any:
+    """Trajectories of one block of runs."""
+    parts = groups(network)
+    return jax.vmap(lambda index: _one_run(network, parts, u, jax.random.fold_in(key, index)))(runs)
+
+
+def _initial(network: Network, u: Any, key: jax.Array, reducer: AbstractReducer) -> Any:
+    """What the reducer holds before the first block."""
+    shapes = eqx.filter_eval_shape(_block, network, u, key, np.arange(BLOCK))
+    return reducer.initial(shapes)
+
+
+@eqx.filter_jit
+def _chunk(
+    network: Network, u: Any, key: jax.Array, blocks: Any, stop: Any, reducer: AbstractReducer, carry: Any
+) -> tuple[Any, Any]:
+    """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
+
+    def body(carry: Any, runs: jax.Array) -> tuple[Any, Any]:
+        return reducer.reduce(carry, _block(network, u, key, runs), runs, runs < stop)
+
+    return jax.lax.scan(body, carry, jnp.asarray(blocks))
+
+
+def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array) -> Any:
+    """One world and all filters on it: dictionaries of truth (time, n), measurements and estimates by node."""
+    steps = NodeSteps(parts)
+    x0 = at(network.plant, 0).sample_initial(_key(key, 0, WORLD, INITIAL))
+
+    def body(carry: tuple[Any, Any], item: tuple[Any, ...]) -> tuple[Any, Any]:
+        (x, states), (k, u_k) = carry, item
+        plant = at(network.plant, k)
+        x = plant.transition(x, u_k) + plant.sample_noise(_key(key, k, WORLD, PROCESS), u_k)
+        z = [_observe(part, x, key, k) for part in parts]
+        states, estimates = steps(states, z, u_k, k)
+        return (x, states), (x, z, estimates)
+
+    _, (truth, z, estimates) = jax.lax.scan(body, (x0, steps.init()), (jnp.arange(u.shape[0]), u))
+    by_node = {name: part_z[:, i] for part, part_z in zip(parts, z, strict=True) for i, name in enumerate(part.names)}
+    return {"truth": truth, "measurements": by_node, "estimates": scatter(parts, estimates, axis=1)}
+
+
+def _observe(part: Group, x: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
+    """What reaches the filters of a group of nodes at step k: (node, received)."""
+
+    def one(node: Any, checksum: jax.Array) -> jax.Array:
+        sensor, channel = at(node.sensor, k), at(node.channel, k)
+        y = sensor.measure(x) + sensor.noise.sample(_key(key, k, checksum, SENSOR))
+        return apply(channel.sample(_key(key, k, checksum, CHANNEL)), y)
+
+    observe = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
+    received: jax.Array = observe(part.stacked, jnp.asarray(part.checksums))
+    return received
+
+
+def _key(run_key: jax.Array, k: Any, place: Any, purpose: int) -> jax.Array:
+    """Key of one draw: folded in by step, node and purpose, so no draw depends on how many others there are."""
+    for part in (k, place, purpose):
+        run_key = jax.random.fold_in(run_key, part)
+    return run_key
+
+
+def _check_inputs(network: Network, inputs: Any, horizon: int) -> np.ndarray:
+    count = len(network.inputs)
+    if inputs is None and count:
+        raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
+    return np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
+
+
+def _check_measurement(name: str, value: Any, steps: int, received: int) -> np.ndarray:
+    result = np.asarray(value, dtype=np.float64)
+    if result.ndim == 1 and received == 1:
+        result = result[:, None]
+    if result.shape != (steps, received):
+        raise fail(f"measurements of node {name!r}", f"shape ({steps}, {received})", f"shape {result.shape}")
+    if np.any(np.isinf(result)):
+        raise fail(f"measurements of node {name!r}", "numbers, or NaN for what is missing", "infinite values")
+    return result
