@@ -1,0 +1,144 @@
+"""The command `heliograph`: it reads files, calls the library and writes files. Help must not wait for JAX."""
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Annotated
+
+from cyclopts import App, CycloptsError, Parameter
+
+import heliograph
+
+BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143  # the last two are 128 + the signal's number
+
+EXTRAS = {  # the extra that brings a package which the core does without
+    "pyarrow": "tables",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "gtsam": "recordings",
+    "cvxpy": "lmi",
+    "clarabel": "lmi",
+    "scs": "lmi",
+    "xarray": "sweep",
+    "zarr": "sweep",
+    "h5netcdf": "sweep",
+    "h5py": "sweep",
+    "dask": "cluster",
+    "distributed": "cluster",
+}
+
+app = App(
+    name="heliograph",
+    help="State estimation over relay networks.",
+    version=heliograph.__version__,
+    help_format="plaintext",
+)
+
+
+@app.command
+def run(
+    network: str,
+    /,
+    *,
+    measurements: Annotated[Path, Parameter(help="CSV or Parquet: time, inputs and received measurements.")],
+    out: Annotated[Path, Parameter(help="CSV or Parquet to write: estimates with their claimed covariances.")],
+) -> None:
+    """Run the filters of your own network over measured data.
+
+    Parameters
+    ----------
+    network:
+        A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
+        holds several. The name may be that of a function that returns one.
+    """
+    from heliograph.check import fail
+    from heliograph.table import check_output
+
+    check_output(out)
+    if out.resolve() == measurements.resolve():
+        raise fail(f"output file {out}", "another file than the measurements", "the same")
+    with _progress("Starting") as say:
+        from heliograph.load import load_network
+        from heliograph.recording import read_recording, write_estimates
+
+        loaded = load_network(network)
+        if not any(node.filters for node in loaded.nodes.values()):
+            raise fail(f"network {network}", "at least one filter to run", "none")
+        recording = read_recording(measurements, loaded)
+        say(f"Filtering {len(recording.time)} rows")
+        record = heliograph.run(loaded, *recording)
+        say(f"Writing {out}")
+        write_estimates(record, out)
+    for failure in record.failures():
+        print(f"heliograph: warning: {failure}", file=sys.stderr)
+    filters = [
+        f"{node}/{name} ({estimate.claim})"
+        for node, estimates in record.estimates.items()
+        for name, estimate in estimates.items()
+    ]
+    print(f"{out}: {len(record.time)} rows of {', '.join(filters)}")
+
+
+@app.command
+def demo(
+    *,
+    out: Annotated[Path, Parameter(help="Folder for the estimates, figures, report and summary; made if missing.")],
+    seed: Annotated[int, Parameter(help="Seed of the simulated relays.")] = 0,
+) -> None:
+    """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
+    from heliograph.demo import run_demo
+
+    run_demo(out, seed)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
+    before = signal.signal(signal.SIGTERM, _terminate)
+    try:
+        command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
+        command(*bound.args, **bound.kwargs)
+        return 0
+    except (CycloptsError, ValueError) as error:
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return _refuse(
+            f'{error.name}: expected to be installed, got no such package: pip install "heliograph[{extra}]"'
+        )
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _refuse(message: str) -> int:
+    print("heliograph:", " ".join(message.split()), file=sys.stderr)
+    return BAD_INPUT
+
+
+def _terminate(_: int, __: FrameType | None) -> None:
+    raise SystemExit(TERMINATED)  # unwinds, so that no temporary file stays
+
+
+@contextmanager
+def _progress(message: str) -> Iterator[Callable[[str], None]]:
+    """A spinner on stderr with a message that can be changed; nothing where stderr is not a terminal."""
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as shown:
+        task = shown.add_task(message)
+        yield lambda text: shown.update(task, description=text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

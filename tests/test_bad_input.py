@@ -1,0 +1,194 @@
+"""Bad input is a ValueError at construction: one line that names the thing, what was expected and what came."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as h
+from heliograph.filter.base import Claim
+
+EYE = np.eye(2)
+SKEWED = [[1.0, 0.5], [0.4, 1.0]]
+INDEFINITE = [[1.0, 2.0], [2.0, 1.0]]
+NAN, INF = np.nan, np.inf
+
+
+def still(x, u):
+    return x
+
+
+def plant() -> h.LinearPlant:
+    return h.LinearPlant(EYE, EYE, [0, 0], EYE)
+
+
+def driven() -> h.LinearPlant:
+    return h.LinearPlant(EYE, EYE, [0, 0], EYE, input_matrix=[[1.0], [0.0]], inputs=["push"])
+
+
+def sensor() -> h.LinearSensor:
+    return h.LinearSensor([[1.0, 0.0]], 1.0)
+
+
+def seen_by(seeing) -> h.Network:
+    return h.Network(plant(), {"a": h.Node(seeing, h.perfect(len(seeing.outputs)), {})})
+
+
+def node() -> h.Node:
+    return h.Node(sensor(), h.perfect(), {"aware": h.cubature_filter(plant(), sensor(), h.perfect())})
+
+
+def network() -> h.Network:
+    return h.Network(plant(), {"a": node()})
+
+
+def lasting(steps: int) -> h.Network:
+    channel = h.over_time([h.hop(0.5 + k, 0.1) for k in range(steps)])
+    return h.Network(plant(), {"a": h.Node(sensor(), channel, {})})
+
+
+def one_per_step(*lengths: int) -> h.OverTime:
+    return h.OverTime({str(i): np.zeros(n) for i, n in enumerate(lengths)})
+
+
+SHAPES = [
+    (lambda: h.LinearPlant(np.eye(3), EYE, [0, 0], EYE), "plant matrix", "shape (3, 3)"),
+    (lambda: h.LinearPlant([[1, 0], [1]], EYE, [0, 0], EYE), "plant matrix", "[[1, 0], [1]]"),
+    (lambda: h.LinearPlant(EYE, np.eye(3), [0, 0], EYE), "process noise", "shape (3, 3)"),
+    (lambda: h.LinearPlant(EYE, h.Gaussian(np.eye(3)), [0, 0], EYE), "process noise", "dimension 3"),
+    (lambda: h.LinearPlant(EYE, EYE, EYE, EYE), "initial mean", "shape (2, 2)"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], [1, 1]), "initial covariance", "shape (2,)"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], EYE, [[1.0]]), "input matrix", "shape (1, 1)"),
+    (lambda: h.Plant(lambda x, u: x[:1], EYE, [0, 0], EYE), "transition(x, u)", "shape (1,)"),
+    (lambda: h.Plant(still, lambda u: jnp.eye(3), [0, 0], EYE), "process noise covariance(u)", "shape (3, 3)"),
+    (lambda: h.Plant(still, EYE, [0, 0], EYE, states=["x"]), "state names", "['x']"),
+    (lambda: h.Plant(still, EYE, [0, 0], EYE, states=["x", "x"]), "state names", "['x', 'x']"),
+    (lambda: h.Plant(still, EYE, [0, 0], EYE, inputs=["u", "u"]), "input names", "['u', 'u']"),
+    (lambda: h.LinearSensor([1.0, 0.0], 1.0), "sensor matrix", "shape (2,)"),
+    (lambda: h.LinearSensor(EYE, 1.0, outputs=["y"]), "sensor outputs", "['y']"),
+    (lambda: h.LinearSensor(EYE, [[1.0]]), "sensor noise", "shape (1, 1)"),
+    (lambda: h.Sensor(lambda x: x, np.eye(3), outputs=["a", "b"]), "sensor noise", "shape (3, 3)"),
+    (lambda: seen_by(h.Sensor(lambda x: x, 1.0)), "sensor", "shape (2,)"),
+    (lambda: seen_by(h.LinearSensor(np.eye(3), 1.0)), "sensor", "(3,) and (2,)"),
+    (lambda: h.Network(plant(), {"a": h.Node(sensor(), h.perfect(2), {})}), "channel", "2 inputs"),
+    (lambda: h.cubature_filter(plant(), sensor(), h.perfect(2)), "channel", "2 inputs"),
+    (lambda: h.cubature_filter(plant(), sensor(), h.perfect(), initial_mean=[0]), "filter's initial mean", "(1,)"),
+    (lambda: h.amplify_and_forward([h.perfect(1), h.perfect(2)]), "series", "takes 2"),
+    (lambda: h.with_direct_link(h.perfect(1), h.perfect(2)), "stack", "[1, 2]"),
+    (lambda: h.Mixture([h.perfect(1), h.perfect(2)], [0.5, 0.5]), "mixture", "[(1, 1), (2, 2)]"),
+    (lambda: h.hop(1.0, np.ones((2, 3))), "hop noise", "shape (2, 3)"),
+    (lambda: h.Discrete([[1.0]], [1.0]), "gain values", "shape (1, 1)"),
+    (lambda: h.Discrete([1.0, 2.0], [1.0]), "gain probabilities", "shape (1,)"),
+    (lambda: one_per_step(2, 3), "OverTime", "['2', '3']"),
+    (lambda: h.over_time([h.perfect(1), h.perfect(2)]), "stack", "objects that differ"),
+]  # fmt: skip
+
+PROBABILITIES = [
+    (lambda: h.Discrete([1, 2], [0.5, 0.6]), "gain probabilities", "sum 1.1"),
+    (lambda: h.Discrete([1, 2], [-0.1, 1.1]), "gain probabilities", "[-0.1, 1.1]"),
+    (lambda: h.Discrete([1, 2], [NAN, 1.0]), "gain probabilities", "1 that are not finite"),
+    (lambda: h.Discrete([1, 2], [0.5, 0.5], -0.1), "probability radius", "-0.1"),
+    (lambda: h.Discrete([1, 2], [0.5, 0.5], 0.6), "probability radius", "0.6"),
+    (lambda: h.Discrete([1, 2], [0.5, 0.5], [0.1, 0.1, 0.1]), "probability radius", "shape (3,)"),
+    (lambda: h.bernoulli(1.2), "probability that a link works", "1.2"),
+    (lambda: h.dropout(h.perfect(), -0.2), "arrival probability", "-0.2"),
+    (lambda: h.Mixture([h.perfect(), h.silent()], [0.7, 0.7]), "gain probabilities", "sum 1.4"),
+    (lambda: h.FiniteSupport([[1.0], [2.0]], [0.7, 0.7]), "noise probabilities", "sum 1.4"),
+]
+
+COVARIANCES = [
+    (lambda: h.LinearPlant(EYE, SKEWED, [0, 0], EYE), "process noise", "differ by 0.1"),
+    (lambda: h.LinearPlant(EYE, INDEFINITE, [0, 0], EYE), "process noise", "eigenvalue -1"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], SKEWED), "initial covariance", "differ by 0.1"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], INDEFINITE), "initial covariance", "eigenvalue -1"),
+    (lambda: h.LinearSensor(EYE, SKEWED), "sensor noise", "differ by 0.1"),
+    (lambda: h.LinearSensor([[1.0, 0.0]], -1.0), "sensor noise", "eigenvalue -1"),
+    (lambda: h.hop(1.0, INDEFINITE), "hop noise", "eigenvalue -1"),
+    (lambda: h.hop(1.0, -0.5), "hop noise", "eigenvalue -0.5"),
+    (lambda: h.silent(2, noise=SKEWED), "noise of a silent channel", "differ by 0.1"),
+    (lambda: h.Gaussian(INDEFINITE), "noise covariance", "eigenvalue -1"),
+    (lambda: h.cubature_filter(plant(), sensor(), h.perfect(), initial_covariance=INDEFINITE),
+     "filter's initial covariance", "eigenvalue -1"),
+    (lambda: h.GivenMoments([1.0, 0.5]), "gain moments", "which none has"),
+]  # fmt: skip
+
+NUMBERS = [
+    (lambda: h.LinearPlant([[1, NAN], [0, 1]], EYE, [0, 0], EYE), "plant matrix", "1 that are not finite"),
+    (lambda: h.LinearPlant(EYE, [[INF, 0], [0, INF]], [0, 0], EYE), "process noise", "2 that are not finite"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, NAN], EYE), "initial mean", "1 that are not finite"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], NAN), "initial covariance", "1 that are not finite"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], EYE, [[NAN], [0]]), "input matrix", "1 that are not finite"),
+    (lambda: h.LinearPlant("A", EYE, [0, 0], EYE), "plant matrix", "'A'"),
+    (lambda: h.LinearSensor([[INF, 0]], 1.0), "sensor matrix", "1 that are not finite"),
+    (lambda: h.LinearSensor(EYE, NAN), "sensor noise", "1 that are not finite"),
+    (lambda: h.hop(NAN, 0.1), "constant gain", "1 that are not finite"),
+    (lambda: h.hop(1.0, NAN), "hop noise", "1 that are not finite"),
+    (lambda: h.hop(1.0, 0.1, power=-1.0), "hop power", "-1"),
+    (lambda: h.hop(1.0, 0.1, amplification=INF), "amplification", "1 that are not finite"),
+    (lambda: h.Gaussian([[1.0]], [NAN]), "noise mean", "1 that are not finite"),
+    (lambda: h.Discrete([1, INF], [0.5, 0.5]), "gain values", "1 that are not finite"),
+    (lambda: h.Rayleigh(-1.0), "Rayleigh scale", "-1"),
+    (lambda: h.Rician(-1.0, 1.0), "Rician line of sight", "-1"),
+    (lambda: h.Rician(1.0, 0.0), "Rician scale", "got 0"),
+    (lambda: h.Nakagami(0.4), "Nakagami shape", "0.4"),
+    (lambda: h.LogNormal(0.0, -1.0), "log-normal deviation", "-1"),
+    (lambda: h.GivenMoments([NAN]), "gain moments", "1 that are not finite"),
+    (lambda: h.ZeroMean(-1.0), "scalar of the bound", "-1"),
+    (lambda: h.Scalars(0.0, 1.0), "scalars of the bound", "(0.0, 1.0)"),
+]
+
+MISSING = [
+    (lambda: h.Network(plant(), {}), "network", "none"),
+    (lambda: h.amplify_and_forward([]), "series", "none"),
+    (lambda: h.parallel([]), "parallel channels", "none"),
+    (lambda: h.over_time([]), "over_time", "none"),
+    (lambda: h.linear_filter(h.Plant(still, EYE, [0, 0], EYE), sensor(), h.perfect()), "linear filter", "Plant"),
+]
+
+RUNS = [
+    (lambda: h.run(network(), {}), "measurements", "['a']"),
+    (lambda: h.run(network(), {"a": [1.0], "b": [1.0]}), "measurements", "['b']"),
+    (lambda: h.run(network(), {"a": []}), "measurements", "none"),
+    (lambda: h.run(network(), {"a": np.zeros((3, 2))}), "measurements of node 'a'", "shape (3, 2)"),
+    (lambda: h.run(network(), {"a": [1.0, INF]}), "measurements of node 'a'", "infinite"),
+    (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0, 0.5]), "time", "0.5 after 1"),
+    (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0]), "time", "shape (1,)"),
+    (lambda: h.run(h.Network(driven(), {"a": node()}), {"a": [1.0]}), "inputs", "none"),
+    (lambda: h.run(h.Network(driven(), {"a": node()}), {"a": [1.0]}, [[NAN]]), "inputs", "not finite"),
+    (lambda: h.run(lasting(2), {"a": [1.0, 2.0, 3.0]}), "horizon", "got 3"),
+    (lambda: h.monte_carlo(lasting(2), 3, 1, 0), "horizon", "got 3"),
+    (lambda: h.monte_carlo(network(), 0, 1, 0), "horizon", "got 0"),
+    (lambda: h.monte_carlo(network(), 1, 0, 0), "runs", "got 0"),
+    (lambda: h.monte_carlo(network(), 1, 1, 0, inputs=np.zeros((1, 3))), "inputs", "shape (1, 3)"),
+    (lambda: h.Stream(node().filters["aware"]).push([INF]), "measurement", "[inf]"),
+]
+
+
+@pytest.mark.parametrize(("make", "name", "came"), [*SHAPES, *PROBABILITIES, *COVARIANCES, *NUMBERS, *MISSING, *RUNS])
+def test_one_line_that_names_it(make, name, came):
+    with pytest.raises(ValueError) as caught:
+        make()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith(f"{name}: expected ")
+    assert came in "got " + message.split(", got ", 1)[1]
+
+
+class Losing(h.AbstractFilter):
+    """A filter whose covariance is indefinite from its third step."""
+
+    claim: Claim = eqx.field(static=True, default="nominal")
+
+    def init(self):
+        return jnp.zeros(2)
+
+    def step(self, state, z, u=(), k=0):
+        lost = jnp.where(k >= 2, -1.0, 1.0)
+        return state, h.Estimate(state, jnp.diag(jnp.stack([1.0, lost])), self.claim)
+
+
+def test_a_covariance_that_is_lost_is_flagged_and_kept():
+    net = h.Network(plant(), {"a": h.Node(sensor(), h.perfect(), {"losing": Losing()})})
+    record = h.run(net, {"a": np.zeros(4)})
+    assert record.failures() == ["a/losing: no valid covariance from step 2 in 1 of 1 runs"]
+    np.testing.assert_array_equal(np.asarray(record.estimates["a"]["losing"].bound)[:, 1, 1], [1, 1, -1, -1])
