@@ -1,0 +1,259 @@
+"""The demonstration: a robot mower's recorded ranges, through a simulated relay, to filters that know it or do not."""
+
+import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+from pathlib import Path
+from textwrap import fill
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import rich.box
+import rich.console
+import rich.progress
+import rich.table
+
+from heliograph.channel import hop, perfect
+from heliograph.check import fail
+from heliograph.examples import plaza
+from heliograph.filter.base import Estimate
+from heliograph.filter.gaussian import cubature_filter
+from heliograph.float64 import compiled
+from heliograph.network import Network, Node
+from heliograph.output_folder import check_replaceable, whole_folder
+from heliograph.plaza_recording import PlazaRecording, read_recording
+from heliograph.random_affine.base import AbstractRandomAffine, apply
+from heliograph.random_affine.second_order import second_order
+from heliograph.record import Record
+from heliograph.recording import write_estimates
+from heliograph.simulate import run
+from heliograph.table import write_table
+
+SUMMARY = "summary.json"  # also tells an earlier demonstration from other folders
+SEEDS = 5  # seeds of the relay for the spread: the one asked for and those after it
+NAMES = ("relay_aware", "extra_noise", "mean_gain", "perfect_channel", "open_loop")
+TABLE_HEADERS = (
+    "filter",
+    "RMSE (m)",
+    "claimed (m)",
+    "NEES / dim",
+    "in 95 % ellipse",
+    "RMSE, all seeds",
+    "NEES, all seeds",
+)
+INSIDE_95 = -2 * np.log(0.05)  # 95 % point of chi-square with two degrees of freedom
+
+
+@dataclass(frozen=True)
+class Score:
+    """How far off the position is, and whether the filter knew.
+
+    NEES e' B^-1 e / 2 of the 2-D position error e against the claimed covariance B; 1 is honest. claimed_rmse_m:
+    root of the mean trace of B. inside_95: share of rows where the truth lies inside the claimed 95 % ellipse.
+    """
+
+    position_rmse_m: float
+    claimed_rmse_m: float
+    nees_per_dimension: float
+    inside_95: float
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One draw of the relay: what arrived (rows, 4), every filter's estimates and scores."""
+
+    seed: int
+    received: np.ndarray
+    estimates: dict[str, Estimate]
+    scores: dict[str, Score]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """All that the demonstration found: one trial for each seed, the first of them shown in full."""
+
+    recording: PlazaRecording
+    extra_variance: float
+    trials: list[Trial]
+
+
+def relay(channel: AbstractRandomAffine, signals: np.ndarray, seed: int) -> np.ndarray:
+    """Send recorded signals (rows, inputs) through the channel, drawn anew for each row; NaN stays NaN."""
+    missing = np.isnan(signals)
+    return np.where(missing, np.nan, _send(channel, np.where(missing, 0.0, signals), np.asarray(seed)))
+
+
+@compiled
+def _send(channel: AbstractRandomAffine, signals: Any, seed: Any) -> Any:
+    keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(len(signals)))
+    return jax.vmap(lambda key, y: apply(channel.sample(key), y))(keys, signals)
+
+
+def average_noise(path: AbstractRandomAffine, signals: np.ndarray) -> float:
+    """Variance of z - E[z | y] on one path, averaged over the recorded signals: a constant in place of fading."""
+    y = signals[~np.isnan(signals)]
+    moments = np.array([[np.mean(y**2), np.mean(y)], [np.mean(y), 1.0]])
+    with jax.enable_x64(True):
+        return float(second_order(path).spread(jnp.asarray(moments), jnp.array([True]))[0, 0])
+
+
+def networks(extra_variance: float) -> Network:
+    """The example's node with one more competitor, and a node that hears the ranges without any relay."""
+    node, count = plaza.network.nodes["robot"], len(plaza.BEACONS)
+    extra = cubature_filter(plaza.plant, plaza.sensor, hop(1.0, extra_variance, dimension=count))
+    direct = cubature_filter(plaza.plant, plaza.sensor, perfect(count))
+    relayed = Node(node.sensor, node.channel, node.filters | {"extra_noise": extra})
+    return Network(
+        plaza.plant, {"robot": relayed, "direct": Node(plaza.sensor, perfect(count), {"perfect_channel": direct})}
+    )
+
+
+def one_trial(recording: PlazaRecording, network: Network, seed: int) -> Trial:
+    """Draw the relay, run every filter, and score it."""
+    received = relay(plaza.channel, recording.ranges, seed)
+    measurements = {"robot": received, "direct": recording.ranges}
+    record = run(network, measurements, recording.odometry, recording.time)
+    if failures := record.failures():
+        raise fail("demonstration", "sound estimates", "; ".join(failures))
+    by_name = {name: e for filters in record.estimates.values() for name, e in filters.items()}
+    estimates = {name: by_name[name] for name in NAMES}
+    return Trial(seed, received, estimates, {name: score(e, recording.truth) for name, e in estimates.items()})
+
+
+def position_nees(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
+    """e' B^-1 e / 2 of the position at each row, (rows,)."""
+    error = (np.asarray(estimate.mean) - truth)[:, :2, None]
+    weighted = np.linalg.solve(np.asarray(estimate.bound)[:, :2, :2], error)
+    result: np.ndarray = np.sum(error * weighted, axis=(1, 2)) / 2
+    return result
+
+
+def score(estimate: Estimate, truth: np.ndarray) -> Score:
+    """Score one filter's estimates of the position."""
+    nees = position_nees(estimate, truth)
+    squared = np.sum((np.asarray(estimate.mean) - truth)[:, :2] ** 2, axis=1)
+    claimed = np.trace(np.asarray(estimate.bound)[:, :2, :2], axis1=1, axis2=2)
+    inside = np.mean(2 * nees <= INSIDE_95)
+    return Score(float(np.sqrt(squared.mean())), float(np.sqrt(claimed.mean())), float(nees.mean()), float(inside))
+
+
+def compute(recording: PlazaRecording, seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
+    """Run the trials of SEEDS seeds; `advance` is told what begins."""
+    extra_variance = average_noise(plaza.relay, recording.ranges)
+    network, trials = networks(extra_variance), []
+    for s in range(seed, seed + SEEDS):
+        advance(f"relay and filters, seed {s}")
+        trials.append(one_trial(recording, network, s))
+    return Outcome(recording, extra_variance, trials)
+
+
+def run_demo(out: Path, seed: int = 0) -> None:
+    """Run the demonstration, print its table, and write estimates, figures, report and summary to `out`/demo.
+
+    The folder appears whole or not at all, in place of an earlier demonstration's.
+
+    Raises:
+        ValueError: a folder that cannot be written, or one that holds something else.
+        ModuleNotFoundError: an extra of `recordings`, `report`, `tables` is not installed.
+    """
+    import pyarrow  # noqa: F401  a missing extra is told before the work starts
+
+    from heliograph.report.demo_page import demo_figures, demo_page
+    from heliograph.report.figures import png, svg
+
+    target = Path(out) / "demo"
+    check_replaceable(target, SUMMARY)
+    with progress(SEEDS + 3) as advance, whole_folder(target) as folder:
+        advance("reading the recording")
+        outcome = compute(read_recording(), seed, advance)
+        advance("drawing")
+        figures = demo_figures(outcome)
+        drawings = {name: svg(figure) for name, figure in figures.items()}
+        for name, figure in figures.items():
+            (folder / f"{name}.png").write_bytes(png(figure))
+            (folder / f"{name}.svg").write_bytes(drawings[name])
+        advance("writing")
+        (folder / "report.html").write_text(demo_page(outcome, drawings).html(), encoding="utf-8")
+        write_data(outcome, folder)
+    print_table(outcome, target)
+
+
+def write_data(outcome: Outcome, folder: Path) -> None:
+    """Write what arrived with the odometry, all estimates of the first seed, and the summary."""
+    trial, recording = outcome.trials[0], outcome.recording
+    columns = {"time": recording.time}
+    columns |= dict(zip(plaza.plant.inputs, recording.odometry.T, strict=True))
+    columns |= dict(zip(plaza.sensor.outputs, trial.received.T, strict=True))
+    write_table(columns, folder / "measurements.csv")
+    record = Record(recording.time, plaza.plant.states, None, {}, {"robot": trial.estimates})
+    write_estimates(record, folder / "estimates.parquet")
+    (folder / SUMMARY).write_text(json.dumps(summary(outcome), indent=2) + "\n", encoding="utf-8")
+
+
+def summary(outcome: Outcome) -> dict[str, Any]:
+    """The scores by quantity and filter: of the first seed at the top, of all seeds under `seeds`."""
+    quantities = [field.name for field in fields(Score)]
+    trials = outcome.trials
+    spread = {q: {n: [getattr(t.scores[n], q) for t in trials] for n in NAMES} for q in quantities}
+    top = {q: {n: values[0] for n, values in by_name.items()} for q, by_name in spread.items()}
+    start = {"recording": "Plaza2", "rows": len(outcome.recording.time), "seed": trials[0].seed}
+    return {**start, **top, "seeds": {"seed": [t.seed for t in trials], **spread}}
+
+
+def table_rows(outcome: Outcome) -> list[list[str]]:
+    """One row for each filter: name, scores of the first seed, and their range over all seeds; see TABLE_HEADERS."""
+    rows = []
+    for name in NAMES:
+        shown, scores = outcome.trials[0].scores[name], [t.scores[name] for t in outcome.trials]
+        errors, nees = [s.position_rmse_m for s in scores], [s.nees_per_dimension for s in scores]
+        one = shown.position_rmse_m, shown.claimed_rmse_m, shown.nees_per_dimension
+        rows.append([name, *map(_short, one), f"{100 * shown.inside_95:.1f} %", _spread(errors), _spread(nees)])
+    return rows
+
+
+def _short(value: float) -> str:
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
+
+
+def _spread(values: list[float]) -> str:
+    low, high = _short(min(values)), _short(max(values))
+    return low if low == high else f"{low}–{high}"
+
+
+def print_table(outcome: Outcome, target: Path) -> None:
+    """Print the table and where the report is."""
+    seeds = f"{outcome.trials[0].seed} to {outcome.trials[-1].seed}"
+    title = f"Position of the robot: relay seed {outcome.trials[0].seed}, and the range over seeds {seeds}"
+    table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 0, 0, 1), title=title)
+    rows = table_rows(outcome)
+    for header in TABLE_HEADERS:  # two lines each, so that the table fits 80 columns
+        table.add_column(fill(header, 9), justify="right" if table.columns else "left", no_wrap=True)
+    for row in rows:
+        table.add_row(*row)
+    console = rich.console.Console()
+    console.print(table)
+    console.print(f"Report: {target / 'report.html'}", soft_wrap=True, highlight=False)
+
+
+@contextmanager
+def progress(total: int) -> Iterator[Callable[[str], None]]:
+    """A progress bar on stderr; the callable says what begins, and counts what was begun before as done."""
+    columns = (
+        rich.progress.TextColumn("{task.description}"),
+        rich.progress.BarColumn(),
+        rich.progress.TimeElapsedColumn(),
+    )
+    console = rich.console.Console(stderr=True)
+    with rich.progress.Progress(*columns, console=console, transient=True) as shown:
+        task = shown.add_task("starting", total=total)
+        begun = 0
+
+        def advance(what: str) -> None:
+            nonlocal begun
+            shown.update(task, description=what, completed=begun)
+            begun += 1
+
+        yield advance

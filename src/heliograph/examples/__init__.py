@@ -1,0 +1,1 @@
+"""Networks written as users write them; each file runs with `heliograph run`."""

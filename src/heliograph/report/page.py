@@ -1,0 +1,122 @@
+"""One self-contained HTML page made of sections of blocks: text, key figures, tables, pictures and code."""
+
+import re
+from base64 import b64encode
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+
+@dataclass(frozen=True)
+class Text:
+    """Paragraphs; `**strong**` and backquoted code are understood, everything else is taken as it is."""
+
+    paragraphs: Sequence[str]
+    kind: str = "text"
+
+
+@dataclass(frozen=True)
+class Points:
+    """A list of points, written as paragraphs are."""
+
+    points: Sequence[str]
+    kind: str = "points"
+
+
+@dataclass(frozen=True)
+class KeyFigure:
+    """One number to remember: what it says, the number with its unit, and a colour that names it in the figures."""
+
+    label: str
+    value: str
+    note: str
+    colour: str
+
+
+@dataclass(frozen=True)
+class KeyFigures:
+    """Numbers to remember, side by side."""
+
+    figures: Sequence[KeyFigure]
+    kind: str = "key_figures"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells under headers; the first column names the row, with a dot in its colour if `colours` are given.
+
+    Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines.
+    """
+
+    headers: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    caption: str = ""
+    colours: Sequence[str] | None = None
+    wordy: bool = False
+    kind: str = "table"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An SVG figure with a caption, and a description for those who do not see it."""
+
+    svg: bytes
+    description: str
+    caption: str = ""
+    kind: str = "picture"
+
+    @property
+    def address(self) -> str:
+        """The picture itself as a data address, so that the page needs no other file."""
+        return "data:image/svg+xml;base64," + b64encode(self.svg).decode()
+
+
+@dataclass(frozen=True)
+class Code:
+    """Lines to type or to read."""
+
+    text: str
+    kind: str = "code"
+
+
+Block = Text | Points | KeyFigures | Table | Picture | Code
+
+
+@dataclass(frozen=True)
+class Section:
+    """A titled part of the page."""
+
+    title: str
+    blocks: Sequence[Block]
+
+
+@dataclass(frozen=True)
+class Page:
+    """A page: a kicker above its title, a lead below, sections, and a last line."""
+
+    kicker: str
+    title: str
+    lead: str
+    sections: Sequence[Section]
+    footer: str = ""
+
+    def html(self) -> str:
+        """The whole page as HTML that loads nothing from anywhere."""
+        environment = Environment(
+            loader=PackageLoader("heliograph.report", "."),
+            autoescape=True,
+            undefined=StrictUndefined,
+            trim_blocks=True,
+            lstrip_blocks=True,
+        )
+        environment.filters["rich"] = rich
+        return environment.get_template("page.html.j2").render(page=self)
+
+
+def rich(text: str) -> Markup:
+    """Escape a text, then set `**strong**` and backquoted code."""
+    safe = str(escape(text))
+    safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
+    return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))

@@ -1,0 +1,205 @@
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph import demo
+from heliograph.demo import NAMES, SEEDS, Outcome, average_noise, compute, relay, run_demo, score
+from heliograph.examples import plaza
+from heliograph.filter.base import Estimate
+from heliograph.plaza_recording import PlazaRecording, read_recording
+from heliograph.recording import read_recording as read_measurements
+
+
+@pytest.fixture(scope="module")
+def recording() -> PlazaRecording:
+    return read_recording()
+
+
+@pytest.fixture(scope="module")
+def outcome(recording: PlazaRecording) -> Outcome:
+    return compute(recording, 0)
+
+
+@pytest.fixture(scope="module")
+def folder(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("run") / "new" / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(demo, "compute", lambda *_: outcome)  # computed once for all tests
+        run_demo(out)
+    assert [p.name for p in out.iterdir()] == ["demo"]  # nothing temporary is left beside it
+    return out / "demo"
+
+
+def cubature_oracle(
+    recording: PlazaRecording, received: np.ndarray, gain_variance: float, noise: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The textbook cubature filter in NumPy, Var(z) = Pyy + gain_variance (Pyy + y^2) + noise for each component."""
+
+    def points(x: np.ndarray, p: np.ndarray) -> np.ndarray:
+        spread = np.sqrt(3) * np.linalg.cholesky(p).T
+        return np.asarray(x + np.vstack([spread, -spread]))
+
+    x, p, means, covariances = plaza.START, np.diag(plaza.START_DEVIATION**2), [], []
+    for (distance, turn, dt), z in zip(recording.odometry, received, strict=True):
+        turn = turn - plaza.GYRO_RATE * dt
+        c = points(x, p)
+        course = c[:, 2] + turn / 2
+        c = c + np.column_stack([distance * np.cos(course), distance * np.sin(course), np.full(6, turn)])
+        x = c.mean(0)
+        walk = [plaza.POSITION_WALK * distance] * 2 + [plaza.HEADING_WALK * dt]
+        p = (c - x).T @ (c - x) / 6 + np.diag(walk)
+        c = points(x, p)
+        b = plaza.BEACONS[~np.isnan(z)]
+        y = plaza.RANGE_SCALE * np.linalg.norm(c[:, None, :2] - b, axis=-1)
+        mean, pyy = y.mean(0), (y - y.mean(0)).T @ (y - y.mean(0)) / 6 + plaza.RANGE_VARIANCE * np.eye(len(b))
+        s = pyy + np.diag(gain_variance * (np.diag(pyy) + mean**2) + noise)
+        k = (c - x).T @ (y - mean) / 6 @ np.linalg.inv(s)
+        x, p = x + k @ (z[~np.isnan(z)] - mean), p - k @ s @ k.T
+        means.append(x)
+        covariances.append(p)
+    return np.array(means), np.array(covariances)
+
+
+SECOND = 0.25 * 0.8**2 + 0.5 + 0.25 * 1.2**2  # E[g^2] of one hop
+RELAY_NOISE = (SECOND + 1) * plaza.HOP_VARIANCE
+
+
+@pytest.mark.parametrize(
+    ("name", "gain_variance", "noise"),
+    [
+        ("relay_aware", SECOND**2 - 1, RELAY_NOISE),
+        ("mean_gain", 0.0, 2 * plaza.HOP_VARIANCE),
+        ("perfect_channel", 0.0, 0.0),
+    ],
+)
+def test_filters_are_the_textbook_ones(
+    recording: PlazaRecording, outcome: Outcome, name: str, gain_variance: float, noise: float
+) -> None:
+    trial = outcome.trials[0]
+    received = recording.ranges if name == "perfect_channel" else trial.received
+    mean, covariance = cubature_oracle(recording, received, gain_variance, noise)
+    # Rounding only; errors of 1e-16 grow over 1816 steps of a stable filter by little.
+    np.testing.assert_allclose(trial.estimates[name].mean, mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(trial.estimates[name].bound, covariance, rtol=0, atol=1e-9)
+
+
+def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:
+    assert [t.seed for t in outcome.trials] == list(range(SEEDS))
+    for trial in outcome.trials:
+        aware, mean, extra = (trial.scores[name] for name in ("relay_aware", "mean_gain", "extra_noise"))
+        assert aware.position_rmse_m <= 2.2  # the project's own requirement, as the two below
+        assert 0.6 <= aware.nees_per_dimension <= 1.5
+        assert mean.position_rmse_m >= 2.3 * aware.position_rmse_m
+        assert mean.nees_per_dimension > 100
+        assert trial.scores["perfect_channel"].position_rmse_m < aware.position_rmse_m < extra.position_rmse_m
+        assert mean.position_rmse_m < trial.scores["open_loop"].position_rmse_m
+
+
+def test_relay_draws_follow_the_channel(recording: PlazaRecording) -> None:
+    received = relay(plaza.channel, recording.ranges, 3)
+    heard = ~np.isnan(recording.ranges)
+    np.testing.assert_array_equal(np.isnan(received), ~heard)
+    np.testing.assert_array_equal(received, relay(plaza.channel, recording.ranges, 3))
+    assert not np.any(received[heard] == relay(plaza.channel, recording.ranges, 4)[heard])
+    y, z = recording.ranges[heard], received[heard]
+    deviation = np.sqrt((SECOND**2 - 1) * y**2 + RELAY_NOISE)
+    scaled = (z - y) / deviation  # mean 0, variance 1
+    assert abs(scaled.mean()) < 4 / np.sqrt(len(y))  # four standard errors
+    kurtosis = np.mean(scaled**4)
+    assert scaled.var() == pytest.approx(1.0, abs=4 * np.sqrt((kurtosis - 1) / len(y)))
+
+
+def test_rows_do_not_depend_on_later_rows(recording: PlazaRecording) -> None:
+    whole = relay(plaza.channel, recording.ranges, 0)
+    np.testing.assert_array_equal(relay(plaza.channel, recording.ranges[:50], 0), whole[:50])
+
+
+def test_average_noise_is_the_mean_variance(recording: PlazaRecording) -> None:
+    y = recording.ranges[~np.isnan(recording.ranges)]
+    expected = (SECOND**2 - 1) * np.mean(y**2) + RELAY_NOISE
+    assert average_noise(plaza.relay, recording.ranges) == pytest.approx(expected, rel=1e-12)
+    assert expected == pytest.approx(102.15, abs=0.01)
+
+
+def test_score_of_known_errors() -> None:
+    truth = np.zeros((2, 3))
+    mean = np.array([[3.0, 4.0, 9.0], [0.0, 0.0, 9.0]])  # the heading is not scored
+    bound = np.stack([np.diag([9.0, 16.0, 1.0]), np.diag([1.0, 1.0, 1.0])])
+    got = score(Estimate(mean, bound, "nominal"), truth)
+    assert got.position_rmse_m == pytest.approx(np.sqrt(25 / 2))
+    assert got.claimed_rmse_m == pytest.approx(np.sqrt((25 + 2) / 2))
+    assert got.nees_per_dimension == pytest.approx((1 + 0) / 2)
+    assert got.inside_95 == 1.0
+    far = score(Estimate(2.5 * mean, bound, "nominal"), truth)  # 2.5^2 * 2 = 12.5, beyond 5.99
+    assert far.inside_95 == 0.5
+
+
+def test_summary_holds_the_scores(folder: Path, outcome: Outcome) -> None:
+    found = json.loads((folder / "summary.json").read_text())
+    assert found["seed"] == 0
+    assert found["seeds"]["seed"] == list(range(SEEDS))
+    for name in NAMES:
+        shown = outcome.trials[0].scores[name]
+        assert found["position_rmse_m"][name] == shown.position_rmse_m == found["seeds"]["position_rmse_m"][name][0]
+        assert found["nees_per_dimension"][name] == shown.nees_per_dimension
+        assert len(found["seeds"]["nees_per_dimension"][name]) == SEEDS
+
+
+def test_written_measurements_give_the_written_estimates(folder: Path) -> None:
+    data = read_measurements(folder / "measurements.csv", plaza.network)
+    record = hg.run(plaza.network, *data)
+    written = _parquet(folder / "estimates.parquet")
+    for name in ("relay_aware", "mean_gain", "open_loop"):
+        for i, state in enumerate(plaza.plant.states):
+            # The same numbers through CSV; the networks differ, so does the order of rounding.
+            again = record.estimates["robot"][name].mean[:, i]
+            np.testing.assert_allclose(written[f"{name}.{state}"], again, rtol=0, atol=1e-9)
+
+
+def _parquet(path: Path) -> dict[str, np.ndarray]:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(path)
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+def test_report_stands_alone(folder: Path) -> None:
+    html = (folder / "report.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?:|<script|<link|@import|url\(", html)
+    assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', html))
+    assert html.count("<img") == 3
+    for text in ("Recorded:", "Simulated:", "in-sample", "correlated", "1.5 %", "heliograph run"):
+        assert text in html
+
+
+def test_table_is_printed_whole_in_80_columns(
+    outcome: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    demo.print_table(outcome, tmp_path)
+    printed = capsys.readouterr().out
+    assert "…" not in printed
+    for row in demo.table_rows(outcome):
+        assert re.search(r"\s+".join(map(re.escape, row)), printed)
+
+
+def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(demo, "compute", lambda *_: outcome)
+    monkeypatch.setattr(demo, "write_data", broken)
+    with pytest.raises(OSError, match="disk full"):
+        run_demo(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_peoples_files_are_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "demo").mkdir()
+    (tmp_path / "demo" / "thesis.txt").write_text("mine")
+    with pytest.raises(ValueError, match=r"demo: expected .*, got other files"):
+        run_demo(tmp_path)
+    assert (tmp_path / "demo" / "thesis.txt").read_text() == "mine"
