@@ -1,0 +1,93 @@
+"""The shape of the package: exported names, docstrings, and imports that flow with the data."""
+
+import ast
+import inspect
+from pathlib import Path
+
+import pytest
+
+import heliograph
+
+SOURCE = Path(heliograph.__file__).parent
+# Later may import earlier, never the reverse.
+ORDER = [
+    ["float64", "check"],
+    ["linalg", "over_time"],
+    ["random_affine"],
+    ["plant", "sensor", "channel"],
+    ["filter.base", "filter.transform", "filter.update"],
+    ["design"],
+    ["filter"],
+    ["quantizer"],
+    ["fusion"],
+    ["network"],
+    ["groups", "record", "stream"],
+    ["simulate", "consistency"],
+    ["testing"],
+    ["table", "recording", "plaza_recording", "output_folder", "load"],
+    ["examples"],
+    ["report"],
+    ["demo", "report.demo_page", "papers"],
+    ["cli"],
+]
+RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
+
+
+def rank(module: str) -> int | None:
+    """Rank of the longest listed prefix of a dotted module name."""
+    parts = module.split(".")
+    for length in range(len(parts), 0, -1):
+        if ".".join(parts[:length]) in RANK:
+            return RANK[".".join(parts[:length])]
+    return None
+
+
+def imports(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("heliograph."):
+            module = node.module.removeprefix("heliograph.")
+            found |= {
+                f"{module}.{alias.name}" if rank(f"{module}.{alias.name}") is not None else module
+                for alias in node.names
+            }
+    return found
+
+
+FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
+def test_imports_flow_with_the_data(path):
+    own = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")
+    assert rank(own) is not None, f"{own}: give it a place in ORDER"
+    for other in imports(path):
+        assert rank(other) <= rank(own), f"{own} imports {other}, which comes later"
+
+
+@pytest.mark.parametrize("name", heliograph.__all__)
+def test_exported_names_exist_and_are_documented(name):
+    item = getattr(heliograph, name)
+    text = inspect.getdoc(item) or ""
+    assert text and "\n" not in text.split(".")[0], f"{name}: expected a first line that says what it is"
+    if inspect.isfunction(item):
+        assert "Raises:" in text, f"{name}: expected what it raises"
+        if item.__module__.startswith(("heliograph.filter", "heliograph.fusion")):
+            assert "Source:" in text, f"{name}: expected where it comes from"
+
+
+def test_no_public_function_is_without_a_docstring():
+    for path in FILES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                assert ast.get_docstring(node), f"{path.name}: {node.name} has no docstring"
+                members = node.body if isinstance(node, ast.ClassDef) else []
+                for member in members:
+                    public = isinstance(member, ast.FunctionDef) and not member.name.startswith("_")
+                    assert not public or ast.get_docstring(member), f"{path.name}: {node.name}.{member.name}"
+
+
+def test_nothing_outside_papers_knows_a_paper():
+    for path in FILES:
+        if "papers" not in path.parts and path.name != "cli.py":
+            assert not any(name.startswith("papers") for name in imports(path)), path.name
