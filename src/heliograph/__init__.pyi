@@ -12,22 +12,27 @@ from .random_affine import (
     GainAndNoise as GainAndNoise,
     Gaussian as Gaussian,
     GivenMoments as GivenMoments,
+    Independent as Independent,
     Lift as Lift,
     LogNormal as LogNormal,
     Mixture as Mixture,
     Nakagami as Nakagami,
+    NoiseMoments as NoiseMoments,
     Rayleigh as Rayleigh,
     Rician as Rician,
     Series as Series,
+    Shaped as Shaped,
     Stack as Stack,
     bernoulli as bernoulli,
     known as known,
+    recorded_noise as recorded_noise,
     second_order as second_order,
     square as square,
 )
 from .plant import (
     LinearPlant as LinearPlant,
     Plant as Plant,
+    with_bias as with_bias,
 )
 from .sensor import (
     LinearSensor as LinearSensor,
@@ -47,7 +52,14 @@ from .filter.base import (
     AbstractFilter as AbstractFilter,
     Estimate as Estimate,
 )
+from .filter.transform import (
+    Cubature as Cubature,
+    Linearization as Linearization,
+    PolynomialMoments as PolynomialMoments,
+)
 from .filter.update import (
+    Interval as Interval,
+    LooseInterval as LooseInterval,
     Polytope as Polytope,
     Scalars as Scalars,
     ZeroMean as ZeroMean,
@@ -55,6 +67,7 @@ from .filter.update import (
 from .filter.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
+    gaussian_filter as gaussian_filter,
     mean_gain_filter as mean_gain_filter,
 )
 from .filter.linear import (
@@ -80,6 +93,7 @@ from .consistency import (
     ErrorStatistics as ErrorStatistics,
     Statistics as Statistics,
     error_statistics as error_statistics,
+    pool as pool,
 )
 
 __version__: str

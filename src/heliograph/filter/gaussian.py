@@ -124,6 +124,28 @@ def _each(item: SecondOrder | OverTime) -> list[SecondOrder]:
     return unstack(item) if isinstance(item, OverTime) else [item]
 
 
+def gaussian_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+
+    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
+    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    rule = Polytope() if update is None else update
+    return _build(plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True)
+
+
 def cubature_filter(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -141,8 +163,7 @@ def cubature_filter(
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
     Source: cubature fusion under amplify-and-forward relays, Section III.
     """
-    rule = Polytope() if update is None else update
-    return _build(plant, sensor, channel, Cubature(), rule, initial_mean, initial_covariance, trusted=True)
+    return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
 
 
 def extended_filter(
@@ -161,8 +182,7 @@ def extended_filter(
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
     Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
     """
-    rule = Polytope() if update is None else update
-    return _build(plant, sensor, channel, Linearization(), rule, initial_mean, initial_covariance, trusted=True)
+    return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
 
 
 def mean_gain_filter(

@@ -1,13 +1,18 @@
 """Mean and covariance of f(x) from those of x: by cubature points or by the Jacobian."""
 
 from collections.abc import Callable
+from itertools import product
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from heliograph.check import check_count, fail
 from heliograph.linalg import cholesky, symmetrize
+
+POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
 
 Function = Callable[[jax.Array], jax.Array]
 
@@ -54,3 +59,39 @@ class Linearization(AbstractTransform):
         jacobian = jax.jacfwd(function)(mean)
         cross = covariance @ jacobian.T
         return Transformed(function(mean), symmetrize(jacobian @ cross), cross)
+
+
+class PolynomialMoments(AbstractTransform):
+    """Exact mean and covariance of a polynomial of a Gaussian x, by Gauss-Hermite quadrature.
+
+    With d + 1 points in each of the n directions of the factor of P, products of two polynomials of degree d are
+    integrated exactly; (d + 1)^n evaluations of the function.
+
+    Raises:
+        ValueError: a degree below one, or (when applied) more than 20,000 points.
+    Source: Golub and Welsch, Calculation of Gauss quadrature rules (1969).
+    """
+
+    degree: int = eqx.field(static=True)
+
+    def __init__(self, degree: int):
+        self.degree = check_count("degree of the polynomial", degree)
+
+    def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
+        """Evaluate at the quadrature points and sum with their weights."""
+        points, weights = _hermite_grid(mean.shape[0], self.degree + 1)
+        deviations = jnp.asarray(points) @ cholesky(covariance).T
+        values = jax.vmap(function)(mean + deviations)
+        center = weights @ values
+        spread = values - center
+        weighted = weights[:, None] * spread
+        return Transformed(center, spread.T @ weighted, deviations.T @ weighted)
+
+
+def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (count^dimension, dimension) and weights of the tensor rule for a standard normal vector."""
+    if count**dimension > POINT_LIMIT:
+        raise fail("points of the exact-moment rule", f"at most {POINT_LIMIT:,}", f"{count}^{dimension}")
+    nodes, weights = np.polynomial.hermite_e.hermegauss(count)
+    grid = np.array(list(product(nodes, repeat=dimension)))
+    return grid, np.array([np.prod(w) for w in product(weights / weights.sum(), repeat=dimension)])

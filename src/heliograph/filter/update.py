@@ -10,14 +10,18 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.check import fail
+from heliograph.check import array, fail
 from heliograph.linalg import psd_solve, symmetrize
+from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_order import SecondOrder, second_order
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.second_order import QuadraticMap, SecondOrder, second_order, symmetric_product
 
 SWEEPS = 200  # most alternations between gain and scalars; each lowers the jointly convex trace
-SETTLED = 1e-6  # relative change of the scalars; the trace is flat there, so its error is of second order, 1e-12
+SETTLED = 1e-8  # relative change of the scalars; the trace is flat there, so its error is of second order
 SMALLEST_SCALAR = 1e-12  # keeps 1/beta finite where nothing is gained by a larger one
 
 
@@ -40,13 +44,12 @@ class Scalars(eqx.Module):
         ValueError: a scalar that is not positive.
     """
 
-    first: float = eqx.field(static=True)
-    second: float = eqx.field(static=True)
+    values: np.ndarray
 
     def __init__(self, first: float, second: float):
-        if not (first > 0 and second > 0):
+        self.values = array("scalars of the bound", [first, second], (2,))
+        if np.any(self.values <= 0):
             raise fail("scalars of the bound", "two positive numbers", (first, second))
-        self.first, self.second = float(first), float(second)
 
 
 class AbstractUpdate(eqx.Module):
@@ -98,11 +101,12 @@ class ZeroMean(AbstractUpdate):
     `scalar` None: the trace is minimised over beta at each step.
     """
 
-    scalar: float | None = eqx.field(static=True, default=None)
+    scalar: np.ndarray | None
 
-    def __check_init__(self) -> None:
-        if self.scalar is not None and not self.scalar > 0:
-            raise fail("scalar of the bound", "a positive number", self.scalar)
+    def __init__(self, scalar: float | None = None):
+        self.scalar = None if scalar is None else array("scalar of the bound", scalar, ())
+        if self.scalar is not None and self.scalar <= 0:
+            raise fail("scalar of the bound", "a positive number", scalar)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
         """Worst cases over the polytope."""
@@ -134,6 +138,106 @@ class ZeroMean(AbstractUpdate):
         return gain, bound + beta * explained
 
 
+class Interval(AbstractUpdate):
+    """Young's bound with each hop's uncertainty as intervals of its moments, combined hop by hop.
+
+    With m, s = E g, E g^2 and radii r = sum |v_i| radius_i, q = sum v_i^2 radius_i of each hop:
+    var g <= s + q - max(|m| - r, 0)^2. Sound, looser than `Polytope`, and for chains of scalar hops only.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (11), with the sign of its last term corrected.
+    """
+
+    scalars: Scalars | None = None
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Worst cases from intervals.
+
+        Raises:
+            ValueError: a channel that is not a chain of scalar hops.
+        """
+        return _interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        return young_correction(prior, signal, channel, present, self.scalars)
+
+
+class LooseInterval(AbstractUpdate):
+    """`Interval` with the squared mean added where it should be subtracted: var g <= s + q + (m - r)^2.
+
+    As published. A bound still, but of the power of g instead of its variance, so it trusts a good channel too little:
+    with a perfect channel it does not become the filter without one.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (11) as printed.
+    """
+
+    scalars: Scalars | None = None
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Worst cases from intervals.
+
+        Raises:
+            ValueError: a channel that is not a chain of scalar hops.
+        """
+        return _interval_description(channel, lambda hop: hop.second + (hop.mean - hop.mean_radius) ** 2)
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        return young_correction(prior, signal, channel, present, self.scalars)
+
+
+class _HopRange(NamedTuple):
+    """One hop's amplitude, E g with its radius, the largest E g^2, and noise covariance."""
+
+    amplitude: float
+    mean: float
+    mean_radius: float
+    second: float
+    noise: np.ndarray
+
+
+def _hop_range(hop: AbstractRandomAffine) -> _HopRange:
+    if not isinstance(hop, GainAndNoise) or not _is_scalar(hop.matrix) or np.any(hop.noise.mean):
+        raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
+    radius, law = (0.0, 0.0), hop.gain
+    if isinstance(law, Discrete):
+        radius = (float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius))
+    amplitude = float(hop.matrix[0, 0])
+    return _HopRange(amplitude, law.moment(1), radius[0], law.moment(2) + radius[1], hop.noise.covariance)
+
+
+def _is_scalar(matrix: np.ndarray) -> bool:
+    return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
+
+
+def _interval_description(channel: AbstractRandomAffine, variance: Callable[[_HopRange], float]) -> SecondOrder:
+    """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise."""
+    hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
+    spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
+    for hop in hops:
+        spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
+        power *= hop.second
+        noise = hop.amplitude**2 * hop.second * noise + hop.noise
+    amplitude = float(np.prod([hop.amplitude for hop in hops]))
+    nominal = float(np.prod([abs(hop.mean) for hop in hops]))
+    shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal
+    gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
+
+    def scaled(value: float, constant: np.ndarray) -> QuadraticMap:
+        center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
+        center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))
+        center[..., -1, -1] = constant
+        return QuadraticMap(center, np.zeros_like(center))
+
+    zero = np.zeros_like(noise)
+    parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
+    return SecondOrder(gain, np.zeros(len(noise)), *parts, shift > 0)
+
+
 def young_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Scalars | None
 ) -> tuple[jax.Array, jax.Array]:
@@ -155,8 +259,7 @@ def young_correction(
         ratios = jnp.stack([moved / jnp.trace(prior), moved / jnp.trace(k @ mean_part @ k.T)])
         return jnp.maximum(jnp.sqrt(jnp.nan_to_num(ratios, posinf=0.0)), SMALLEST_SCALAR)
 
-    fixed = None if scalars is None else jnp.asarray([scalars.first, scalars.second])
-    beta = settle(refine, jnp.asarray([0.1, 0.1])) if fixed is None else fixed
+    beta = settle(refine, jnp.asarray([0.1, 0.1])) if scalars is None else jnp.asarray(scalars.values)
     gain, bound = gain_and_bound(prior, cross, omega(beta))
     return gain, bound + beta[0] * prior
 

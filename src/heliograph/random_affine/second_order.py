@@ -110,7 +110,7 @@ def second_moment_tensor(matrix: np.ndarray, outputs: int, inputs: int) -> np.nd
     return tensor
 
 
-def _outer(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def symmetric_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """(A y)(B y)' as a tensor, made symmetric in the two factors y."""
     forward = np.einsum("ia,jb->ijab", a, b)
     result: np.ndarray = (forward + forward.swapaxes(2, 3)) / 2
@@ -121,10 +121,10 @@ def _tensors(moments: Moments, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     own = moments.mean[:-1]
-    spread = raw - _outer(mean, own) - _outer(own, mean) + _outer(mean, mean)
+    spread = raw - symmetric_product(mean, own) - symmetric_product(own, mean) + symmetric_product(mean, mean)
     power = raw.copy()
     power[..., -1, :] = power[..., :, -1] = 0.0
-    return spread, _outer(own - mean, own - mean), power
+    return spread, symmetric_product(own - mean, own - mean), power
 
 
 def _dominate(tensors: np.ndarray, mean: np.ndarray) -> QuadraticMap:
@@ -139,7 +139,7 @@ def _dominate(tensors: np.ndarray, mean: np.ndarray) -> QuadraticMap:
 
 def _dominate_common_gain(tensors: np.ndarray, mean: np.ndarray) -> np.ndarray | None:
     """The dominating tensor where y enters as s_v M y y' M' and the noise part has a largest matrix; None otherwise."""
-    shape = _outer(mean[:, :-1], mean[:, :-1])
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
     scale = np.max(np.abs(tensors), initial=0.0)
     size = float(np.sum(shape**2))
@@ -178,10 +178,10 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     apart = (label[:, None] != label[None, :])[:, :, None, None]
     size = np.abs(mean)
     gain = np.concatenate([mean[:, :-1], np.zeros((n, 1))], axis=1)
-    cross = _outer(reach, reach)
-    power_cross = _outer(size, reach) + _outer(reach, size) + cross
+    cross = symmetric_product(reach, reach)
+    power_cross = symmetric_product(size, reach) + symmetric_product(reach, size) + cross
     power_cross[..., -1, :] = power_cross[..., :, -1] = 0.0
-    center[2] += apart * _outer(gain, gain)
+    center[2] += apart * symmetric_product(gain, gain)
     for r, extra in zip(radius, (cross, cross, power_cross), strict=True):
         r += apart * extra
     return [QuadraticMap(c, r) for c, r in zip(center, radius, strict=True)]
@@ -198,9 +198,11 @@ def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: np.nd
     reach = np.abs(middle.mean[:-1] - mean) + mean_radius
     power_radius = raw_radius.copy()
     power_radius[..., -1, :] = power_radius[..., :, -1] = 0.0
-    spread_radius = raw_radius + _outer(np.abs(mean), mean_radius) + _outer(mean_radius, np.abs(mean))
+    spread_radius = (
+        raw_radius + symmetric_product(np.abs(mean), mean_radius) + symmetric_product(mean_radius, np.abs(mean))
+    )
     return [
         QuadraticMap(spread, spread_radius),
-        QuadraticMap(np.zeros_like(spread), _outer(reach, reach)),
+        QuadraticMap(np.zeros_like(spread), symmetric_product(reach, reach)),
         QuadraticMap(power, power_radius),
     ]
