@@ -74,6 +74,17 @@ from .filter.linear import (
     linear_filter as linear_filter,
     open_loop_filter as open_loop_filter,
 )
+from .filter.sequential import (
+    sequential_filter as sequential_filter,
+)
+from .fusion import (
+    CovarianceIntersection as CovarianceIntersection,
+    EqualIntersection as EqualIntersection,
+    FixedIntersection as FixedIntersection,
+    Fusion as Fusion,
+    InverseCovarianceIntersection as InverseCovarianceIntersection,
+    fuse as fuse,
+)
 from .network import (
     Network as Network,
     Node as Node,

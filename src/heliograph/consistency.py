@@ -1,5 +1,6 @@
 """Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from scipy import stats
 
 from heliograph.check import fail
-from heliograph.filter.base import Claim, Estimate
+from heliograph.filter.base import Claim, Estimate, weakest
 from heliograph.float64 import to_numpy
 from heliograph.linalg import psd_solve
 from heliograph.network import Network
@@ -109,6 +110,21 @@ class ErrorStatistics:
         return WorstDirection(ratio, standard_error, step, d / np.linalg.norm(d))
 
 
+def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
+    """Statistics of several nodes together, their steps joined: means run over nodes as over steps.
+
+    Runs stay the unit of independence, so errors that nodes share are counted as shared.
+
+    Raises:
+        ValueError: nothing to pool, or statistics of different runs.
+    """
+    parts = list(statistics)
+    if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
+        raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
+    joined = {name: np.concatenate([getattr(s, name) for s in parts], axis=1) for name in ("outer", "bound", "nees")}
+    return ErrorStatistics(parts[0].count, **joined, claim=weakest([s.claim for s in parts]))
+
+
 @dataclass(frozen=True)
 class WorstDirection:
     """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""
@@ -168,8 +184,8 @@ class Statistics(AbstractReducer):
     def finish(self, carry: Any, collected: Any, network: Network) -> dict[str, dict[str, ErrorStatistics]]:
         """Statistics by node and filter."""
         return {
-            node: {name: ErrorStatistics(**carry[node][name], claim=item.claim) for name, item in filters.items()}
-            for node, filters in ((name, node.filters) for name, node in network.nodes.items())
+            node: {name: ErrorStatistics(**carry[node][name], claim=claim) for name, claim in claims.items()}
+            for node, claims in network.claims().items()
         }
 
 

@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filter.base import Estimate
-from heliograph.network import Network, Node
+from heliograph.filter.base import AbstractFilter, Estimate
+from heliograph.fusion import Fusion
+from heliograph.network import FUSED, Network, Node
 from heliograph.over_time import alike, stack
 
 
@@ -38,25 +39,50 @@ def groups(network: Network) -> list[Group]:
     ]
 
 
-class NodeSteps:
-    """Every filter of every group, stepped once: the node axis is vmapped, the groups are a list."""
+class AllFilters:
+    """Every filter of a network stepped once: nodes of a group vmapped, then fusion rules and central filters."""
 
-    def __init__(self, parts: list[Group]):
-        self.parts = parts
+    def __init__(self, network: Network, parts: list[Group]):
+        self.network, self.parts = network, parts
+        self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
+        self.rules = {name: item for name, item in network.fused.items() if isinstance(item, Fusion)}
 
-    def init(self) -> list[Any]:
-        """States before the first step, for each group a dictionary by filter with a leading node axis."""
-        return [eqx.filter_vmap(_init, in_axes=eqx.if_array(0))(part.stacked) for part in self.parts]
+    def init(self) -> tuple[list[Any], dict[str, Any]]:
+        """States before the first step: for each group with a leading node axis, and of each central filter."""
+        groups = [eqx.filter_vmap(_init, in_axes=eqx.if_array(0))(part.stacked) for part in self.parts]
+        return groups, _initial(self.central)
 
-    def __call__(self, states: list[Any], z: list[Any], u: jax.Array, k: jax.Array) -> tuple[list[Any], list[Any]]:
-        """One step of all filters; estimates have a leading node axis."""
+    def __call__(self, states: Any, z: dict[str, jax.Array], u: jax.Array, k: jax.Array) -> tuple[Any, Any]:
+        """One step of all filters from the measurements of each node; estimates by node and filter."""
         step = eqx.filter_vmap(_step, in_axes=(eqx.if_array(0), eqx.if_array(0), eqx.if_array(0), None, None))
-        results = [step(part.stacked, s, z_part, u, k) for part, s, z_part in zip(self.parts, states, z, strict=True)]
-        return [r[0] for r in results], [r[1] for r in results]
+        after, estimates = [], {}
+        for part, state in zip(self.parts, states[0], strict=True):
+            following, group = step(part.stacked, state, jnp.stack([z[name] for name in part.names]), u, k)
+            after.append(following)
+            for i, name in enumerate(part.names):
+                estimates[name] = jax.tree.map(lambda leaf, i=i: leaf[i], group)
+        central, fused = self._fuse(states[1], estimates, z, u, k)
+        if self.network.fused:
+            estimates[FUSED] = fused
+        return (after, central), estimates
+
+    def _fuse(self, states: Any, estimates: Any, z: Any, u: jax.Array, k: jax.Array) -> tuple[Any, Any]:
+        joined = jnp.concatenate([z[name] for name in self.network.nodes])
+        results = {name: item.step(states[name], joined, u, k) for name, item in self.central.items()}
+        fused = {name: result[1] for name, result in results.items()}
+        for name, fusion in self.rules.items():
+            local = [estimates[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)]
+            means, bounds = jnp.stack([e.mean for e in local]), jnp.stack([e.bound for e in local])
+            fused[name] = Estimate(*fusion.rule.combine(means, bounds), fusion.rule.claim([e.claim for e in local]))
+        return {name: result[0] for name, result in results.items()}, fused
 
 
 def _init(node: Node) -> dict[str, Any]:
-    return {name: jax.tree.map(jnp.asarray, item.init()) for name, item in node.filters.items()}
+    return _initial(node.filters)
+
+
+def _initial(filters: dict[str, AbstractFilter]) -> dict[str, Any]:
+    return {name: jax.tree.map(jnp.asarray, item.init()) for name, item in filters.items()}
 
 
 def _step(
@@ -64,12 +90,3 @@ def _step(
 ) -> tuple[dict[str, Any], dict[str, Estimate]]:
     results = {name: item.step(states[name], z, u, k) for name, item in node.filters.items()}
     return {name: r[0] for name, r in results.items()}, {name: r[1] for name, r in results.items()}
-
-
-def scatter(parts: list[Group], estimates: list[dict[str, Estimate]], axis: int) -> dict[str, dict[str, Estimate]]:
-    """Estimates by node and filter, from those of groups with the node axis at `axis`."""
-    return {
-        name: jax.tree.map(lambda leaf, i=i: jnp.take(leaf, i, axis=axis), group)
-        for part, group in zip(parts, estimates, strict=True)
-        for i, name in enumerate(part.names)
-    }

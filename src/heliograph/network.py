@@ -8,11 +8,14 @@ import equinox as eqx
 
 from heliograph.channel import Channel, check_link
 from heliograph.check import fail
-from heliograph.filter.base import AbstractFilter
+from heliograph.filter.base import AbstractFilter, Claim
+from heliograph.fusion import Fusion
 from heliograph.over_time import first, steps_covered
 from heliograph.plant import AbstractPlant, AnyPlant
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.sensor import AbstractSensor, AnySensor
+
+FUSED = "fused"  # the name under which results of several nodes stand
 
 
 class Node(eqx.Module):
@@ -42,15 +45,22 @@ class Node(eqx.Module):
 class Network(eqx.Module):
     """A plant observed by named nodes. Everything downstream (simulation, filters, reports) reads this one description.
 
+    `fused` names what is made of several nodes: a `Fusion` of the estimates that one of their filters gives, or a
+    central filter that receives all measurements, joined in the order of the nodes. In results these stand under the
+    node name "fused".
+
     Raises:
-        ValueError: no nodes, or a node that does not fit the plant.
+        ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has.
     """
 
     plant: AnyPlant
     nodes: dict[str, Node]
+    fused: dict[str, Fusion | AbstractFilter]
 
-    def __init__(self, plant: AnyPlant, nodes: Mapping[str, Node]):
-        self.plant, self.nodes = plant, dict(nodes)
+    def __init__(
+        self, plant: AnyPlant, nodes: Mapping[str, Node], fused: Mapping[str, Fusion | AbstractFilter] | None = None
+    ):
+        self.plant, self.nodes, self.fused = plant, dict(nodes), dict(fused or {})
         _check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
@@ -59,6 +69,25 @@ class Network(eqx.Module):
             check_link(first(node.sensor), first(node.channel), len(self.states))
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
+        if self.fused and FUSED in self.nodes:
+            raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+        for name, item in self.fused.items():
+            if isinstance(item, Fusion):
+                item.rule.check(len(self.nodes_with(item.filter)))
+            else:
+                _check_type(f"fused {name!r}", item, AbstractFilter)
+
+    def nodes_with(self, name: str) -> list[str]:
+        """Names of the nodes that have the filter `name`.
+
+        Raises:
+            ValueError: none has it.
+        """
+        found = [node for node, item in self.nodes.items() if name in item.filters]
+        if not found:
+            known = sorted({f for node in self.nodes.values() for f in node.filters})
+            raise fail("fusion", f"a filter that some node has {known}", repr(name))
+        return found
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -71,6 +100,18 @@ class Network(eqx.Module):
         """Names of the plant's inputs."""
         names: tuple[str, ...] = first(self.plant).inputs
         return names
+
+    def claims(self) -> dict[str, dict[str, Claim]]:
+        """What every estimate claims, by node and filter; fused ones last, under "fused"."""
+        claims = {name: {f: item.claim for f, item in node.filters.items()} for name, node in self.nodes.items()}
+        if self.fused:
+            claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
+        return claims
+
+    def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
+        if isinstance(item, AbstractFilter):
+            return item.claim
+        return item.rule.claim([self.nodes[n].filters[item.filter].claim for n in self.nodes_with(item.filter)])
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

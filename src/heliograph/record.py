@@ -102,5 +102,5 @@ def trajectories_record(network: Network, batch: Any, time: np.ndarray) -> Recor
     """Record from the scan's output; nodes in the network's order."""
     measurements = {name: np.asarray(batch["measurements"][name]) for name in network.nodes}
     found = batch["estimates"]
-    estimates = {name: {f: found[name][f] for f in node.filters} for name, node in network.nodes.items()}
+    estimates = {node: {name: found[node][name] for name in claims} for node, claims in network.claims().items()}
     return Record(time, network.states, batch["truth"], measurements, estimates)

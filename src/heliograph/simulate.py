@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.check import array, check_count, fail
 from heliograph.float64 import compiled, to_numpy
-from heliograph.groups import Group, NodeSteps, groups, scatter
+from heliograph.groups import AllFilters, Group, groups
 from heliograph.network import Network
 from heliograph.over_time import at
 from heliograph.random_affine.base import apply
@@ -98,17 +98,13 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
 
 @compiled
 def _run_filters(network: Network, z: dict[str, Any], u: Any) -> Any:
-    parts = groups(network)
-    steps = NodeSteps(parts)
+    step = AllFilters(network, groups(network))
 
     def body(states: Any, item: tuple[Any, ...]) -> tuple[Any, Any]:
         k, u_k, z_k = item
-        gathered = [jnp.stack([z_k[name] for name in part.names]) for part in parts]
-        return steps(states, gathered, u_k, k)
+        return step(states, z_k, u_k, k)
 
-    length = u.shape[0]
-    _, estimates = jax.lax.scan(body, steps.init(), (jnp.arange(length), u, z))
-    return scatter(parts, estimates, axis=1)
+    return jax.lax.scan(body, step.init(), (jnp.arange(u.shape[0]), u, z))[1]
 
 
 def _flat(leaf: np.ndarray) -> np.ndarray:
@@ -141,20 +137,20 @@ def _chunk(
 
 def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array) -> Any:
     """One world and all filters on it: dictionaries of truth (time, n), measurements and estimates by node."""
-    steps = NodeSteps(parts)
+    step = AllFilters(network, parts)
     x0 = at(network.plant, 0).sample_initial(_key(key, 0, WORLD, INITIAL))
 
     def body(carry: tuple[Any, Any], item: tuple[Any, ...]) -> tuple[Any, Any]:
         (x, states), (k, u_k) = carry, item
         plant = at(network.plant, k)
         x = plant.transition(x, u_k) + plant.sample_noise(_key(key, k, WORLD, PROCESS), u_k)
-        z = [_observe(part, x, key, k) for part in parts]
-        states, estimates = steps(states, z, u_k, k)
-        return (x, states), (x, z, estimates)
+        z: dict[str, jax.Array] = {}
+        for part in parts:
+            z |= dict(zip(part.names, _observe(part, x, key, k), strict=True))
+        states, estimates = step(states, z, u_k, k)
+        return (x, states), {"truth": x, "measurements": z, "estimates": estimates}
 
-    _, (truth, z, estimates) = jax.lax.scan(body, (x0, steps.init()), (jnp.arange(u.shape[0]), u))
-    by_node = {name: part_z[:, i] for part, part_z in zip(parts, z, strict=True) for i, name in enumerate(part.names)}
-    return {"truth": truth, "measurements": by_node, "estimates": scatter(parts, estimates, axis=1)}
+    return jax.lax.scan(body, (x0, step.init()), (jnp.arange(u.shape[0]), u))[1]
 
 
 def _observe(part: Group, x: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:

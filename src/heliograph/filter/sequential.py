@@ -1,0 +1,67 @@
+"""The central filter: it hears all nodes, predicts once, and uses their measurements one after another."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.check import fail
+from heliograph.filter.base import AbstractFilter, Claim, Estimate, weakest
+from heliograph.filter.gaussian import Belief, GaussianFilter
+from heliograph.float64 import compiled, in_float64
+from heliograph.over_time import OverTime, first
+
+
+class SequentialFilter(AbstractFilter):
+    """Predict with the first node's filter, then correct with each node's in turn; z is the nodes' measurements joined.
+
+    The posterior of one node is the prior of the next. Behind uncertain gains the first correction is not a conditional
+    mean, so a next one that assumes E[e yhat'] = 0 (`ZeroMean`) is no bound: the claim is "nominal" unless every part
+    is exact.
+    """
+
+    filters: tuple[GaussianFilter, ...]
+    lengths: tuple[int, ...] = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Belief:
+        """The first node's prior."""
+        return self.filters[0].init()
+
+    @compiled
+    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
+        """Predict over step k, then use what arrived from each node."""
+        after, start = self.filters[0].predict(state, u, k), 0
+        measurements: jax.Array = jnp.asarray(z, dtype=float)
+        for item, length in zip(self.filters, self.lengths, strict=True):
+            after = item.correct(after, measurements[start : start + length], k)
+            start += length
+        return after, Estimate(after.mean, after.covariance, self.claim)
+
+
+def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
+    """The central filter made of the nodes' own filters, in the order of the network's nodes.
+
+    Claim: "exact" if every part is, else "nominal".
+
+    Raises:
+        ValueError: no filters, or filters of different state dimensions.
+    Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
+    """
+    parts = tuple(filters)
+    if len({len(first(item.plant).states) for item in parts}) != 1:
+        raise fail("sequential filter", "filters of one state dimension", [len(first(f.plant).states) for f in parts])
+    weakest_part = weakest([item.claim for item in parts])
+    return SequentialFilter(
+        filters=parts,
+        lengths=tuple(_received(item) for item in parts),
+        claim="exact" if weakest_part == "exact" else "nominal",
+    )
+
+
+def _received(item: GaussianFilter) -> int:
+    channel = item.channel.values if isinstance(item.channel, OverTime) else item.channel
+    return int(channel.offset.shape[-1])

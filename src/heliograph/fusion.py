@@ -1,0 +1,260 @@
+"""Fusion of estimates whose errors are correlated in unknown ways: covariance intersection and its relatives."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.check import array, fail, probabilities
+from heliograph.filter.base import Claim, Estimate, weakest
+from heliograph.float64 import compiled
+from heliograph.linalg import psd_solve, symmetrize
+
+GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
+ITERATIONS = 60  # of the interior point method; it needs about 12
+CENTERING = 0.1  # complementarity aimed at, relative to the present one
+STEP_BACK = 0.99  # share of the way to the boundary
+SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks to 1e-8, the flat minimum to 1e-16
+
+
+class AbstractFusion(eqx.Module):
+    """A rule that makes one estimate of several.
+
+    A fused claim is never stronger than the weakest of its inputs; what else a rule assumes is in `claim`.
+    """
+
+    def check(self, count: int) -> None:
+        """Raise ValueError if the rule cannot fuse this number of estimates."""
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """What the fused covariance claims, from what the inputs claim."""
+        raise NotImplementedError
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Fused mean (n,) and covariance (n, n) of means (count, n) and bounds (count, n, n)."""
+        raise NotImplementedError
+
+
+def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
+    """Fuse estimates of one state; leading axes (run, time) are carried along.
+
+    Raises:
+        ValueError: no estimates, or estimates of different state dimensions.
+    Source: cubature fusion under amplify-and-forward relays, equation (8).
+    """
+    if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
+        raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
+    rule.check(len(estimates))
+    means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
+    bounds = np.stack([np.asarray(e.bound) for e in estimates], axis=-3)
+    mean, bound = _combine_all(rule, means, bounds)
+    return Estimate(mean, bound, rule.claim([e.claim for e in estimates]))
+
+
+@compiled
+def _combine_all(rule: AbstractFusion, means: Any, bounds: Any) -> tuple[Any, Any]:
+    combine = rule.combine
+    for _ in range(means.ndim - 2):
+        combine = jax.vmap(combine)
+    return combine(means, bounds)
+
+
+class CovarianceIntersection(AbstractFusion):
+    """Covariance intersection with the weights that minimise the trace.
+
+    P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, w on the simplex; tr P is convex in w. An upper bound for
+    any correlation if the inputs are and if weights do not depend on the data. Where bounds depend on the data, so do
+    the weights, and choosing the smallest can overstate: then the inputs are "nominal", and so is the result.
+
+    Source: Julier and Uhlmann (1997); cubature fusion under amplify-and-forward relays, equations (8) and (34).
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Find the weights and intersect."""
+        information = _inverses(bounds)
+        return intersect(means, information, trace_optimal_weights(information))
+
+
+class EqualIntersection(AbstractFusion):
+    """Covariance intersection with equal weights: nothing is chosen, so data-dependent bounds cannot mislead.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (8) with w_i = 1 / M.
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Intersect with equal weights."""
+        count = means.shape[0]
+        return intersect(means, _inverses(bounds), jnp.full(count, 1 / count))
+
+
+class FixedIntersection(AbstractFusion):
+    """Covariance intersection with weights given once and for all.
+
+    Raises:
+        ValueError: weights off the simplex.
+    Source: cubature fusion under amplify-and-forward relays, equation (8).
+    """
+
+    weights: np.ndarray
+
+    def __init__(self, weights: Any):
+        self.weights = probabilities("fusion weights", weights)
+
+    def check(self, count: int) -> None:
+        """As many weights as estimates."""
+        array("fusion weights", self.weights, (count,))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Intersect with the given weights."""
+        return intersect(means, _inverses(bounds), jnp.asarray(self.weights))
+
+
+class InverseCovarianceIntersection(AbstractFusion):
+    """Inverse covariance intersection, two estimates at a time in the order of the nodes.
+
+    P^-1 = A^-1 + B^-1 - (w A + (1 - w) B)^-1 with the w that minimises the trace. Tighter than covariance intersection,
+    and valid only for estimates that share information of a certain form; so it claims "nominal".
+
+    Source: Noack, Sijs, Reinhardt and Hanebeck, Decentralized data fusion with inverse covariance intersection (2017).
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """ "nominal": the assumed form of the correlation is not checked."""
+        return "nominal"
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Fuse the first two, the result with the third, and so on."""
+        mean, bound = means[0], bounds[0]
+        for other_mean, other_bound in zip(means[1:], bounds[1:], strict=True):
+            mean, bound = _inverse_pair(mean, bound, other_mean, other_bound)
+        return mean, bound
+
+
+def intersect(means: jax.Array, information: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """(sum w J)^-1 sum w J x and (sum w J)^-1, from information matrices J (count, n, n)."""
+    weighted = weights[:, None, None] * information
+    total = weighted.sum(axis=0)
+    bound = _inverse(total)
+    return bound @ jnp.einsum("kij,kj->i", weighted, means), symmetrize(bound)
+
+
+def trace_optimal_weights(information: jax.Array) -> jax.Array:
+    """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
+
+    The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
+    iteration stops when this certificate is below GAP tr P.
+
+    Shapes: (count, n, n) -> (count,).
+    """
+    count = information.shape[0]
+    scaled = information / jnp.mean(jnp.trace(information, axis1=1, axis2=2))
+
+    def unfinished(carry: Any) -> jax.Array:
+        _, _, gap, iteration = carry
+        more: jax.Array = (gap > GAP) & (iteration < ITERATIONS)
+        return more
+
+    def step(carry: Any) -> Any:
+        w, slack, _, iteration = carry
+        _, gradient, hessian = _trace_derivatives(scaled, w)
+        w, slack = _newton_step(w, slack, gradient, hessian)
+        w = w / w.sum()
+        return w, slack, relative_gap(scaled, w), iteration + 1
+
+    w = jnp.full(count, 1 / count)
+    trace, gradient, _ = _trace_derivatives(scaled, w)
+    slack = gradient - gradient.min() + 0.1 * trace
+    start = (w, slack, relative_gap(scaled, w), jnp.asarray(0))
+    weights: jax.Array = jax.lax.while_loop(unfinished, step, start)[0]
+    return weights
+
+
+def relative_gap(information: jax.Array, weights: jax.Array) -> jax.Array:
+    """Certificate max_k tr(P J_k P) / tr P - 1 of how far tr P may be above its minimum, relative to itself."""
+    bound = _inverse(jnp.tensordot(weights, information, axes=1))
+    square = bound @ bound
+    return jnp.max(jnp.einsum("kij,ij->k", information, square)) / jnp.trace(bound) - 1
+
+
+def _trace_derivatives(information: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
+    bound = _inverse(jnp.tensordot(w, information, axes=1))
+    half = jnp.einsum("ij,kjl->kil", bound, information)  # P J_k
+    full = half @ bound
+    return jnp.trace(bound), -jnp.trace(full, axis1=1, axis2=2), 2 * jnp.einsum("kij,lji->kl", half, full)
+
+
+def _newton_step(
+    w: jax.Array, slack: jax.Array, gradient: jax.Array, hessian: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """One step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m."""
+    target = CENTERING * jnp.mean(w * slack)
+    matrix = hessian + jnp.diag(slack / w)
+    sides = jnp.stack([target / w - gradient, jnp.ones_like(w)], axis=1)
+    solved = psd_solve(matrix, sides)
+    multiplier = solved[:, 0].sum() / solved[:, 1].sum()
+    move = solved[:, 0] - multiplier * solved[:, 1]
+    slack_move = (target - slack * move) / w - slack
+    length = jnp.minimum(_longest(w, move), _longest(slack, slack_move))
+    return w + length * move, slack + length * slack_move
+
+
+def _longest(value: jax.Array, move: jax.Array) -> jax.Array:
+    """Largest step, at most 1, that keeps value + step move positive."""
+    return jnp.minimum(1.0, STEP_BACK * jnp.min(jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)))
+
+
+def _inverse_pair(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Inverse covariance intersection of (a, P) and (b, Q), with its weight by golden-section search."""
+    p_information, q_information = _inverse(p), _inverse(q)
+
+    def fused_information(w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        common = _inverse(w * p + (1 - w) * q)
+        return p_information + q_information - common, common
+
+    def cost(w: jax.Array) -> jax.Array:
+        return jnp.trace(_inverse(fused_information(w)[0]))
+
+    ratio = (np.sqrt(5) - 1) / 2
+
+    def shrink(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        low, high = ends
+        left, right = high - ratio * (high - low), low + ratio * (high - low)
+        better = cost(left) < cost(right)
+        return jnp.where(better, low, left), jnp.where(better, right, high)
+
+    low, high = jax.lax.fori_loop(0, SEARCH_STEPS, shrink, (jnp.asarray(0.0), jnp.asarray(1.0)))
+    w = (low + high) / 2
+    information, common = fused_information(w)
+    bound = _inverse(information)
+    mean = bound @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
+    return mean, symmetrize(bound)
+
+
+def _inverse(a: jax.Array) -> jax.Array:
+    return psd_solve(a, jnp.eye(a.shape[-1]))
+
+
+def _inverses(bounds: jax.Array) -> jax.Array:
+    return jax.vmap(_inverse)(bounds)
+
+
+class Fusion(eqx.Module):
+    """Which filter's estimates a network fuses, at every node that has it, and by which rule."""
+
+    filter: str = eqx.field(static=True)
+    rule: AbstractFusion
