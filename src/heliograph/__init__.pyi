@@ -64,6 +64,31 @@ from .filter.update import (
     Scalars as Scalars,
     ZeroMean as ZeroMean,
 )
+from .design.linear_system import (
+    LinearSystem as LinearSystem,
+    Steps as Steps,
+    state_moments as state_moments,
+)
+from .design.lift import (
+    lifted_system as lifted_system,
+)
+from .design.schedule import (
+    Gains as Gains,
+    Schedule as Schedule,
+    load_schedule as load_schedule,
+)
+from .design.lmmse import (
+    lmmse as lmmse,
+    true_covariance as true_covariance,
+)
+from .design.worth import (
+    Worth as Worth,
+    worth as worth,
+)
+from .design.bounded import (
+    Boundedness as Boundedness,
+    boundedness as boundedness,
+)
 from .filter.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
@@ -73,6 +98,19 @@ from .filter.gaussian import (
 from .filter.linear import (
     linear_filter as linear_filter,
     open_loop_filter as open_loop_filter,
+)
+from .filter.scheduled import (
+    KalmanFilter as KalmanFilter,
+    ScheduledFilter as ScheduledFilter,
+)
+from .filter.polynomial import (
+    PolynomialFilter as PolynomialFilter,
+    memory_filter as memory_filter,
+    polynomial_filter as polynomial_filter,
+    scheduled_polynomial_filter as scheduled_polynomial_filter,
+)
+from .filter.mixture import (
+    mixture_filter as mixture_filter,
 )
 from .filter.sequential import (
     sequential_filter as sequential_filter,

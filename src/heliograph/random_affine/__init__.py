@@ -18,12 +18,21 @@ from heliograph.random_affine.law import (
     Rician,
     bernoulli,
 )
-from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Gaussian
+from heliograph.random_affine.moment_noise import NoiseMoments, recorded_noise
+from heliograph.random_affine.noise import (
+    AbstractNoise,
+    FiniteSupport,
+    Gaussian,
+    Independent,
+    Shaped,
+)
+from heliograph.random_affine.push import push
 from heliograph.random_affine.second_order import QuadraticMap, SecondOrder, second_order
 
 __all__ = [
     "AbstractLaw", "AbstractNoise", "AbstractRandomAffine", "Constant", "Discrete", "FiniteSupport", "GainAndNoise",
-    "Gaussian", "GivenMoments", "Lift", "LogNormal", "Mixture", "Moments", "Nakagami", "QuadraticMap", "Rayleigh",
-    "Rician", "SecondOrder", "Series", "Stack", "apply", "bernoulli", "conditional_moments", "known", "moment_interval",
-    "second_order", "square",
+    "Gaussian", "GivenMoments", "Independent", "Lift", "LogNormal", "Mixture", "Moments", "Nakagami",
+    "NoiseMoments", "QuadraticMap", "Rayleigh", "Rician", "SecondOrder", "Series", "Shaped", "Stack", "apply",
+    "bernoulli", "conditional_moments", "known", "moment_interval", "push", "recorded_noise", "second_order",
+    "square",
 ]  # fmt: skip

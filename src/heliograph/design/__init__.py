@@ -1,0 +1,1 @@
+"""Offline design: from system and network to gains, before any data."""
