@@ -195,10 +195,13 @@ def test_nothing_is_left_after_an_interrupt(folder, monkeypatch, signal_number, 
         signal.raise_signal(signal_number)
 
     monkeypatch.setattr(os, "replace", interrupt)
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits "ignore"
     try:
         assert cli.main(run_arguments()) == code
     except SystemExit as stopped:
         assert stopped.code == code
+    finally:
+        signal.signal(signal.SIGINT, inherited)
     assert contents(folder) == before
     assert signal.getsignal(signal.SIGTERM) is handler
 
@@ -217,9 +220,9 @@ def test_a_command_line_that_is_none(folder, capsys, arguments, fragments):
 
 
 def demo_module(monkeypatch, run_demo) -> None:
-    module = ModuleType("heliograph.demo")
+    module = ModuleType("heliograph.demo.run")
     module.run_demo = run_demo
-    monkeypatch.setitem(sys.modules, "heliograph.demo", module)
+    monkeypatch.setitem(sys.modules, "heliograph.demo.run", module)
 
 
 def test_demo_takes_folder_and_seed(folder, monkeypatch):
@@ -286,3 +289,21 @@ def test_a_refusal_in_a_process_of_its_own(folder):
     assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, got")
     assert done.stderr.count("\n") == 1 and done.stdout == ""
     assert contents(folder) == before
+
+
+def test_reproduce_alone_lists_the_methods(capsys):
+    assert cli.main(["reproduce"]) == 0
+    assert "cubature-fusion" in capsys.readouterr().out.splitlines()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["reproduce", "cubatur", "--out", "o"], ["method: expected one of cubature-fusion", "or all, got 'cubatur'"]),
+        (["reproduce", "cubature-fusion"], ["reproduce: expected a folder for the results (--out DIR), got none"]),
+        (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
+        (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
+    ],
+)
+def test_bad_reproductions(folder, capsys, arguments, fragments):
+    refused(folder, capsys, arguments, *fragments)

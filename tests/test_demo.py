@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph import demo
-from heliograph.demo import NAMES, SEEDS, Outcome, average_noise, compute, relay, run_demo, score
+from heliograph.demo import compute as compute_module
+from heliograph.demo import run
+from heliograph.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
+from heliograph.demo.run import run_demo
 from heliograph.examples import plaza
 from heliograph.filter.base import Estimate
 from heliograph.plaza_recording import PlazaRecording, read_recording
@@ -28,7 +30,7 @@ def outcome(recording: PlazaRecording) -> Outcome:
 def folder(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "new" / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(demo, "compute", lambda *_: outcome)  # computed once for all tests
+        patch.setattr(run, "compute", lambda *_: outcome)  # computed once for all tests
         run_demo(out)
     assert [p.name for p in out.iterdir()] == ["demo"]  # nothing temporary is left beside it
     return out / "demo"
@@ -179,10 +181,10 @@ def test_table_is_printed_whole_in_80_columns(
     outcome: Outcome, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "80")
-    demo.print_table(outcome, tmp_path)
+    run.print_table(outcome, tmp_path)
     printed = capsys.readouterr().out
     assert "…" not in printed
-    for row in demo.table_rows(outcome):
+    for row in compute_module.table_rows(outcome):
         assert re.search(r"\s+".join(map(re.escape, row)), printed)
 
 
@@ -190,8 +192,8 @@ def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path, monkeypatch: p
     def broken(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr(demo, "compute", lambda *_: outcome)
-    monkeypatch.setattr(demo, "write_data", broken)
+    monkeypatch.setattr(run, "compute", lambda *_: outcome)
+    monkeypatch.setattr(run, "write_data", broken)
     with pytest.raises(OSError, match="disk full"):
         run_demo(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []

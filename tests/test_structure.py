@@ -11,7 +11,7 @@ import heliograph
 SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
-    ["float64", "check"],
+    ["float64", "check", "progress"],
     ["linalg", "over_time"],
     ["random_affine"],
     ["plant", "sensor", "channel"],
@@ -22,12 +22,12 @@ ORDER = [
     ["fusion"],
     ["network"],
     ["groups", "record", "stream"],
-    ["simulate", "consistency"],
+    ["simulate", "simulate_relays", "consistency"],
     ["testing"],
     ["table", "recording", "plaza_recording", "output_folder", "load"],
     ["examples"],
     ["report"],
-    ["demo", "report.demo_page", "papers"],
+    ["demo", "papers"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

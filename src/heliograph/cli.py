@@ -4,6 +4,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from types import FrameType
 from typing import Annotated
@@ -89,9 +90,39 @@ def demo(
     seed: Annotated[int, Parameter(help="Seed of the simulated relays.")] = 0,
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
-    from heliograph.demo import run_demo
+    from heliograph.demo.run import run_demo
 
     run_demo(out, seed)
+
+
+@app.command
+def reproduce(
+    method: Annotated[str | None, Parameter(help="Which publication, or all; without it, the list of them.")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder for figures, report, record and summary.")] = None,
+    runs: Annotated[int | None, Parameter(help="Monte Carlo runs; each publication has its own default.")] = None,
+    seed: Annotated[int, Parameter(help="Seed of the simulations.")] = 0,
+) -> None:
+    """Run a published method as printed and as improved, and judge each of its claims by this very run."""
+    from heliograph.papers import METHODS
+
+    if method is None:
+        print("\n".join(METHODS))
+        return
+    from heliograph.check import fail
+    from heliograph.table import check_output_folder
+
+    chosen = list(METHODS) if method == "all" else [method]
+    if method not in METHODS and method != "all":
+        raise fail("method", f"one of {', '.join(METHODS)} or all", repr(method))
+    if out is None:
+        raise fail("reproduce", "a folder for the results (--out DIR)", "none")
+    if runs is not None and runs < 1:
+        raise fail("--runs", "a positive whole number", runs)
+    check_output_folder(out)
+    for name in chosen:
+        import_module(METHODS[name]).reproduce(out, runs, seed)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

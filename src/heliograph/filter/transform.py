@@ -79,8 +79,8 @@ class PolynomialMoments(AbstractTransform):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Evaluate at the quadrature points and sum with their weights."""
-        points, weights = _hermite_grid(mean.shape[0], self.degree + 1)
-        deviations = jnp.asarray(points) @ cholesky(covariance).T
+        points, weights = map(jnp.asarray, _hermite_grid(mean.shape[0], self.degree + 1))
+        deviations = points @ cholesky(covariance).T
         values = jax.vmap(function)(mean + deviations)
         center = weights @ values
         spread = values - center

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.demo import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
+from heliograph.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
 from heliograph.examples import plaza
 from heliograph.plaza_recording import WINDOW
 from heliograph.report.figures import (

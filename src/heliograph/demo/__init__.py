@@ -1,0 +1,1 @@
+"""The demonstration: recorded ranges through a simulated relay, to filters that know it or do not."""

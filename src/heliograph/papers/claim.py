@@ -1,0 +1,28 @@
+"""One judged claim of a publication."""
+
+from typing import Literal, NamedTuple
+
+Verdict = Literal["holds", "holds_vacuously", "fails"]
+
+
+class Claim(NamedTuple):
+    """A claim, where it is made, what it says there in numbers, what is found here, and the verdict.
+
+    "holds_vacuously": true, but so it would be without any measurement, or its premise is never met.
+    """
+
+    claim: str
+    source: str
+    paper: str
+    ours: str
+    verdict: Verdict
+
+
+def holds(condition: bool) -> Verdict:
+    """ "holds" or "fails"."""
+    return "holds" if condition else "fails"
+
+
+def if_met(premise: bool) -> Verdict:
+    """ "holds" for a theorem whose premise is met here, else "holds_vacuously"."""
+    return "holds" if premise else "holds_vacuously"

@@ -1,0 +1,36 @@
+"""Curves over time in stacked panels, each named at its right edge."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.report.figures import STYLE, WIDTH, Curve, label_right
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One set of axes: what its values are, and the curves (time,) in it."""
+
+    label: str
+    curves: Sequence[Curve]
+
+
+@matplotlib.rc_context(STYLE)
+def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "step") -> Figure:
+    """Panels one above the other over the same time; curves are named at the right, at the mean of their last tenth.
+
+    Shapes: time (time,), values of each curve (time,); NaN leaves a gap.
+    """
+    figure = Figure(figsize=(WIDTH, 0.4 + 2.4 * len(panels)), layout="constrained")
+    grid = figure.subplots(len(panels), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, panel in zip(grid, panels, strict=True):
+        for curve in panel.curves:
+            axes.plot(time, curve.values, color=curve.colour, linewidth=1.4)
+        axes.set(ylabel=panel.label, xlim=(time[0], time[-1]))
+        tail = max(len(time) // 10, 1)
+        label_right(axes, {c.name: (float(np.nanmean(c.values[-tail:])), c.colour) for c in panel.curves})
+    grid[-1].set_xlabel(label)
+    return figure
