@@ -123,6 +123,40 @@ from .fusion import (
     InverseCovarianceIntersection as InverseCovarianceIntersection,
     fuse as fuse,
 )
+from .design.relay_network import (
+    RelayNetwork as RelayNetwork,
+)
+from .design.relay_design import (
+    RelayDesign as RelayDesign,
+    given_design as given_design,
+    relay_schedules as relay_schedules,
+)
+from .design.own_error import (
+    own_error_design as own_error_design,
+)
+from .design.receiver_error import (
+    receiver_error_design as receiver_error_design,
+)
+from .design.behind_relays import (
+    receiver_behind_relays as receiver_behind_relays,
+)
+from .design.periodic import (
+    periodic_behind_relays as periodic_behind_relays,
+    periodic_given_design as periodic_given_design,
+    periodic_own_error_design as periodic_own_error_design,
+)
+from .design.periodic_tuning import (
+    periodic_receiver_error_design as periodic_receiver_error_design,
+    periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
+)
+from .design.certificate import (
+    RelayCertificate as RelayCertificate,
+    certify_relays as certify_relays,
+)
+from .simulate_relays import (
+    initial_states as initial_states,
+    simulate_relays as simulate_relays,
+)
 from .network import (
     Network as Network,
     Node as Node,

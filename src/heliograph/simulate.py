@@ -138,12 +138,12 @@ def _chunk(
 def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array) -> Any:
     """One world and all filters on it: dictionaries of truth (time, n), measurements and estimates by node."""
     step = AllFilters(network, parts)
-    x0 = at(network.plant, 0).sample_initial(_key(key, 0, WORLD, INITIAL))
+    x0 = at(network.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
 
     def body(carry: tuple[Any, Any], item: tuple[Any, ...]) -> tuple[Any, Any]:
         (x, states), (k, u_k) = carry, item
         plant = at(network.plant, k)
-        x = plant.transition(x, u_k) + plant.sample_noise(_key(key, k, WORLD, PROCESS), u_k)
+        x = plant.transition(x, u_k) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u_k)
         z: dict[str, jax.Array] = {}
         for part in parts:
             z |= dict(zip(part.names, _observe(part, x, key, k), strict=True))
@@ -158,15 +158,15 @@ def _observe(part: Group, x: jax.Array, key: jax.Array, k: jax.Array) -> jax.Arr
 
     def one(node: Any, checksum: jax.Array) -> jax.Array:
         sensor, channel = at(node.sensor, k), at(node.channel, k)
-        y = sensor.measure(x) + sensor.noise.sample(_key(key, k, checksum, SENSOR))
-        return apply(channel.sample(_key(key, k, checksum, CHANNEL)), y)
+        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum, SENSOR))
+        return apply(channel.sample(draw_key(key, k, checksum, CHANNEL)), y)
 
     observe = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
     received: jax.Array = observe(part.stacked, jnp.asarray(part.checksums))
     return received
 
 
-def _key(run_key: jax.Array, k: Any, place: Any, purpose: int) -> jax.Array:
+def draw_key(run_key: jax.Array, k: Any, place: Any, purpose: int) -> jax.Array:
     """Key of one draw: folded in by step, node and purpose, so no draw depends on how many others there are."""
     for part in (k, place, purpose):
         run_key = jax.random.fold_in(run_key, part)

@@ -1,0 +1,69 @@
+"""Time to design a relay network's gains: 100 steps of the example, and the cost of a step in the state dimension."""
+
+import os
+
+os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import time
+
+import jax
+import numpy as np
+
+import heliograph as hg
+from heliograph.design.own_error import _propagate_own
+from heliograph.design.relay_design import start_moments
+from heliograph.papers.successive_relays import setting
+
+STEPS = 100
+LIMIT = 0.020  # seconds, warm, one core
+
+
+def median_time(call, repeats: int = 21) -> float:
+    call()
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return float(np.median(times))
+
+
+def of_dimension(n: int) -> hg.RelayNetwork:
+    rng = np.random.default_rng(n)
+    plant = hg.LinearPlant(rng.normal(size=(n, n)) * 0.5 / np.sqrt(n), np.eye(n), np.zeros(n), np.eye(n))
+    return hg.RelayNetwork(plant, hg.LinearSensor(rng.normal(size=(1, n)), [[1.0]]), ("relay_1", "relay_2"),
+                           setting.network().slots)  # fmt: skip
+
+
+def dense(d: int) -> float:
+    """One product of dense (d, d) matrices, in a scan of STEPS."""
+    with jax.enable_x64(True):
+        a = jax.numpy.asarray(np.random.default_rng(d).normal(size=(d, d)) / d)
+        run = jax.jit(lambda x: jax.lax.scan(lambda b, _: (a @ b, None), x, None, length=STEPS)[0])
+        return median_time(lambda: run(a).block_until_ready()) / STEPS
+
+
+def main() -> None:
+    network = setting.network()
+    start = time.perf_counter()
+    hg.own_error_design(network, STEPS)
+    first = time.perf_counter() - start
+    warm = median_time(lambda: hg.own_error_design(network, STEPS))
+    steps, moments = network.steps(STEPS), start_moments(network)
+    recursion = median_time(lambda: _propagate_own(steps, moments))
+    print(f"design of {STEPS} steps: first call {first:.2f} s, warm {1e3 * warm:.2f} ms (limit {1e3 * LIMIT:.0f} ms), "
+          f"of which the recursion {1e3 * recursion:.2f} ms")  # fmt: skip
+    print("n   design of a step (us)   dense (4 n)^3 product (us)   ratio")
+    for n in (3, 6, 12, 24):
+        net = of_dimension(n)
+        tables, at_start = net.steps(STEPS), start_moments(net)
+        step = median_time(lambda t=tables, s=at_start: _propagate_own(t, s), 7) / STEPS
+        product = dense(4 * n)
+        print(f"{n:<3} {1e6 * step:>10.1f} {1e6 * product:>22.1f} {step / product:>22.1f}")
+    if warm > LIMIT:
+        raise SystemExit(f"design of {STEPS} steps: expected at most {LIMIT} s, got {warm:.4f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""A small minimiser: BFGS with backtracking, for smooth functions of tens of variables that may be infinite."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
+
+DECREASE = 1e-4  # Armijo: least part of the predicted decrease that a step must give
+SHORTEN = 0.3
+SHORTEST = 1e-14
+PATIENCE = 5  # steps in a row that gain nothing
+
+
+def bfgs(function: Function, start: np.ndarray, iterations: int = 300, tolerance: float = 1e-12) -> np.ndarray:
+    """Follow value and gradient down from `start`, where the value is finite; a step to an infinite value is shortened.
+
+    Stops after PATIENCE steps that gain less than `tolerance`, or where no step goes down any more.
+    """
+    x = np.asarray(start, dtype=np.float64)
+    value, gradient = function(x)
+    inverse = np.eye(len(x)) * 0.1 / max(np.linalg.norm(gradient), np.finfo(float).tiny)
+    idle = 0
+    for iteration in range(iterations):
+        direction = -inverse @ gradient
+        if direction @ gradient >= 0:
+            inverse = np.eye(len(x)) * 1e-2 / np.linalg.norm(gradient)
+            direction = -inverse @ gradient
+        taken = _backtrack(function, x, value, direction, float(direction @ gradient))
+        if taken is None:
+            break
+        step, new_value, new_gradient = taken
+        inverse = _update(inverse, step, new_gradient - gradient, first=iteration == 0)
+        idle = idle + 1 if value - new_value < tolerance else 0
+        x, value, gradient = x + step, new_value, new_gradient
+        if idle >= PATIENCE or not np.any(gradient):
+            break
+    return x
+
+
+def _backtrack(
+    function: Function, x: np.ndarray, value: float, direction: np.ndarray, slope: float
+) -> tuple[np.ndarray, float, np.ndarray] | None:
+    length = 1.0
+    while length >= SHORTEST:
+        new_value, gradient = function(x + length * direction)
+        if np.isfinite(new_value) and np.all(np.isfinite(gradient)) and new_value <= value + DECREASE * length * slope:
+            return length * direction, new_value, gradient
+        length *= SHORTEN
+    return None
+
+
+def _update(inverse: np.ndarray, s: np.ndarray, y: np.ndarray, first: bool) -> np.ndarray:
+    """H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y, skipped where the curvature s'y is not positive."""
+    curvature = float(s @ y)
+    if curvature <= 1e-14 * np.linalg.norm(s) * np.linalg.norm(y):
+        return inverse
+    if first:
+        inverse = np.eye(len(s)) * curvature / float(y @ y)
+    left = np.eye(len(s)) - np.outer(s, y) / curvature
+    result: np.ndarray = left @ inverse @ left.T + np.outer(s, s) / curvature
+    return result
