@@ -2,6 +2,8 @@
 
 from typing import Literal, NamedTuple
 
+import numpy as np
+
 Verdict = Literal["holds", "holds_vacuously", "fails"]
 
 
@@ -18,8 +20,8 @@ class Claim(NamedTuple):
     verdict: Verdict
 
 
-def holds(condition: bool) -> Verdict:
-    """ "holds" or "fails"."""
+def holds(condition: bool | np.bool | None) -> Verdict:
+    """ "holds" or "fails" (also where nothing could be judged, None)."""
     return "holds" if condition else "fails"
 
 

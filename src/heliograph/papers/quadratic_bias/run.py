@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 
 from heliograph.check import fail
-from heliograph.progress import progress
 from heliograph.output_folder import check_replaceable, whole_folder
 from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
@@ -21,6 +20,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
     simulated_over_time,
 )
+from heliograph.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
 FOLDER = "quadratic-bias"
