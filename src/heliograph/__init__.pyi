@@ -95,6 +95,13 @@ from .filter.gaussian import (
     gaussian_filter as gaussian_filter,
     mean_gain_filter as mean_gain_filter,
 )
+from .filter.boundedness import (
+    Ceiling as Ceiling,
+    GrowthCondition as GrowthCondition,
+    empirical_ceiling as empirical_ceiling,
+    growth_condition as growth_condition,
+    provable_ceiling as provable_ceiling,
+)
 from .filter.linear import (
     linear_filter as linear_filter,
     open_loop_filter as open_loop_filter,

@@ -130,7 +130,7 @@ def test_theorem_1_holds_by_enumeration(build):
         joint = a @ a.T  # E of (e, e_y, yhat) (...)': correlated in any way, so E[e yhat'] is not zero
         e, ey, y = joint[:5, :5], joint[5:7, 5:7], slice(7, 9)
         yy = ey + joint[y, y] + joint[5:7, y] + joint[y, 5:7]
-        signal = Signal(*(jnp.asarray(v) for v in (np.zeros(2), ey, joint[:5, 5:7], yy)))
+        signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
         update = build(hg.Scalars(*10 ** rng.uniform(-2, 0, 2)))
         channel = machine.channel(s)
         with jax.enable_x64(True):
@@ -177,3 +177,32 @@ def test_extended_filter_takes_every_bound():
         item = hg.extended_filter(machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(STRONG), update)
         reference = follow_oracle(STRONG, 0, oracle.predict_extended, oracle.bounded(terms(STRONG), False), z)
         agree(follow(item, z), reference)
+
+
+def too_small(radius, shrink, seeds=range(20)):
+    """Whether enumeration finds a violation when the channel's description is made smaller by `shrink`."""
+    worst = np.inf
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        a = np.outer(rng.normal(size=9), rng.normal(size=9)) + 0.05 * rng.normal(size=(9, 9))
+        joint = a @ a.T  # nearly one direction: e and y move together, the worst for a shifted mean
+        ey = joint[5:7, 5:7]
+        yy = ey + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
+        signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
+        channel, update = machine.channel(STRONG, radius), hg.Polytope(hg.Scalars(0.01, 0.01))
+        right = update.describe(channel)
+        with jax.enable_x64(True):
+            gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(joint[:5, :5]), signal, shrink(right)))
+        for corner in channel.extremes():
+            gap = bound - actual_covariance(joint, gain, corner, right.gain)
+            worst = min(worst, np.linalg.eigvalsh(gap)[0] / np.trace(bound))
+    return worst < -1e-6
+
+
+def test_the_enumeration_finds_bounds_that_are_too_small():
+    """Half the spread, or no shift, is caught; the description as it is is not: the checks above can fail."""
+    half = lambda d: eqx.tree_at(lambda x: x.spread.center, d, d.spread.center / 2)  # noqa: E731
+    still = lambda d: eqx.tree_at(lambda x: x.shift.center, d, 0 * d.shift.center)  # noqa: E731
+    assert too_small(0.0, half)
+    assert too_small(0.15, still)
+    assert not too_small(0.0, lambda d: d) and not too_small(0.15, lambda d: d)

@@ -1,0 +1,1 @@
+"""Cubature Kalman fusion filtering under amplify-and-forward relays, reproduced and repaired; see README.md."""
