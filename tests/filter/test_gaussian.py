@@ -243,3 +243,29 @@ def test_a_component_known_exactly_is_no_error():
 def test_parts_that_do_not_fit_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
+
+
+def test_a_constant_gain_is_a_scaled_signal():
+    z = machine.data(STRONG, STEPS)[:, 0]
+    gains = hg.amplify_and_forward([hg.hop(0.7, 2e-3, dimension=2), hg.hop(1.5, 1e-3, dimension=2)])
+    scaled = hg.LinearSensor(
+        0.7 * 1.5 * STRONG["C"][0], (0.7 * 1.5) ** 2 * STRONG["Q"] + (1.5**2 * 2e-3 + 1e-3) * np.eye(2)
+    )
+    ours = hg.cubature_filter(machine.plant(STRONG), machine.sensor(STRONG, 0), gains)
+    agree(follow(ours, z), follow(hg.cubature_filter(machine.plant(STRONG), scaled, hg.perfect(2)), z))
+
+
+def test_known_laws_make_the_interval_bound_the_polytope():
+    """rho = kappa = 0: tight = polytope."""
+    z = machine.data(STRONG, STEPS)[:, 0]
+    parts = (machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(STRONG, radius=0.0))
+    agree(follow(hg.cubature_filter(*parts, hg.Interval()), z), follow(hg.cubature_filter(*parts, hg.Polytope()), z))
+
+
+def test_every_transform_is_the_same_for_linear_plants():
+    z = np.random.default_rng(2).normal(size=(STEPS, 2))
+    parts = (LINEAR, SENSOR, PARALLEL)
+    rules = [hg.Cubature(), hg.Linearization(), hg.PolynomialMoments(1)]
+    first, *others = (follow(hg.gaussian_filter(*parts, rule), z) for rule in rules)
+    for other in others:
+        agree(other, first)

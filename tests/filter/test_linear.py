@@ -87,3 +87,40 @@ def test_a_horizon_beyond_what_varies_is_refused():
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channels, {"f": hg.linear_filter(PLANT, SENSOR, channels)})})
     with pytest.raises(ValueError, match=r"horizon: expected at most 3 steps, .* got 4"):
         hg.monte_carlo(network, 4, 2, 0)
+
+
+def test_the_exact_claim_is_the_mean_squared_error_by_enumeration():
+    """E of (x, e)(x, e)' propagated over every gain outcome, with the filter's own gains, equals the claim to 1e-12."""
+    gamma, xi, qm, qn = hg.Discrete([0.2, 0.8, 1.3], P), hg.Discrete([0.5, 1.0], [0.4, 0.6]), 0.1, 0.05
+    channel = hg.amplify_and_forward([hg.hop(gamma, qm, dimension=2), hg.hop(xi, qn, dimension=2)])
+    item = hg.linear_filter(PLANT, SENSOR, channel)
+    a, c, mu = PLANT.matrix, SENSOR.matrix, gamma.moment(1) * xi.moment(1)
+    outcomes = [
+        (p * q, g * x, x) for p, g in zip(P, gamma.values, strict=True) for q, x in zip(*_atoms(xi), strict=True)
+    ]
+    cov = PLANT.initial_covariance
+    joint = np.block([[cov + np.outer(PLANT.initial_mean, PLANT.initial_mean), cov], [cov, cov]])
+    state = item.init()
+    for k in range(6):
+        before = state
+        state, estimate = item.step(before, np.zeros(2), (), k)
+        moved = np.kron(np.eye(2), a)
+        joint = moved @ joint @ moved.T + 0.05 * np.kron(np.ones((2, 2)), np.eye(2))
+        gain = _gain(item, before, k)
+        total = np.zeros((4, 4))
+        for p, g, x in outcomes:  # e+ = e - K (g y + x m + n - mu C xhat), y = C x + v, C xhat = C x - C e
+            step = np.block([[np.eye(2), np.zeros((2, 2))], [-(g - mu) * gain @ c, np.eye(2) - mu * gain @ c]])
+            noise = gain @ ((g**2 * 0.02 + x**2 * qm + qn) * np.eye(2)) @ gain.T
+            total += p * (step @ joint @ step.T + np.block([[np.zeros((2, 4))], [np.zeros((2, 2)), noise]]))
+        joint = total
+        np.testing.assert_allclose(estimate.bound, joint[2:, 2:], atol=1e-12)
+
+
+def _atoms(law):
+    return law.probabilities, law.values
+
+
+def _gain(item, state, k):
+    """The filter's gain, read off its response to unit measurements."""
+    zero = item.step(state, np.zeros(2), (), k)[1].mean
+    return np.stack([item.step(state, unit, (), k)[1].mean - zero for unit in np.eye(2)], axis=1)
