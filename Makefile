@@ -25,7 +25,7 @@ test: .venv/.test  ## Lint, check types and run the tests
 	$(BIN)/pytest -n 2
 
 bench: .venv/.test  ## Run the benchmarks
-	$(BIN)/python benchmarks/run.py
+	@for file in benchmarks/*.py; do echo "$$file"; $(BIN)/python "$$file" || exit 1; done
 
 clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
