@@ -190,7 +190,8 @@ def simulated_mean(outcome: Outcome, name: str, against: str | None = None) -> t
         squared = squared - _batches(outcome, against)[0]
     mean = squared.sum(axis=0) / count.sum()
     used = count > 0
-    scatter = np.sum((squared[used] - mean * count[used, None]) ** 2, axis=0) * used.sum() / max(used.sum() - 1, 1)
+    batches = int(np.count_nonzero(used))
+    scatter = np.sum((squared[used] - mean * count[used, None]) ** 2, axis=0) * batches / max(batches - 1, 1)
     return mean, np.sqrt(scatter) / count.sum()
 
 
