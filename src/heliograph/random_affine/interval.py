@@ -61,17 +61,16 @@ def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval
     """Moments are sum_k E[g^k] B_k with known B_k; each E[g^k] has its exact range from the closed-form LP."""
     basis, ends = [], []
     for k in range(order + 1):
-        # The part that multiplies E[g^k]: the k-th derivative of the moments in a constant gain, by differences.
         basis.append(_gain_coefficient(channel, k, order))
         ends.append((-law.worst(-(law.values**k)), law.worst(law.values**k)) if k else (1.0, 1.0))
     products = [
         (np.minimum(b * lo, b * hi), np.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
     ]
-    return sum(p[0] for p in products), sum(p[1] for p in products)  # type: ignore[return-value]
+    return np.sum([low for low, _ in products], axis=0), np.sum([high for _, high in products], axis=0)
 
 
 def _gain_coefficient(channel: GainAndNoise, k: int, order: int) -> np.ndarray:
-    """Coefficient of g^k in the moments, which are a polynomial of degree `order` in a constant gain g."""
+    """Coefficient of g^k in the moments, a polynomial of degree `order` in a constant gain g, by interpolation."""
     nodes = np.arange(order + 1, dtype=np.float64)
     values = np.array([GainAndNoise(Constant(g), channel.matrix, channel.noise).moments(order).matrix for g in nodes])
     weights = np.linalg.inv(np.vander(nodes, increasing=True))[k]
