@@ -7,7 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
+from heliograph.filter.base import STRENGTH, weakest
 from heliograph.fusion import relative_gap, trace_optimal_weights
+from heliograph.testing import check_fusion
 from tests.oracles import cubature_fusion as oracle
 
 CERTIFIED = 1e-9  # what the issue of optimal weights asks for; the method stops at 1e-10
@@ -61,6 +63,53 @@ def test_weights_agree_with_a_semidefinite_programme():
     problem.solve(solver=cp.CLARABEL)
     fused = hg.fuse(hg.CovarianceIntersection(), estimates(bounds))
     assert np.trace(fused.bound) == pytest.approx(problem.value, rel=1e-6)  # the solver's tolerance
+
+
+RULES = {
+    "optimal": hg.CovarianceIntersection(),
+    "equal": hg.EqualIntersection(),
+    "fixed": hg.FixedIntersection([0.2, 0.3, 0.5]),
+    "weighted": hg.WeightedFusion([0.2, 0.3, 0.5]),
+    "inverse": hg.InverseCovarianceIntersection(),
+}
+
+
+@pytest.mark.parametrize("name", RULES)
+def test_contract(name):
+    check_fusion(RULES[name])
+
+
+class _Overconfident(hg.WeightedFusion):
+    """Takes correlated errors for independent ones."""
+
+    def combine(self, means, bounds):
+        mean, bound = super().combine(means, bounds)
+        return mean, bound / 2
+
+
+def test_the_check_finds_a_bound_that_is_none():
+    with pytest.raises(AssertionError, match="identical bounds"):
+        check_fusion(_Overconfident([0.2, 0.3, 0.5]))
+
+
+def test_weighted_fusion_by_hand():
+    pair = estimates(np.array([[[1.0]], [[3.0]]]), "exact")
+    fused = hg.fuse(hg.WeightedFusion([0.25, 0.75]), pair)
+    np.testing.assert_allclose(fused.mean, 0.25 * pair[0].mean + 0.75 * pair[1].mean, rtol=1e-15)
+    assert fused.bound[0, 0] == 2.5 and fused.claim == "upper"
+
+
+def test_estimates_that_claim_no_covariance():
+    """A weighted mean needs none; rules that weigh by covariances say so."""
+    some = estimates(covariances(0, 2, 2), "exact")
+    mixed = [some[0], hg.Estimate(some[1].mean, np.full((2, 2), np.nan), "none")]
+    fused = hg.fuse(hg.WeightedFusion([0.5, 0.5]), mixed)
+    assert fused.claim == "none" and np.all(np.isfinite(fused.mean)) and np.all(np.isnan(fused.bound))
+    rules = (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.InverseCovarianceIntersection())
+    for rule in (*rules, hg.FixedIntersection([0.5, 0.5])):
+        with pytest.raises(ValueError, match="estimates that claim one, got the claim 'none'"):
+            hg.fuse(rule, mixed)
+    assert [weakest([a, "none"]) for a in STRENGTH] == ["none"] * 4
 
 
 @pytest.mark.parametrize(
@@ -186,11 +235,49 @@ def test_fusion_inside_the_scan_is_fusion_outside():
     assert record.estimates["fused"]["optimal"].claim == "upper"
 
 
+def test_nodes_keep_their_order():
+    """Weights and joined measurements go by the order of the nodes, not of their names."""
+    sensors = {"z": hg.LinearSensor([[1.0, 0.0]], 0.1), "a": hg.LinearSensor([[0.3, 1.0], [1.0, 1.0]], 0.1)}
+    nodes = {
+        name: hg.Node(s, hg.perfect(len(s.outputs)), {"f": hg.cubature_filter(PLANT, s, hg.perfect(len(s.outputs)))})
+        for name, s in sensors.items()
+    }
+    weights = [0.9, 0.1]
+    fused = {
+        "fixed": hg.Fusion("f", hg.FixedIntersection(weights)),
+        "central": hg.sequential_filter([n.filters["f"] for n in nodes.values()]),
+    }
+    record = hg.monte_carlo(hg.Network(PLANT, nodes, fused), 4, 2, 0)
+    outside = hg.fuse(hg.FixedIntersection(weights), [record.estimates[name]["f"] for name in nodes])
+    np.testing.assert_allclose(record.estimates["fused"]["fixed"].mean, outside.mean, atol=1e-12)
+    stream = hg.Stream(fused["central"])
+    for k in range(4):
+        estimate = stream.push(np.concatenate([record.measurements[name][0, k] for name in nodes]))
+        np.testing.assert_allclose(record.estimates["fused"]["central"].mean[0, k], estimate.mean, atol=1e-11)
+
+
 def test_an_upper_claim_of_fusion_holds():
     fading = hg.hop(hg.Rayleigh(0.8), 0.05)
     found = network(fading, lambda n: {"ci": hg.Fusion("linear", hg.CovarianceIntersection())})
     s = hg.monte_carlo(found, 8, 2000, 1, keep=hg.Statistics())["fused"]["ci"]
     assert s.claim == "upper" and s.worst_direction().z < 4
+
+
+QUANTIZER = hg.UniformQuantizer(8, 3.0)
+
+
+def quantized(quantizer):
+    fusion = hg.Fusion("linear", hg.EqualIntersection(), quantizer)
+    return network(hg.perfect(), lambda n: {"x": fusion})
+
+
+def test_a_claim_through_a_quantizer():
+    assert quantized(None).claims()["fused"]["x"] == quantized(QUANTIZER).claims()["fused"]["x"] == "upper"
+    following = hg.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
+    assert quantized(following).claims()["fused"]["x"] == "nominal"
+    assert quantized({name: following for name in ROWS}).claims()["fused"]["x"] == "nominal"
+    varying = hg.over_time([QUANTIZER, hg.UniformQuantizer(16, 3.0)])
+    assert quantized(varying).claims()["fused"]["x"] == "upper"
 
 
 @pytest.mark.parametrize(
@@ -215,6 +302,15 @@ def test_an_upper_claim_of_fusion_holds():
             r"shape \(3\)",
         ),
         (lambda: hg.sequential_filter([]), "one state dimension"),
+        (lambda: hg.WeightedFusion([0.5, 0.6]), "sum to 1"),
+        (lambda: hg.fuse(hg.WeightedFusion([0.5, 0.5]), estimates(covariances(0, 3, 2))), r"shape \(3\)"),
+        (lambda: quantized({"a": QUANTIZER}), r"quantizers: expected one for each node of \['a', 'b', 'c'\]"),
+        (lambda: quantized(3.0), "quantizer: expected an AbstractQuantizer, got float"),
+        (lambda: quantized(hg.UniformQuantizer(8, [1.0, 2.0, 3.0])), r"numbers or shape \(2,\)"),
+        (
+            lambda: quantized({"a": QUANTIZER, "b": QUANTIZER, "c": hg.ZoomQuantizer(8, 1.0, 0.5, 0.1)}),
+            "objects of one structure",
+        ),
     ],
 )
 def test_bad_fusions(call, message):

@@ -167,6 +167,15 @@ def test_columns_of_estimates():
     np.testing.assert_array_equal(found["valid"], [True, False, False])
 
 
+def test_no_columns_for_a_covariance_that_is_not_claimed():
+    record = record_of("silent")
+    means = record.estimates["a"]["silent"].mean
+    record.estimates["a"]["silent"] = h.Estimate(means, np.full((3, 2, 2), np.nan), "none")
+    found = estimate_columns(record)
+    assert list(found) == ["time", "p", "v", "valid"]
+    np.testing.assert_array_equal(found["valid"], np.isfinite(means).all(axis=1))
+
+
 def test_prefixes_of_nodes_and_filters():
     assert list(estimate_columns(record_of("aware", "other")))[1] == "aware.p"
     assert list(estimate_columns(record_of("aware", nodes=("a", "b"))))[1] == "a.p"

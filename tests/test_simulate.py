@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.testing import check_filter
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1, [0.0, 1.0], 0.3, input_matrix=[[1.0], [0.5]])
 CHANNEL = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.7), 0.1), hg.hop(hg.bernoulli(0.8), 0.05)])
@@ -100,6 +101,161 @@ def test_a_lost_covariance_is_reported_with_its_step():
     assert line.startswith("n/f: no valid covariance from step ")
     step = int(line.split("step ")[1].split()[0])
     assert 0 < step < 12 and np.all(np.isfinite(record.estimates["n"]["f"].mean[: step - 1]))
+
+
+LINEAR = {
+    name: hg.Node(item.sensor, item.channel, {"linear": item.filters["linear"]}) for name, item in NETWORK.nodes.items()
+}
+STATIC = {
+    "b": hg.UniformQuantizer(32, 0.8),  # saturates now and then
+    "a": hg.UniformQuantizer(16, 12.0),
+    "direct": hg.UniformQuantizer(64, 10.0),
+}
+LINKED = hg.Network(
+    PLANT,
+    LINEAR,
+    {
+        "plain": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5])),
+        "static": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
+        "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
+        "zoom": hg.Fusion("linear", hg.EqualIntersection(), hg.ZoomQuantizer(40, [3.0, 2.0], 0.6, 0.1)),
+    },
+)
+
+
+@pytest.fixture(scope="module")
+def linked():
+    return hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS)
+
+
+def sent_step_by_step(fusion, record, run):
+    """What each node's quantizer delivers of its filter's means in one run, by a plain loop."""
+    delivered = []
+    for name in NETWORK.nodes:
+        quantizer = fusion.quantizer[name] if isinstance(fusion.quantizer, dict) else fusion.quantizer
+        state = quantizer.init(2)
+        for k in range(HORIZON):
+            state, sent = quantizer.step(state, record.estimates[name][fusion.filter].mean[run, k])
+            delivered.append(sent)
+    return [
+        np.stack([getattr(s, part) for s in delivered]).reshape(3, HORIZON, 2).swapaxes(0, 1)
+        for part in ("value", "error", "saturated", "symbols")
+    ]
+
+
+@pytest.mark.parametrize("name", ["static", "escape", "zoom"])
+def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
+    fusion, link = LINKED.fused[name], linked.links[name]
+    for run in (0, 5):
+        value, error, saturated, symbols = sent_step_by_step(fusion, linked, run)
+        np.testing.assert_array_equal(link.saturated[run], saturated)
+        np.testing.assert_array_equal(link.symbols[run], symbols)
+        k = int(np.flatnonzero(~saturated.any(axis=(1, 2)))[-1])
+        local = []
+        for i, node in enumerate(NETWORK.nodes):
+            p, d = linked.estimates[node][fusion.filter].bound[run, k], error[k, i]
+            s, r = d.sum(), np.sqrt(np.trace(p))
+            local.append(hg.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
+        outside, inside = hg.fuse(fusion.rule, local), linked.estimates["fused"][name]
+        # The same arithmetic in another compilation; searched weights agree to the root of rounding.
+        np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(inside.bound[run, k], outside.bound, rtol=0, atol=1e-7)
+
+
+def test_links_change_nothing_else(linked, record):
+    assert np.array_equal(linked.truth, record.truth) and record.links == {}
+    assert list(linked.links) == ["static", "escape", "zoom"]
+    for node in NETWORK.nodes:
+        np.testing.assert_allclose(linked.estimates[node]["linear"].mean, record.estimates[node]["linear"].mean)
+
+
+def test_saturation_is_reported_and_nothing_is_claimed_there(linked):
+    link, fused = linked.links["static"], linked.estimates["fused"]["static"]
+    assert link.nodes == ("b", "a", "direct") and link.saturated.shape == (RUNS, HORIZON, 3, 2)
+    count = int(link.saturated[:, :, 0].sum())
+    assert count > 0 and not link.saturated[:, :, 1:].any()
+    lines = [line for line in linked.failures() if line.startswith("fused/static")]
+    assert lines[1] == f"fused/static: the quantizer of node b saturated in {count} of {RUNS * HORIZON * 2} samples"
+    assert lines[0].startswith("fused/static: no valid covariance from step ")
+    anywhere = link.saturated.any(axis=(-1, -2))
+    assert np.array_equal(np.isnan(fused.bound).all(axis=(-1, -2)), anywhere)
+    assert np.array_equal(np.isnan(fused.bound).any(axis=(-1, -2)), anywhere) and np.all(np.isfinite(fused.mean))
+    assert link.saturated_share()["b"] == count / (RUNS * HORIZON * 2) and link.symbols_per_value() == 1
+    assert not any("fused/escape" in line for line in linked.failures())
+    assert 1 < linked.links["escape"].symbols_per_value() < 5
+
+
+def test_statistics_count_what_the_record_shows(linked):
+    some = [hg.monte_carlo(LINKED, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk)["fused"] for chunk in (64, 256)]
+    for name in linked.links:
+        a, b = (s[name].link for s in some)
+        assert np.array_equal(a.saturated, b.saturated) and np.array_equal(a.symbols, b.symbols)
+    found = some[0]
+    assert found["plain"].link is None
+    for name in linked.links:
+        kept, counted = hg.error_statistics(linked, "fused", name).link, found[name].link
+        assert kept.nodes == counted.nodes
+        np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
+        np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
+
+
+def test_chunks_change_no_bit_of_links(linked):
+    other = hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
+    pairs = zip(leaves(linked), leaves(other), strict=True)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    for name, link in linked.links.items():
+        assert np.array_equal(link.saturated, other.links[name].saturated)
+
+
+def test_a_recording_goes_through_the_same_links(linked):
+    result = hg.run(LINKED, {name: z[3] for name, z in linked.measurements.items()}, INPUTS)
+    for name, link in linked.links.items():
+        assert np.array_equal(result.links[name].symbols, link.symbols[3])
+        np.testing.assert_allclose(
+            result.estimates["fused"][name].mean, linked.estimates["fused"][name].mean[3], rtol=0, atol=1e-9
+        )
+
+
+def test_quantizers_over_time_and_the_claim_of_a_static_one():
+    """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
+    each = hg.over_time([hg.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
+    network = hg.Network(PLANT, LINEAR, {"ci": hg.Fusion("linear", hg.CovarianceIntersection(), each)})
+    found = hg.monte_carlo(network, 5, 2000, 3, hg.Statistics(), INPUTS[:5])["fused"]["ci"]
+    assert found.claim == "upper" and found.link.saturated.max() == 0 and found.worst_direction().z < 4
+    trace = np.trace(found.claimed(), axis1=1, axis2=2)
+    assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
+    with pytest.raises(ValueError, match="at most 5 steps"):
+        hg.monte_carlo(network, HORIZON, 2, 3, inputs=INPUTS)
+
+
+class Silent(hg.AbstractFilter):
+    """Gives the initial mean and claims nothing."""
+
+    claim: str = "none"
+
+    def init(self):
+        return np.zeros(2)
+
+    def step(self, state, z, u=(), k=0):
+        return state, hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
+
+
+def test_a_filter_that_claims_no_covariance_harms_no_other():
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
+    filters = {"silent": Silent(), "linear": hg.linear_filter(PLANT, sensor, CHANNEL)}
+    nodes = {name: hg.Node(sensor, CHANNEL, filters) for name in ("p", "q")}
+    network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.WeightedFusion([0.5, 0.5]))})
+    check_filter(Silent(), 1)
+    assert hg.monte_carlo(network, 4, 8, 0, inputs=INPUTS[:4]).failures() == []
+    found = hg.monte_carlo(network, 4, 200, 0, hg.Statistics(), INPUTS[:4])
+    silent, linear = found["p"]["silent"], found["p"]["linear"]
+    assert silent.claim == found["fused"]["mean"].claim == "none"
+    assert silent.rmse()[0] > linear.rmse()[0] and linear.nees_per_dimension()[0] == pytest.approx(1, abs=0.3)
+    assert np.isnan(silent.nees_per_dimension()[0]) and np.isnan(silent.mean_trace())
+    assert np.isnan(silent.worst_direction().ratio) and np.isnan(silent.worst_direction().z)
+    assert hg.pool([silent, linear]).claim == "none"
+    with pytest.raises(ValueError, match="got the claim 'none'"):
+        hg.Network(PLANT, nodes, {"ci": hg.Fusion("silent", hg.CovarianceIntersection())})
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ ORDER = [
     ["design"],
     ["filter"],
     ["quantizer"],
-    ["fusion"],
+    ["fusion", "fusion_level"],
     ["network"],
     ["groups", "record", "stream"],
     ["simulate", "simulate_relays", "consistency"],
@@ -27,6 +27,7 @@ ORDER = [
     ["table", "recording", "plaza_recording", "output_folder", "load"],
     ["examples"],
     ["report"],
+    ["campaign"],
     ["demo", "papers"],
     ["cli"],
 ]

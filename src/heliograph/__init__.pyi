@@ -41,6 +41,7 @@ from .sensor import (
 from .channel import (
     amplify_and_forward as amplify_and_forward,
     dropout as dropout,
+    erasure as erasure,
     hop as hop,
     mean_gain as mean_gain,
     parallel as parallel,
@@ -122,13 +123,27 @@ from .filter.mixture import (
 from .filter.sequential import (
     sequential_filter as sequential_filter,
 )
+from .quantizer import (
+    AbstractQuantizer as AbstractQuantizer,
+    EscapeQuantizer as EscapeQuantizer,
+    Quantized as Quantized,
+    UniformQuantizer as UniformQuantizer,
+    ZoomQuantizer as ZoomQuantizer,
+)
 from .fusion import (
     CovarianceIntersection as CovarianceIntersection,
     EqualIntersection as EqualIntersection,
     FixedIntersection as FixedIntersection,
     Fusion as Fusion,
     InverseCovarianceIntersection as InverseCovarianceIntersection,
+    WeightedFusion as WeightedFusion,
     fuse as fuse,
+)
+from .fusion_level import (
+    fused_error_norm as fused_error_norm,
+    fused_level as fused_level,
+    level_weights as level_weights,
+    published_fused_level as published_fused_level,
 )
 from .design.relay_network import (
     RelayNetwork as RelayNetwork,
@@ -176,6 +191,7 @@ from .stream import (
     Stream as Stream,
 )
 from .record import (
+    Link as Link,
     Record as Record,
     Trajectories as Trajectories,
 )

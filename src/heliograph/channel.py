@@ -10,6 +10,7 @@ from heliograph.over_time import OverTime, over_time, unstack
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.noise import as_noise
 from heliograph.sensor import AbstractSensor, check_sensor
@@ -68,13 +69,24 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> Series:
 def dropout(channel: AbstractRandomAffine, arrival: Any, radius: Any = 0.0) -> Mixture:
     """A channel whose packet is lost with probability 1 - arrival; the receiver then reads zero and is not told.
 
-    Where the receiver knows of the loss, give NaN as the measurement instead: filters skip it.
+    Where the receiver knows of the loss, it is an `erasure`.
 
     Raises:
         ValueError: an arrival probability outside [0, 1].
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
     return Mixture([channel, silent(channel.outputs, channel.inputs)], [p, 1 - p], radius)
+
+
+def erasure(channel: AbstractRandomAffine, arrival: Any) -> Erasure:
+    """A channel whose packet is lost with probability 1 - arrival; the receiver knows, and reads NaN.
+
+    Filters skip what is NaN, so give a filter the channel inside, without the erasure. A relay forwards NaN as NaN.
+
+    Raises:
+        ValueError: an arrival probability outside [0, 1]; later, when asked for moments.
+    """
+    return Erasure(channel, arrival)
 
 
 def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:

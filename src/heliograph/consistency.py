@@ -1,7 +1,7 @@
 """Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import equinox as eqx
@@ -14,8 +14,8 @@ from heliograph.check import fail
 from heliograph.filter.base import Claim, Estimate, weakest
 from heliograph.float64 import to_numpy
 from heliograph.linalg import psd_solve
-from heliograph.network import Network
-from heliograph.record import AbstractReducer, Record
+from heliograph.network import FUSED, Network
+from heliograph.record import AbstractReducer, Link, Record, links_of
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
 
@@ -25,7 +25,8 @@ class ErrorStatistics:
     """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
 
     count (batch,), outer = sum e e' and bound = sum of claimed covariances (batch, time, n, n),
-    nees = sum e' B^-1 e (batch, time), claim as the filter states it.
+    nees = sum e' B^-1 e (batch, time), claim as the filter states it; link of a fusion that has quantizers. Where no
+    covariance is claimed, what is made of bounds is NaN.
     """
 
     count: np.ndarray
@@ -33,6 +34,7 @@ class ErrorStatistics:
     bound: np.ndarray
     nees: np.ndarray
     claim: Claim
+    link: Link | None = None
 
     @property
     def runs(self) -> int:
@@ -82,13 +84,18 @@ class ErrorStatistics:
         """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, judged on runs that did not choose d.
 
         The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
-        ratio is not biased by the search. `z` is the excess over 1 in standard errors.
+        ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
+        not finite.
 
         Raises:
             ValueError: fewer than 4 runs.
         """
         if self.runs < 4:
             raise fail("worst direction", "at least 4 runs", self.runs)
+        broken = ~(np.isfinite(self.outer) & np.isfinite(self.bound)).all(axis=(0, 2, 3))
+        if np.any(broken):
+            nowhere = np.full(self.outer.shape[-1], np.nan)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), nowhere)
         halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
         return max(halves, key=lambda w: w.ratio)
 
@@ -121,7 +128,9 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     parts = list(statistics)
     if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
-    joined = {name: np.concatenate([getattr(s, name) for s in parts], axis=1) for name in ("outer", "bound", "nees")}
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(s, name) for s in parts], axis=1) for name in ("outer", "bound", "nees")
+    }
     return ErrorStatistics(parts[0].count, **joined, claim=weakest([s.claim for s in parts]))
 
 
@@ -175,18 +184,26 @@ class Statistics(AbstractReducer):
         return jax.tree.map(jnp.add, carry, self._block_sums(batch, deal)), ()
 
     def _block_sums(self, batch: Any, deal: jax.Array) -> Any:
-        return jax.tree.map(
+        errors = jax.tree.map(
             lambda estimate: _sums(batch["truth"], estimate, deal),
             batch["estimates"],
             is_leaf=lambda leaf: isinstance(leaf, Estimate),
         )
+        valid = deal.sum(axis=1)
+        return errors, jax.tree.map(lambda leaf: jnp.tensordot(valid, leaf, axes=1), batch.get("links", {}))
 
     def finish(self, carry: Any, collected: Any, network: Network) -> dict[str, dict[str, ErrorStatistics]]:
         """Statistics by node and filter."""
-        return {
-            node: {name: ErrorStatistics(**carry[node][name], claim=claim) for name, claim in claims.items()}
+        sums, sent = carry
+        result = {
+            node: {name: ErrorStatistics(**sums[node][name], claim=claim) for name, claim in claims.items()}
             for node, claims in network.claims().items()
         }
+        for name, link in links_of(network, sent).items():
+            fused = result[FUSED][name]
+            means = Link(link.nodes, link.saturated / fused.runs, link.symbols / fused.runs)
+            result[FUSED][name] = replace(fused, link=means)
+        return result
 
 
 def _sums(truth: jax.Array, estimate: Estimate, deal: jax.Array) -> dict[str, jax.Array]:
@@ -218,4 +235,6 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     deal = (runs[:, None] % BATCHES == np.arange(BATCHES)).astype(float)
     with jax.enable_x64(True):
         sums = to_numpy(_sums(jnp.asarray(record.truth), estimate, jnp.asarray(deal)))
-    return ErrorStatistics(**sums, claim=estimate.claim)
+    sent = record.links.get(name) if node == FUSED else None
+    link = None if sent is None else Link(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
+    return ErrorStatistics(**sums, claim=estimate.claim, link=link)

@@ -1,5 +1,6 @@
 """Fusion of estimates whose errors are correlated in unknown ways: covariance intersection and its relatives."""
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -11,6 +12,8 @@ from heliograph.check import array, fail, probabilities
 from heliograph.filter.base import Claim, Estimate, weakest
 from heliograph.float64 import compiled
 from heliograph.linalg import psd_solve, symmetrize
+from heliograph.over_time import OverTime, first, stack
+from heliograph.quantizer import AbstractQuantizer, Quantizer
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
 ITERATIONS = 60  # of the interior point method; it needs about 12
@@ -73,7 +76,7 @@ class CovarianceIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """At most "upper"."""
-        return weakest([*claims, "upper"])
+        return _of_covariances(claims, "upper")
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Find the weights and intersect."""
@@ -89,7 +92,7 @@ class EqualIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """At most "upper"."""
-        return weakest([*claims, "upper"])
+        return _of_covariances(claims, "upper")
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Intersect with equal weights."""
@@ -116,11 +119,41 @@ class FixedIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """At most "upper"."""
-        return weakest([*claims, "upper"])
+        return _of_covariances(claims, "upper")
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Intersect with the given weights."""
         return intersect(means, _inverses(bounds), jnp.asarray(self.weights))
+
+
+class WeightedFusion(AbstractFusion):
+    """The weighted mean sum_i c_i x_i, with weights on the simplex given once and for all.
+
+    The error is sum_i c_i e_i, so E[e e'] <= sum_i c_i E[e_i e_i'] for any correlation (convexity): the bound is
+    sum_i c_i P_i. It needs no covariance, so it fuses estimates that claim none.
+
+    Raises:
+        ValueError: weights off the simplex.
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equation (15).
+    """
+
+    weights: np.ndarray
+
+    def __init__(self, weights: Any):
+        self.weights = probabilities("fusion weights", weights)
+
+    def check(self, count: int) -> None:
+        """As many weights as estimates."""
+        array("fusion weights", self.weights, (count,))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Sum with the given weights."""
+        weights = jnp.asarray(self.weights)
+        return weights @ means, jnp.tensordot(weights, bounds, axes=1)
 
 
 class InverseCovarianceIntersection(AbstractFusion):
@@ -134,7 +167,7 @@ class InverseCovarianceIntersection(AbstractFusion):
 
     def claim(self, claims: list[Claim]) -> Claim:
         """ "nominal": the assumed form of the correlation is not checked."""
-        return "nominal"
+        return _of_covariances(claims, "nominal")
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Fuse the first two, the result with the third, and so on."""
@@ -245,6 +278,13 @@ def _inverse_pair(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) -> tup
     return mean, symmetrize(bound)
 
 
+def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
+    """The weakest claim, for rules that weigh by covariances."""
+    if "none" in claims:
+        raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
+    return weakest([*claims, strongest])
+
+
 def _inverse(a: jax.Array) -> jax.Array:
     return psd_solve(a, jnp.eye(a.shape[-1]))
 
@@ -254,7 +294,45 @@ def _inverses(bounds: jax.Array) -> jax.Array:
 
 
 class Fusion(eqx.Module):
-    """Which filter's estimates a network fuses, at every node that has it, and by which rule."""
+    """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which links.
+
+    `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each
+    node by its name, all of one kind. The local bound is widened by the quantizer's error. Covariances are taken to
+    arrive as they are: most are computed before any data.
+    """
 
     filter: str = eqx.field(static=True)
     rule: AbstractFusion
+    quantizer: Quantizer | Mapping[str, Quantizer] | None = None
+
+    def check(self, nodes: Sequence[str], n: int) -> None:
+        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
+        self.rule.check(len(nodes))
+        if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
+            raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
+        for item in self._each(nodes):
+            if not isinstance(first(item), AbstractQuantizer):
+                raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
+            first(item).check(n)
+        self.links(nodes)
+
+    def links(self, nodes: Sequence[str]) -> Any:
+        """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
+
+        Raises:
+            ValueError: quantizers of different kinds.
+        """
+        return None if self.quantizer is None else stack(self._each(nodes))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """What the fused covariance claims, from what the filters claim."""
+        if self.quantizer is None:
+            return self.rule.claim(claims)
+        one = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
+        kind = one.values if isinstance(one, OverTime) else one
+        return self.rule.claim([kind.claim(claim) for claim in claims])
+
+    def _each(self, nodes: Sequence[str]) -> list[Quantizer]:
+        if self.quantizer is None:
+            return []
+        return [self.quantizer[n] if isinstance(self.quantizer, Mapping) else self.quantizer for n in nodes]

@@ -11,7 +11,8 @@ import numpy as np
 from heliograph.filter.base import AbstractFilter, Estimate
 from heliograph.fusion import Fusion
 from heliograph.network import FUSED, Network, Node
-from heliograph.over_time import alike, stack
+from heliograph.over_time import alike, at, stack
+from heliograph.quantizer import Quantized, widen
 
 
 class Group(NamedTuple):
@@ -46,14 +47,21 @@ class AllFilters:
         self.network, self.parts = network, parts
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
         self.rules = {name: item for name, item in network.fused.items() if isinstance(item, Fusion)}
+        links = {name: item.links(network.nodes_with(item.filter)) for name, item in self.rules.items()}
+        self.links = {name: link for name, link in links.items() if link is not None}
 
     def init(self) -> tuple[list[Any], dict[str, Any]]:
-        """States before the first step: for each group with a leading node axis, and of each central filter."""
+        """States before the first step: of groups and links with a leading node axis, and of each central filter."""
         groups = [eqx.filter_vmap(_init, in_axes=eqx.if_array(0))(part.stacked) for part in self.parts]
-        return groups, _initial(self.central)
+        n = len(self.network.states)
+        start = eqx.filter_vmap(lambda link: at(link, 0).init(n), in_axes=eqx.if_array(0))
+        return groups, _initial(self.central) | {name: start(link) for name, link in self.links.items()}
 
     def __call__(self, states: Any, z: dict[str, jax.Array], u: jax.Array, k: jax.Array) -> tuple[Any, Any]:
-        """One step of all filters from the measurements of each node; estimates by node and filter."""
+        """One step of all filters from the measurements of each node.
+
+        Gives "estimates" by node and filter and, where a fusion has quantizers, "links" by the fusion's name.
+        """
         step = eqx.filter_vmap(_step, in_axes=(eqx.if_array(0), eqx.if_array(0), eqx.if_array(0), None, None))
         after, estimates = [], {}
         for part, state in zip(self.parts, states[0], strict=True):
@@ -61,20 +69,32 @@ class AllFilters:
             after.append(following)
             for i, name in enumerate(part.names):
                 estimates[name] = jax.tree.map(lambda leaf, i=i: leaf[i], group)
-        central, fused = self._fuse(states[1], estimates, z, u, k)
+        central, fused, sent = self._fuse(states[1], estimates, z, u, k)
         if self.network.fused:
             estimates[FUSED] = fused
-        return (after, central), estimates
+        return (after, central), {"estimates": estimates} | ({"links": sent} if sent else {})
 
-    def _fuse(self, states: Any, estimates: Any, z: Any, u: jax.Array, k: jax.Array) -> tuple[Any, Any]:
-        joined = jnp.concatenate([z[name] for name in self.network.nodes])
+    def _fuse(self, states: Any, estimates: Any, z: Any, u: jax.Array, k: jax.Array) -> tuple[Any, Any, Any]:
+        joined = jnp.concatenate([z[name] for name in self.network.names])
         results = {name: item.step(states[name], joined, u, k) for name, item in self.central.items()}
-        fused = {name: result[1] for name, result in results.items()}
+        after, fused = ({name: result[part] for name, result in results.items()} for part in (0, 1))
+        links = {}
         for name, fusion in self.rules.items():
             local = [estimates[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)]
             means, bounds = jnp.stack([e.mean for e in local]), jnp.stack([e.bound for e in local])
-            fused[name] = Estimate(*fusion.rule.combine(means, bounds), fusion.rule.claim([e.claim for e in local]))
-        return {name: result[0] for name, result in results.items()}, fused
+            if name in self.links:
+                after[name], sent = _send(self.links[name], states[name], means, k)
+                means, bounds = jnp.asarray(sent.value), jax.vmap(widen)(bounds, jnp.asarray(sent.error))
+                links[name] = {"saturated": sent.saturated, "symbols": sent.symbols}
+            fused[name] = Estimate(*fusion.rule.combine(means, bounds), fusion.claim([e.claim for e in local]))
+        return after, fused, links
+
+
+def _send(links: Any, states: Any, means: jax.Array, k: jax.Array) -> tuple[Any, Quantized]:
+    """Each node's mean (node, n) through its own quantizer."""
+    step = eqx.filter_vmap(lambda link, state, mean: at(link, k).step(state, mean), in_axes=(eqx.if_array(0), 0, 0))
+    result: tuple[Any, Quantized] = step(links, states, means)
+    return result
 
 
 def _init(node: Node) -> dict[str, Any]:

@@ -56,11 +56,13 @@ class Network(eqx.Module):
     plant: AnyPlant
     nodes: dict[str, Node]
     fused: dict[str, Fusion | AbstractFilter]
+    names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
 
     def __init__(
         self, plant: AnyPlant, nodes: Mapping[str, Node], fused: Mapping[str, Fusion | AbstractFilter] | None = None
     ):
         self.plant, self.nodes, self.fused = plant, dict(nodes), dict(fused or {})
+        self.names = tuple(self.nodes)
         _check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
@@ -73,17 +75,18 @@ class Network(eqx.Module):
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
         for name, item in self.fused.items():
             if isinstance(item, Fusion):
-                item.rule.check(len(self.nodes_with(item.filter)))
+                item.check(self.nodes_with(item.filter), len(self.states))
+                self._fused_claim(item)
             else:
                 _check_type(f"fused {name!r}", item, AbstractFilter)
 
     def nodes_with(self, name: str) -> list[str]:
-        """Names of the nodes that have the filter `name`.
+        """Names of the nodes that have the filter `name`, in the given order.
 
         Raises:
             ValueError: none has it.
         """
-        found = [node for node, item in self.nodes.items() if name in item.filters]
+        found = [node for node in self.names if name in self.nodes[node].filters]
         if not found:
             known = sorted({f for node in self.nodes.values() for f in node.filters})
             raise fail("fusion", f"a filter that some node has {known}", repr(name))
@@ -111,7 +114,7 @@ class Network(eqx.Module):
     def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
         if isinstance(item, AbstractFilter):
             return item.claim
-        return item.rule.claim([self.nodes[n].filters[item.filter].claim for n in self.nodes_with(item.filter)])
+        return item.claim([self.nodes[n].filters[item.filter].claim for n in self.nodes_with(item.filter)])
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

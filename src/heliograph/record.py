@@ -1,6 +1,6 @@
 """What a run leaves behind: trajectories with their claims, or running statistics of the errors."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -9,7 +9,29 @@ import numpy as np
 
 from heliograph.check import fail
 from heliograph.filter.base import Estimate
-from heliograph.network import Network
+from heliograph.fusion import Fusion
+from heliograph.network import FUSED, Network
+
+
+@dataclass(frozen=True)
+class Link:
+    """What a fusion's quantizers did to the estimates of `nodes`, by component.
+
+    saturated, whether a component was out of reach, and symbols, how many were sent for it: (run, time, node, n) in a
+    record; in statistics their means over the runs, (time, node, n).
+    """
+
+    nodes: tuple[str, ...]
+    saturated: np.ndarray
+    symbols: np.ndarray
+
+    def saturated_share(self) -> dict[str, float]:
+        """Share of the samples (runs, steps and components) that were out of reach, by node."""
+        return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
+
+    def symbols_per_value(self) -> float:
+        """Mean number of symbols that one component of one estimate took."""
+        return float(self.symbols.mean())
 
 
 @dataclass(frozen=True)
@@ -17,7 +39,7 @@ class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
-    (run, time, n), bound (run, time, n, n) and the claim.
+    (run, time, n), bound (run, time, n, n) and the claim; links[name] of each fusion that has quantizers.
     """
 
     time: np.ndarray
@@ -25,6 +47,7 @@ class Record:
     truth: np.ndarray | None
     measurements: dict[str, np.ndarray]
     estimates: dict[str, dict[str, Estimate]]
+    links: dict[str, Link] = field(default_factory=dict)
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
@@ -40,25 +63,35 @@ class Record:
     def failures(self) -> list[str]:
         """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
 
-        The line names the node, the filter, the first step, and in how many runs; nothing is repaired.
+        The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
+        for each link that saturated.
         """
         lines = []
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
-                bad = ~is_sound(np.asarray(estimate.mean), np.asarray(estimate.bound))
+                bad = ~is_sound(estimate)
                 if np.any(bad):
                     by_time = bad.reshape(-1, bad.shape[-1])
                     step = int(np.argmax(by_time.any(axis=0)))
                     runs = int(by_time.any(axis=1).sum())
-                    lines.append(
-                        f"{node}/{name}: no valid covariance from step {step} in {runs} of {len(by_time)} runs"
-                    )
+                    what = "mean" if estimate.claim == "none" else "covariance"
+                    lines.append(f"{node}/{name}: no valid {what} from step {step} in {runs} of {len(by_time)} runs")
+        for name, link in self.links.items():
+            for i, node in enumerate(link.nodes):
+                saturated = link.saturated[..., i, :]
+                if np.any(saturated):
+                    counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
+                    lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
         return lines
 
 
-def is_sound(mean: np.ndarray, bound: np.ndarray) -> np.ndarray:
-    """Whether each estimate is finite with a positive semidefinite bound (to rounding)."""
-    finite = np.isfinite(mean).all(axis=-1) & np.isfinite(bound).all(axis=(-1, -2))
+def is_sound(estimate: Estimate) -> np.ndarray:
+    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+    if estimate.claim == "none":
+        return finite
+    bound = np.asarray(estimate.bound)
+    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
     values = np.linalg.eigvalsh((safe + np.swapaxes(safe, -1, -2)) / 2)
     result: np.ndarray = finite & (values[..., 0] >= -1e-12 * np.abs(values[..., -1]))  # rounding of an eigenvalue
@@ -103,4 +136,15 @@ def trajectories_record(network: Network, batch: Any, time: np.ndarray) -> Recor
     measurements = {name: np.asarray(batch["measurements"][name]) for name in network.nodes}
     found = batch["estimates"]
     estimates = {node: {name: found[node][name] for name in claims} for node, claims in network.claims().items()}
-    return Record(time, network.states, batch["truth"], measurements, estimates)
+    return Record(
+        time, network.states, batch["truth"], measurements, estimates, links_of(network, batch.get("links", {}))
+    )
+
+
+def links_of(network: Network, found: dict[str, dict[str, np.ndarray]]) -> dict[str, Link]:
+    """Links by the fusion's name, from arrays whose last axes are (node, n)."""
+    result = {}
+    for name, fusion in network.fused.items() if found else ():
+        if isinstance(fusion, Fusion) and name in found:
+            result[name] = Link(tuple(network.nodes_with(fusion.filter)), **found[name])
+    return result

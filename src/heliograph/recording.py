@@ -89,8 +89,8 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
 
     `time`; then for each filter the mean `STATE`, the standard deviation `STATE.sd`, the covariances `cov.A.B` (A
     before B in the state), and `valid`: false where mean or covariance are not finite, or the covariance is no
-    longer positive semidefinite. Each name starts with `NODE.` where there are several nodes, and with `FILTER.`
-    where a node has several filters.
+    longer positive semidefinite. A filter that claims no covariance has no columns for one. Each name starts with
+    `NODE.` where there are several nodes, and with `FILTER.` where a node has several filters.
 
     Raises:
         ValueError: Monte Carlo runs, or names that coincide.
@@ -123,12 +123,14 @@ def _claims(states: Sequence[str], estimate: Estimate) -> list[tuple[str, np.nda
         raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
     result = []
     for i, state in enumerate(states):
-        variance = bound[:, i, i]
-        sd = np.sqrt(np.where(variance >= 0, variance, np.nan))
-        result += [(state, mean[:, i]), (f"{state}.sd", sd)]
-    for i, a in enumerate(states):
-        result += [(f"cov.{a}.{states[j]}", bound[:, i, j]) for j in range(i + 1, len(states))]
-    return [*result, ("valid", is_sound(mean, bound))]
+        result.append((state, mean[:, i]))
+        if estimate.claim != "none":
+            variance = bound[:, i, i]
+            result.append((f"{state}.sd", np.sqrt(np.where(variance >= 0, variance, np.nan))))
+    if estimate.claim != "none":
+        for i, a in enumerate(states):
+            result += [(f"cov.{a}.{states[j]}", bound[:, i, j]) for j in range(i + 1, len(states))]
+    return [*result, ("valid", is_sound(estimate))]
 
 
 def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:

@@ -34,21 +34,26 @@ def monte_carlo(
     inputs: Any = None,
     chunk: int = 512,
     progress: Progress | None = None,
+    first_run: int = 0,
 ) -> Any:
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
     `key` is a seed or a JAX key; a run's draws depend on the key, the run, the step and the node's name alone, so
     neither the chunk size nor another node changes a bit of them. `keep` says what is kept: `Trajectories()` (all,
     the default) or `Statistics()` (bounded memory). `inputs` (horizon, inputs) are common to all runs.
-    `progress(done, total)` is called after each chunk of runs.
+    `progress(done, total)` is called after each chunk of runs. The runs are first_run, first_run + 1, ...: a part of a
+    larger simulation, bit for bit; it starts at a multiple of 64, since so many are simulated side by side.
 
     Returns a `Record` for trajectories, else what the reducer makes.
 
     Raises:
-        ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one.
+        ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
+            that is no multiple of 64.
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
+    if first_run < 0 or first_run % BLOCK:
+        raise fail("first_run", f"a multiple of {BLOCK}", first_run)
     network.check_horizon(horizon)
     reducer = Trajectories() if keep is None else keep
     u = _check_inputs(network, inputs, horizon)
@@ -57,9 +62,9 @@ def monte_carlo(
     with jax.enable_x64(True):
         carry, parts = _initial(network, u, base, reducer), []
         for start in range(0, runs, chunk):
-            blocks = np.arange(start, start + chunk).reshape(-1, BLOCK)
+            blocks = first_run + np.arange(start, start + chunk).reshape(-1, BLOCK)
             done = min(start + chunk, runs)
-            carry, kept = _chunk(network, u, base, blocks, np.asarray(runs), reducer, carry)
+            carry, kept = _chunk(network, u, base, blocks, np.asarray(first_run + runs), reducer, carry)
             parts.append(jax.tree.map(lambda leaf: _flat(leaf)[: done - start], to_numpy(kept)))  # noqa: B023
             if progress is not None:
                 progress(done, runs)
@@ -92,8 +97,8 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
         raise fail(
             "time", "times that do not go backwards", f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
         )
-    estimates = _run_filters(network, z, u)
-    return trajectories_record(network, {"truth": None, "measurements": z, "estimates": estimates}, clock)
+    found = _run_filters(network, z, u)
+    return trajectories_record(network, {"truth": None, "measurements": z, **found}, clock)
 
 
 @compiled
@@ -136,7 +141,7 @@ def _chunk(
 
 
 def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array) -> Any:
-    """One world and all filters on it: dictionaries of truth (time, n), measurements and estimates by node."""
+    """One world and all filters on it: truth (time, n), measurements and estimates by node, links."""
     step = AllFilters(network, parts)
     x0 = at(network.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
 
@@ -147,8 +152,8 @@ def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array)
         z: dict[str, jax.Array] = {}
         for part in parts:
             z |= dict(zip(part.names, _observe(part, x, key, k), strict=True))
-        states, estimates = step(states, z, u_k, k)
-        return (x, states), {"truth": x, "measurements": z, "estimates": estimates}
+        states, found = step(states, z, u_k, k)
+        return (x, states), {"truth": x, "measurements": z, **found}
 
     return jax.lax.scan(body, (x0, step.init()), (jnp.arange(u.shape[0]), u))[1]
 

@@ -1,4 +1,4 @@
-"""Contract checks for your own channels and filters: call them in your tests; they raise AssertionError."""
+"""Contract checks for your own channels, filters, quantizers and fusion rules; they raise AssertionError."""
 
 from typing import Any
 
@@ -7,10 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from heliograph.filter.base import STRENGTH, AbstractFilter
+from heliograph.filter.base import STRENGTH, AbstractFilter, Claim, Estimate
+from heliograph.fusion import AbstractFusion, fuse
+from heliograph.quantizer import AbstractQuantizer
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.monomials import monomials
 
+ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
+SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for to the root of rounding, 1e-8
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
 
 
@@ -59,7 +63,8 @@ def check_filter(item: AbstractFilter, received: int, inputs: Any = (), steps: i
     """Check the (init, step) contract on random measurements of length `received`.
 
     A step is deterministic; leaves the structure of the state alone; gives a finite mean and a symmetric positive
-    semidefinite bound, also when some or all components are missing; and does the same inside vmap.
+    semidefinite bound (NaN if it claims none), also when some or all components are missing; and does the same inside
+    vmap.
 
     Raises:
         AssertionError: naming what does not hold.
@@ -77,14 +82,19 @@ def check_filter(item: AbstractFilter, received: int, inputs: Any = (), steps: i
         again = item.step(state, z, inputs, k)[1]
         assert np.array_equal(estimate.mean, again.mean), "step: expected the same estimate from the same arguments"
         assert str(jax.tree.structure(following)) == structure, "step: expected a state of init's structure"
-        _check_estimate(np.asarray(estimate.mean), np.asarray(estimate.bound), k)
+        _check_estimate(estimate, k)
         _check_vmapped(item, state, z, inputs, k, np.asarray(estimate.mean))
         state = following
 
 
-def _check_estimate(mean: np.ndarray, bound: np.ndarray, k: int) -> None:
+def _check_estimate(estimate: Estimate, k: int) -> None:
+    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.bound)
     n = mean.shape[-1]
     assert bound.shape == (n, n), f"step {k}: expected a bound of shape {(n, n)}, got {bound.shape}"
+    if estimate.claim == "none":
+        assert np.all(np.isfinite(mean)), f"step {k}: expected a finite mean"
+        assert np.all(np.isnan(bound)), f"step {k}: expected a bound of NaN, since none is claimed"
+        return
     assert np.all(np.isfinite(mean)) and np.all(np.isfinite(bound)), f"step {k}: expected a finite estimate"
     size = np.abs(bound).max()
     assert np.abs(bound - bound.T).max() <= 1e-9 * size, f"step {k}: expected a symmetric bound"
@@ -100,3 +110,89 @@ def _check_vmapped(item: AbstractFilter, state: Any, z: np.ndarray, inputs: Any,
         means = jax.vmap(lambda s, m: item.step(s, m, inputs, k)[1].mean)(batch, jnp.stack([z, z]))
     gap = np.abs(np.asarray(means) - mean).max()
     assert gap <= 1e-9 * (1 + np.abs(mean).max()), f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
+
+
+def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, seed: int = 0) -> None:
+    """Check the (init, step) contract on random values of n components, some far out of reach, some NaN.
+
+    The stated error bound holds, and is NaN where a component is saturated or NaN; what was delivered unsaturated is
+    delivered again from the same state; a step is deterministic, leaves the structure of the state alone, and does the
+    same under jit and vmap.
+
+    Raises:
+        AssertionError: naming what does not hold.
+    """
+    generator = np.random.default_rng(seed)
+    state = quantizer.init(n)
+    structure, compiled = str(jax.tree.structure(state)), jax.jit(jax.vmap(quantizer.step))
+    for k in range(steps):
+        value = generator.normal(size=n) * 10.0 ** generator.integers(-3, 4, size=n)
+        value[generator.random(n) < 0.1] = np.nan
+        following, sent = quantizer.step(state, value)
+        assert str(jax.tree.structure(following)) == structure, "step: expected a state of init's structure"
+        _check_quantized(sent, value, n)
+        again = np.asarray(quantizer.step(state, sent.value)[1].value)
+        usable = np.isfinite(sent.error)
+        off = np.abs(again - sent.value)[usable] > ROUNDING * np.abs(value)[usable]
+        assert not np.any(off), f"step {k}: expected what was delivered to be delivered again"
+        with jax.enable_x64(True):
+            batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
+            _, twice = compiled(*batch)
+        for name, one in sent._asdict().items():
+            both = np.asarray(getattr(twice, name))
+            same = np.allclose(both, one, rtol=ROUNDING, atol=0, equal_nan=True)
+            assert same, f"step {k}, {name}: expected the same under jit and vmap"
+        state = following
+
+
+def _check_quantized(sent: Any, value: np.ndarray, n: int) -> None:
+    assert all(np.shape(part) == (n,) for part in sent), f"step: expected parts of shape ({n},)"
+    unusable = np.asarray(sent.saturated) | np.isnan(value)
+    assert np.array_equal(np.isnan(sent.error), unusable), "error: expected NaN where saturated or NaN, and only there"
+    assert np.array_equal(np.isnan(sent.value), np.isnan(value)), "value: expected NaN for NaN, and only there"
+    assert np.all(np.asarray(sent.symbols) >= 1), "symbols: expected at least one"
+    excess = (np.abs(sent.value - value) - sent.error * (1 + ROUNDING))[~unusable]
+    assert np.all(excess <= 0), f"error: expected a bound, exceeded by {excess.max(initial=0.0):g}"
+
+
+def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0) -> None:
+    """Check a rule on random estimates, `count` of them with n components.
+
+    Identical estimates give themselves back; a claim is no stronger than the weakest input's; fusing inside vmap is
+    fusing alone; and where "upper" is claimed, the bound dominates the fused error's covariance for random joint
+    covariances of the inputs' errors.
+
+    Raises:
+        AssertionError: naming what does not hold.
+    """
+    generator = np.random.default_rng(seed)
+    claims: list[Claim] = ["exact", "upper", "nominal"]
+    for claim in claims:
+        fused = rule.claim([claim, *claims[:1] * (count - 1)])
+        assert STRENGTH[fused] <= STRENGTH[claim], f"claim: expected at most {claim!r}, got {fused!r}"
+    for _ in range(10):
+        root = generator.normal(size=(count * n, count * n))
+        joint = (root @ root.T).reshape(count, n, count, n)
+        bounds = np.stack([joint[i, :, i] for i in range(count)])
+        alike = _fused(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
+        _close("identical estimates", alike.mean, np.ones(n))
+        _close("identical bounds", alike.bound, bounds[0])
+        # The mean is linear in the means, so unit means give the gain of each input.
+        units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
+        together = _fused(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
+        _close("fusing inside vmap", together.mean[0], _fused(rule, units[:, 0], bounds).mean)
+        gains = np.asarray(together.mean).T
+        if rule.claim(["upper"] * count) == "upper":
+            excess = gains @ joint.reshape(count * n, count * n) @ gains.T - together.bound[0]
+            worst = np.linalg.eigvalsh(excess)[-1]
+            limit = ROUNDING * np.trace(together.bound[0])
+            assert worst <= limit, f"bound: expected an upper one, exceeded by {worst:g}"
+
+
+def _fused(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estimate:
+    return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
+
+
+def _close(what: str, found: Any, expected: Any) -> None:
+    gap = np.abs(np.asarray(found) - expected).max()
+    assert gap <= SEARCHED * np.abs(expected).max(), f"{what}: expected the same back, off by {gap:g}"

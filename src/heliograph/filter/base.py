@@ -6,15 +6,15 @@ import equinox as eqx
 import jax
 import numpy as np
 
-Claim = Literal["exact", "upper", "nominal"]
-STRENGTH: dict[Claim, int] = {"nominal": 0, "upper": 1, "exact": 2}
+Claim = Literal["exact", "upper", "nominal", "none"]
+STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
 
 
 class Estimate(eqx.Module):
     """An estimate and the covariance claimed for its error.
 
     claim: "exact" if `bound` is E[(x - mean)(x - mean)'], "upper" if it dominates it, "nominal" if it is only what the
-    filter's approximations say.
+    filter's approximations say, "none" if no covariance is claimed: then `bound` is NaN.
 
     Shapes: mean (..., n), bound (..., n, n).
     """

@@ -52,6 +52,11 @@ class AbstractRandomAffine(eqx.Module):
         """Length of y."""
         raise NotImplementedError
 
+    @property
+    def erases(self) -> bool:
+        """Whether outputs can be NaN: lost, and the receiver knows."""
+        return False
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw H of shape (outputs + 1, inputs + 1)."""
         raise NotImplementedError

@@ -50,10 +50,16 @@ class Series(AbstractRandomAffine):
         """Inputs of the first map."""
         return self.maps[0].inputs
 
+    @property
+    def erases(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.erases for m in self.maps)
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each map and multiply."""
         keys = jax.random.split(key, len(self.maps))
-        return reduce(lambda h, pair: pair[0].sample(pair[1]) @ h, zip(self.maps[1:], keys[1:], strict=True),
+        then = _after if self.erases else jnp.matmul
+        return reduce(lambda h, pair: then(pair[0].sample(pair[1]), h), zip(self.maps[1:], keys[1:], strict=True),
                       self.maps[0].sample(keys[0]))  # fmt: skip
 
     def moments(self, order: int) -> Moments:
@@ -73,6 +79,13 @@ class Series(AbstractRandomAffine):
     def mean_gain(self) -> AbstractRandomAffine:
         """Each part with its mean gain."""
         return Series([m.mean_gain() for m in self.maps])
+
+
+def _after(second: jax.Array, first: jax.Array) -> jax.Array:
+    """The product of two drawn maps, where NaN rows of the first are lost: what has no gain on them is not."""
+    lost = jnp.isnan(first).any(axis=1)
+    reached = jnp.any((second != 0) & lost, axis=1) | jnp.isnan(second).any(axis=1)
+    return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
 
 
 class Mixture(AbstractRandomAffine):
@@ -96,6 +109,11 @@ class Mixture(AbstractRandomAffine):
     def inputs(self) -> int:
         """Inputs of each map."""
         return self.maps[0].inputs
+
+    @property
+    def erases(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.erases for m in self.maps)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw which map, and the map."""
@@ -155,6 +173,11 @@ class Stack(AbstractRandomAffine):
         """Inputs of each map."""
         return self.maps[0].inputs
 
+    @property
+    def erases(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.erases for m in self.maps)
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each map and stack the rows."""
         keys = jax.random.split(key, len(self.maps))
@@ -209,6 +232,8 @@ class Lift(AbstractRandomAffine):
     def __init__(self, base: AbstractRandomAffine, degree: int):
         if degree < 1:
             raise fail("lift", "a degree of at least 1", degree)
+        if base.erases:
+            raise fail("lift", "a channel without erasures", "one that erases")
         self.base, self.degree = base, degree
 
     @property

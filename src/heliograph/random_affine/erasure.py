@@ -1,0 +1,61 @@
+"""A loss that the receiver knows of."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.check import fail, scalar
+from heliograph.random_affine.base import AbstractRandomAffine, Moments
+
+
+class Erasure(AbstractRandomAffine):
+    """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
+
+    base: AbstractRandomAffine
+    arrival: Any
+
+    def __init__(self, base: AbstractRandomAffine, arrival: Any):
+        self.base, self.arrival = base, scalar("arrival probability", arrival, 0.0, 1.0)
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map."""
+        return self.base.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the map."""
+        return self.base.inputs
+
+    @property
+    def erases(self) -> bool:
+        """It does."""
+        return True
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw whether it arrives, and the map."""
+        arrives, drawn = jax.random.split(key)
+        h = self.base.sample(drawn)
+        lost = ~jax.random.bernoulli(arrives, self.arrival)
+        return h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
+
+    def moments(self, order: int) -> Moments:
+        """There are none: a filter skips what was lost, and asks for the moments of what arrives.
+
+        Raises:
+            ValueError: always.
+        """
+        raise fail("moments of a channel", "one without erasures (give the filter what is inside)", "an erasure")
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Erasures of the map's extremes."""
+        return tuple(Erasure(m, self.arrival) for m in self.base.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the map."""
+        return self.base.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """The map with its mean gain, lost as often."""
+        return Erasure(self.base.mean_gain(), self.arrival)
