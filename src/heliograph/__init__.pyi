@@ -90,6 +90,30 @@ from .design.bounded import (
     Boundedness as Boundedness,
     boundedness as boundedness,
 )
+from .design.growth_system import (
+    Growth as Growth,
+    GrowthSystem as GrowthSystem,
+    growth_system as growth_system,
+)
+from .design.growth_check import (
+    GrowthFinding as GrowthFinding,
+    check_growth as check_growth,
+    check_size as check_size,
+)
+from .design.h_infinity import (
+    HInfinityDesign as HInfinityDesign,
+    horizon_design as horizon_design,
+    recursive_design as recursive_design,
+    smallest_recursive_level as smallest_recursive_level,
+)
+from .design.h_infinity_closed_form import (
+    known_channel_design as known_channel_design,
+    level_without_measurements as level_without_measurements,
+)
+from .design.h_infinity_certificate import (
+    HInfinityCertificate as HInfinityCertificate,
+    certify_level as certify_level,
+)
 from .filter.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
@@ -119,6 +143,10 @@ from .filter.polynomial import (
 )
 from .filter.mixture import (
     mixture_filter as mixture_filter,
+)
+from .filter.h_infinity import (
+    HInfinityFilter as HInfinityFilter,
+    h_infinity_filter as h_infinity_filter,
 )
 from .filter.sequential import (
     sequential_filter as sequential_filter,

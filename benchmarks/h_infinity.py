@@ -1,0 +1,65 @@
+"""Time of H-infinity design on the published example: a re-solved recursive inequality, and the whole horizon.
+
+Run: python benchmarks/h_infinity.py. Prints milliseconds; the targets are 8 (median) and 300.
+"""
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+import heliograph as hg
+
+REPEATS = 5
+
+
+def system() -> hg.GrowthSystem:
+    """Node 1 of the publication."""
+    hops = [
+        hg.hop(hg.bernoulli(p), c**2, power) for p, c, power in ((0.8, 0.1, 1.0), (0.75, 0.1, 1.0), (0.7, 0.15, 2.0))
+    ]
+    channel = hg.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
+    b = 0.15 * np.sqrt(2)
+    return hg.growth_system(16, [[-0.15], [0.15]], [[0.3]], [[0.05, 0.05]], channel, 0.7, b, initial_weight=15.0)
+
+
+def milliseconds(call: Callable[[], object]) -> float:
+    """One call."""
+    start = time.perf_counter()
+    call()
+    return 1e3 * (time.perf_counter() - start)
+
+
+def recursion() -> tuple[float, float]:
+    """First and median solve of the steps of a recursive design."""
+    from heliograph.design.h_infinity_solver import StepProblem
+
+    found: list[float] = []
+    solve = StepProblem.solve
+
+    def timed(self: StepProblem, fixed: np.ndarray) -> object:
+        start = time.perf_counter()
+        result = solve(self, fixed)
+        found.append(1e3 * (time.perf_counter() - start))
+        return result
+
+    StepProblem.solve = timed  # type: ignore[assignment]
+    try:
+        for _ in range(REPEATS):
+            hg.recursive_design(system(), 1.8, 10 * np.eye(4))
+    finally:
+        StepProblem.solve = solve  # type: ignore[method-assign]
+    return found[0], float(np.median([t for i, t in enumerate(found) if i % 16]))
+
+
+def main() -> None:
+    first, median = recursion()
+    horizon = [milliseconds(lambda: hg.horizon_design(system())) for _ in range(REPEATS)]
+    separate = [milliseconds(lambda: hg.horizon_design(system(), separate=True)) for _ in range(REPEATS)]
+    print(f"recursive inequality: first {first:.1f} ms, re-solved {median:.2f} ms median")
+    print(f"whole horizon: {np.median(horizon):.0f} ms median (worst {max(horizon):.0f})")
+    print(f"whole horizon, separate multipliers: {np.median(separate):.0f} ms median (worst {max(separate):.0f})")
+
+
+if __name__ == "__main__":
+    main()
