@@ -27,11 +27,14 @@ def to_numpy(tree: Any) -> Any:
 def in_float64(function: Callable[P, R]) -> Callable[P, R]:
     """Run a function in the float64 scope and hand NumPy arrays back.
 
-    Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan.
+    Inside a trace it changes nothing, so that the same object can be called by a user and by a compiled scan (which may
+    have chosen single precision).
     """
 
     @wraps(function)
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _traced((args, kwargs)):
+            return function(*args, **kwargs)
         with jax.enable_x64(True):
             result: R = to_numpy(function(*args, **kwargs))
         return result
@@ -42,17 +45,24 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function once per structure and shapes of its arguments, run it in float64, hand NumPy arrays back.
 
-    Numbers in the arguments become arrays first, so that a step counter does not compile anew at each step.
+    Numbers in the arguments become arrays first, so that a step counter does not compile anew at each step. Inside a
+    trace it is the plain function.
     """
     jitted = eqx.filter_jit(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _traced((args, kwargs)):
+            return function(*args, **kwargs)
         with jax.enable_x64(True):
             result: R = to_numpy(jitted(*jax.tree.map(_as_array, args), **jax.tree.map(_as_array, kwargs)))
         return result
 
     return call
+
+
+def _traced(tree: Any) -> bool:
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
 def _as_array(leaf: Any) -> Any:

@@ -103,10 +103,14 @@ def steps_covered(tree: Any) -> int | None:
 
 def unstack(stacked: OverTime) -> list[Any]:
     """The objects of each step, as they were given to `over_time`."""
+    return [_item(stacked, i) for i in range(stacked.steps)]
+
+
+def _item(stacked: OverTime, i: int) -> Any:
     arrays, rest = eqx.partition(stacked.values, eqx.is_array)
-    return [eqx.combine(jax.tree.map(lambda v, i=i: np.asarray(v)[i], arrays), rest) for i in range(stacked.steps)]
+    return eqx.combine(jax.tree.map(lambda v: v[i], arrays), rest)
 
 
 def first(item: Any) -> Any:
     """A plant, sensor or channel at its first step."""
-    return unstack(item)[0] if isinstance(item, OverTime) else item
+    return _item(item, 0) if isinstance(item, OverTime) else item
