@@ -11,7 +11,7 @@ import heliograph
 SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
-    ["float64", "check", "progress"],
+    ["float64", "check", "progress", "compilation_cache"],
     ["linalg", "over_time"],
     ["random_affine"],
     ["plant", "sensor", "channel"],

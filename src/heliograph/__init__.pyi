@@ -229,5 +229,21 @@ from .consistency import (
     error_statistics as error_statistics,
     pool as pool,
 )
+from .campaign.read import (
+    load_campaign as load_campaign,
+)
+from .campaign.plan import (
+    Campaign as Campaign,
+)
+from .campaign.run import (
+    CampaignRun as CampaignRun,
+    run_campaign as run_campaign,
+)
+from .campaign.summary import (
+    open_results as open_results,
+)
+from .compilation_cache import (
+    keep_compilations as keep_compilations,
+)
 
 __version__: str

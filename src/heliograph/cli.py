@@ -3,7 +3,7 @@
 import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -12,6 +12,7 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 import heliograph
+from heliograph.compilation_cache import keep_compilations
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143  # the last two are 128 + the signal's number
 
@@ -125,13 +126,38 @@ def reproduce(
         import_module(METHODS[name]).reproduce(out, runs, seed)
 
 
+@app.command
+def sweep(
+    campaign: Path,
+    /,
+    *,
+    out: Annotated[Path, Parameter(help="Folder for the results; what is already there is not computed again.")],
+    workers: Annotated[int | None, Parameter(help="Processes on this machine; one for each CPU by default.")] = None,
+    scheduler: Annotated[str | None, Parameter(help="Address of a Dask scheduler to work on instead.")] = None,
+    setting: Annotated[int | None, Parameter(help="Run only this setting, here in one process.")] = None,
+    chunk: Annotated[int | None, Parameter(help="And of it only this chunk.")] = None,
+) -> int:
+    """Simulate a network in many settings, into one labelled store that survives any interruption.
+
+    Parameters
+    ----------
+    campaign:
+        A TOML file that names the network's function, the settings, and how many runs of each.
+    """
+    from heliograph.campaign.command import sweep
+
+    return sweep(campaign, out, workers, scheduler, setting, chunk)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
     before = signal.signal(signal.SIGTERM, _terminate)
+    with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
+        keep_compilations()
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
-        command(*bound.args, **bound.kwargs)
-        return 0
+        code: int | None = command(*bound.args, **bound.kwargs)
+        return code or 0
     except (CycloptsError, ValueError) as error:
         return _refuse(str(error))
     except OSError as error:

@@ -7,10 +7,11 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import wraps
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from heliograph.check import fail
 from heliograph.network import Network
@@ -42,6 +43,33 @@ def load_network(reference: str) -> Network:
         source = _guarded(lambda: _source(place), place, None)
         module = _guarded(lambda: importlib.import_module(place), place, source)
         return _pick(module, name, place, source)
+
+
+def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
+    """The function `name` of a Python file with this source, which need not be the file's; it returns a network.
+
+    The module finds others in the file's folder, when it is loaded and when the function is called.
+
+    Raises:
+        ValueError: as `load_network`; calling the function raises the same.
+    """
+    place = f"{path.name}:{name}"
+    with _importing_from(path.parent):
+        module = _guarded(lambda: _run_source(path, source), path.name, path)
+    function = getattr(module, name, None)
+    if not callable(function):
+        came = "an unknown name" if function is None else type(function).__name__
+        raise fail(f"network {place}", "a function that returns a heliograph.Network", came)
+
+    @wraps(function)
+    def build(*args: Any, **kwargs: Any) -> Network:
+        with _importing_from(path.parent):
+            network = _guarded(lambda: function(*args, **kwargs), place, path)
+        if not isinstance(network, Network):
+            raise fail(f"network {place}", "a heliograph.Network", type(network).__name__)
+        return network
+
+    return build
 
 
 def _pick(module: ModuleType, name: str, place: str, path: Path | None) -> Network:
@@ -83,7 +111,11 @@ def _source(module: str) -> Path | None:
 
 
 def _run_file(path: Path) -> ModuleType:
-    """Run a file as a module of its own; unlike an import, nothing is written beside it."""
+    return _run_source(path, path.read_bytes())
+
+
+def _run_source(path: Path, source: str | bytes) -> ModuleType:
+    """Run a file's source as a module of its own; unlike an import, nothing is written beside it."""
     name = f"heliograph_network_{path.stem}"
     spec = spec_from_file_location(name, path)
     if spec is None:
@@ -91,7 +123,7 @@ def _run_file(path: Path) -> ModuleType:
     module = module_from_spec(spec)
     sys.modules[name] = module  # dataclasses look their module up while it runs
     try:
-        exec(compile(path.read_bytes(), str(path), "exec"), vars(module))
+        exec(compile(source, str(path), "exec"), vars(module))
     except BaseException:
         del sys.modules[name]
         raise

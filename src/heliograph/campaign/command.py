@@ -1,0 +1,73 @@
+"""The command `sweep`: run a campaign, show how it goes, print its table and write its report."""
+
+import os
+import sys
+from pathlib import Path
+
+import rich.console
+
+from heliograph.campaign.failures import FAILURES
+from heliograph.campaign.plan import Campaign
+from heliograph.campaign.read import load_campaign
+from heliograph.campaign.run import CampaignRun, run_campaign
+from heliograph.campaign.show import print_scores, showing
+from heliograph.campaign.summary import SUMMARY, read_summary
+from heliograph.check import fail
+
+FAILED = 1  # exit code: some work failed, the rest is there
+
+
+def sweep(
+    path: Path,
+    out: Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    setting: int | None = None,
+    chunk: int | None = None,
+) -> int:
+    """Run what is missing of a campaign, or only a setting or chunk of it in this process; returns the exit code.
+
+    Raises:
+        ValueError: as `load_campaign` and `run_campaign`; a chunk without its setting.
+        ModuleNotFoundError: an extra of `sweep`, `report`, `cluster` is not installed.
+    """
+    from heliograph.campaign.page import write_report  # a missing extra is told before the work starts
+
+    campaign = load_campaign(path)
+    only = _only(campaign, setting, chunk)
+    if only is not None and workers is None:
+        workers = 0  # so that a debugger can follow
+    with showing(workers or os.cpu_count() or 1) as tell:
+        result = run_campaign(campaign, out, workers, scheduler, only, tell)
+    scores = read_summary(out / SUMMARY)
+    report = write_report(campaign, scores, out)
+    print_scores(campaign, scores)
+    console = rich.console.Console()
+    console.print(_done(result), soft_wrap=True, highlight=False, markup=False)
+    console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
+    for failure in result.failures:
+        if only is not None:
+            print(failure.traceback, end="", file=sys.stderr)
+        print(f"heliograph: failed: {failure}", file=sys.stderr)
+    if result.failures:
+        print(f"heliograph: {out / FAILURES} says how to run each of them again alone", file=sys.stderr)
+    return FAILED if result.failures else 0
+
+
+def _only(campaign: Campaign, setting: int | None, chunk: int | None) -> list[tuple[int, int]] | None:
+    if setting is None:
+        if chunk is not None:
+            raise fail("--chunk", "a --setting whose chunk it is", "none")
+        return None
+    if not 0 <= setting < len(campaign.settings):
+        raise fail("--setting", f"a number from 0 to {len(campaign.settings) - 1}", setting)
+    chunks = [item.number for item in campaign.chunks(setting)]
+    if chunk is not None and chunk not in chunks:
+        raise fail("--chunk", f"a number from 0 to {chunks[-1]}", chunk)
+    return [(setting, number) for number in (chunks if chunk is None else [chunk])]
+
+
+def _done(result: CampaignRun) -> str:
+    if not result.computed and not result.failures:
+        return f"{result.folder}: nothing to compute, all {result.already} chunks are already there"
+    return f"{result.folder}: {result.computed} chunks computed, {result.already} were already there"

@@ -1,0 +1,70 @@
+"""What failed in a campaign, with all that is needed to run it again alone."""
+
+import json
+import os
+import shlex
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from heliograph.campaign.plan import Campaign
+from heliograph.campaign.work import Job, Reply
+
+FAILURES = "failures.json"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A chunk, or where `chunk` is None all of a setting, that failed every time.
+
+    runs: the first and the last. key: the campaign's seed and the numbers that are folded into its key for the setting.
+    """
+
+    setting: int
+    parameters: dict[str, Any]
+    chunk: int | None
+    runs: tuple[int, int]
+    key: tuple[int, int, int]
+    error: str
+    traceback: str
+
+    def __str__(self) -> str:
+        """One line that says what failed and why."""
+        values = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
+        return f"setting {self.setting} ({values}), runs {self.runs[0]} to {self.runs[1]}: {self.error}"
+
+
+def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
+    """What is to be said of a job that failed."""
+    chunks = campaign.chunks(job.setting)
+    chunks = chunks if job.chunk is None else [chunks[job.chunk]]
+    return Failure(
+        setting=job.setting,
+        parameters=campaign.settings[job.setting],
+        chunk=job.chunk,
+        runs=(chunks[0].start, chunks[-1].stop - 1),
+        key=(campaign.seed, *campaign.words(job.setting)),
+        error=reply.error,
+        traceback=reply.traceback,
+    )
+
+
+def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried: list[Job]) -> None:
+    """Write failures.json beside the store: these, and the earlier ones of what was not tried now; none, no file."""
+    path = out / FAILURES
+    jobs = {*tried, *(Job(job.setting) for job in tried)}
+    earlier = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    left = [entry for entry in earlier if Job(entry["setting"], entry["chunk"]) not in jobs]
+    entries = left + [asdict(item) | {"command": command(campaign, out, item)} for item in failures]
+    if not entries:
+        path.unlink(missing_ok=True)
+        return
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    os.replace(partial, path)
+
+
+def command(campaign: Campaign, out: Path, item: Failure) -> str:
+    """The command that runs what failed again, alone and in one process."""
+    words = ["heliograph", "sweep", campaign.path, "--out", str(out.absolute()), "--setting", str(item.setting)]
+    return shlex.join(words if item.chunk is None else [*words, "--chunk", str(item.chunk)])

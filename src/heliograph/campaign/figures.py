@@ -1,0 +1,166 @@
+"""Figures of a campaign: RMSE and NEES of every filter against a parameter, or by setting where there is no number."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from heliograph.campaign.plan import Campaign, canonical
+from heliograph.campaign.store import parameter_values
+from heliograph.campaign.summary import Score
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, STYLE, VERMILION, WIDTH
+
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED)
+PANELS, SETTINGS, PARAMETERS = 6, 20, 3  # more than that is in the table
+LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an axis is logarithmic
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of scores with that of its standard error."""
+
+    label: str
+    value: str
+    error: str
+
+
+RMSE = Quantity("RMSE", "rmse", "rmse_error")
+NEES = Quantity("NEES per dimension", "nees_per_dimension", "nees_error")
+
+
+def campaign_figures(campaign: Campaign, scores: Sequence[Score]) -> dict[str, Figure]:
+    """Figures by name: for each numeric parameter, or else by setting, RMSE and NEES."""
+    parameters = [name for name in campaign.parameters if _is_axis(campaign, name)][:PARAMETERS]
+    figures = {}
+    for quantity in (RMSE, NEES):
+        for name in parameters:
+            figures[f"{quantity.value} against {name}"] = against(campaign, scores, name, quantity)
+        if not parameters:
+            figures[f"{quantity.value} by setting"] = by_setting(campaign, scores, quantity)
+    return figures
+
+
+def _is_axis(campaign: Campaign, name: str) -> bool:
+    """Whether a parameter is a number that takes several values while the others stay."""
+    values = parameter_values(campaign, name)
+    if values.dtype.kind not in "if" or not np.all(np.isfinite(values)):
+        return False
+    rests = [canonical(_rest(setting, name)) for setting in campaign.settings]
+    return len(set(rests)) < len(rests)
+
+
+def _rest(setting: Mapping[str, Any], name: str) -> dict[str, Any]:
+    return {key: value for key, value in setting.items() if key != name}
+
+
+@matplotlib.rc_context(STYLE)
+def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantity: Quantity) -> Figure:
+    """A quantity against a parameter, a curve for each filter with two standard errors to both sides.
+
+    One panel for each node and each choice of the other parameters.
+    """
+    panels: dict[str, list[Score]] = {}
+    for score in scores:
+        rest = _rest(campaign.settings[score.setting], parameter)
+        title = ", ".join([score.node, *(f"{name} = {value}" for name, value in rest.items())])
+        panels.setdefault(title, []).append(score)
+    shown = dict(list(panels.items())[:PANELS])
+    figure, grid = _panels(len(shown), 2.5)
+    colours = _colours(scores)
+    for axes, (title, part) in zip(grid, shown.items(), strict=False):
+        for name in dict.fromkeys(score.filter for score in part):
+            own = [score for score in part if score.filter == name]
+            own.sort(key=lambda score: campaign.settings[score.setting][parameter])
+            x = [campaign.settings[score.setting][parameter] for score in own]
+            y, error = _columns(own, quantity)
+            axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=name)
+        axes.set_title(title)
+    drawn = [score for part in shown.values() for score in part]
+    _scale(grid[0], [campaign.settings[score.setting][parameter] for score in drawn], "x")
+    figure.supxlabel(parameter, fontsize=10, color=INK)
+    _finish(figure, grid, drawn, quantity, colours)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) -> Figure:
+    """A quantity for each setting, a point for each filter with two standard errors to both sides; a panel a node."""
+    nodes = list(dict.fromkeys(score.node for score in scores))[:PANELS]
+    settings = list(dict.fromkeys(score.setting for score in scores))[:SETTINGS]
+    figure, grid = _panels(len(nodes), 0.9 + 0.3 * len(settings), columns=1)
+    colours = _colours(scores)
+    for axes, node in zip(grid, nodes, strict=False):
+        for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
+            own = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
+            y, error = _columns(own, quantity)
+            rows = [settings.index(score.setting) + shift for score in own]
+            axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=name)
+        axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
+        axes.set_ylim(len(settings) - 0.5, -0.5)
+        axes.set_title(node)
+        if quantity is NEES:
+            axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    drawn = [score for score in scores if score.node in nodes and score.setting in settings]
+    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "x")
+    grid[-1].set_xlabel(quantity.label)
+    _legend(figure, grid, colours)
+    return figure
+
+
+def _named(campaign: Campaign, setting: int) -> str:
+    text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
+    return text if len(text) <= 36 else text[:35] + "…"
+
+
+def _panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
+    columns = min(columns, max(count, 1))
+    rows = -(-max(count, 1) // columns)
+    figure = Figure(figsize=(WIDTH, 0.5 + height * rows), layout="constrained")
+    grid = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    for axes in grid[count:]:
+        axes.set_axis_off()
+    return figure, grid
+
+
+def _colours(scores: Sequence[Score]) -> dict[str, str]:
+    names = dict.fromkeys(score.filter for score in scores)
+    return {name: COLOURS[i % len(COLOURS)] for i, name in enumerate(names)}
+
+
+def _columns(scores: Sequence[Score], quantity: Quantity) -> tuple[np.ndarray, np.ndarray]:
+    values = np.array([getattr(score, quantity.value) for score in scores])
+    return values, np.nan_to_num(np.array([getattr(score, quantity.error) for score in scores]))
+
+
+def _finish(
+    figure: Figure, grid: list[Axes], drawn: Sequence[Score], quantity: Quantity, colours: Mapping[str, str]
+) -> None:
+    if quantity is NEES:
+        for axes in grid:
+            axes.axhline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    _scale(grid[0], [getattr(score, quantity.value) for score in drawn], "y")
+    figure.supylabel(quantity.label, fontsize=10, color=INK)
+    _legend(figure, grid, colours)
+
+
+def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
+    """Make a shared axis logarithmic where its values spread over much."""
+    finite = np.array([value for value in values if np.isfinite(value)])
+    if len(set(finite)) > 2 and finite.min() > 0 and finite.max() > LOGARITHMIC * finite.min():
+        axes.set_xscale("log") if axis == "x" else axes.set_yscale("log")
+
+
+def _legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
+    entries = {name: handle for axes in grid for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
+    names = [name for name in colours if name in entries]
+    figure.legend(
+        [entries[name] for name in names],
+        names,
+        loc="outside upper center",
+        ncols=min(len(names), 4) or 1,
+        frameon=False,
+    )

@@ -1,0 +1,67 @@
+"""The names that the settings of a campaign share: what the axes of its store are called."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from heliograph.check import fail
+from heliograph.network import Network
+
+Claims = dict[str, dict[str, str]]
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Names along the axes of a campaign's store, and the longest measurement."""
+
+    states: tuple[str, ...]
+    nodes: tuple[str, ...]
+    filters: tuple[str, ...]
+    received: int
+
+
+def describe(network: Network) -> dict[str, Any]:
+    """The labels of one network, and its claims by node and filter, as JSON can hold them."""
+    claims = network.claims()
+    labels = Labels(
+        states=network.states,
+        nodes=tuple(claims),
+        filters=tuple(dict.fromkeys(name for filters in claims.values() for name in filters)),
+        received=max(node.received for node in network.nodes.values()),
+    )
+    return {"labels": asdict(labels), "claims": claims}
+
+
+def labels_from(table: dict[str, Any]) -> Labels:
+    """The labels that `describe` gave, after their way through JSON."""
+    states, nodes, filters = (tuple(table[axis]) for axis in ("states", "nodes", "filters"))
+    return Labels(states, nodes, filters, int(table["received"]))
+
+
+def join(parts: Mapping[int, Labels]) -> Labels:
+    """Labels that hold those of every setting, in order of first appearance.
+
+    Raises:
+        ValueError: settings whose plants have other states: their errors have no common axis.
+    """
+    first, labels = next(iter(parts.items()))
+    for setting, other in parts.items():
+        if other.states != labels.states:
+            raise fail(f"setting {setting}", f"the states of setting {first}, {labels.states}", other.states)
+    return Labels(
+        states=labels.states,
+        nodes=_union([part.nodes for part in parts.values()]),
+        filters=_union([part.filters for part in parts.values()]),
+        received=max(part.received for part in parts.values()),
+    )
+
+
+def check_within(labels: Labels, known: Labels, setting: int) -> None:
+    """Raise ValueError if a setting has a name that the store was not made for."""
+    lacking = [name for name in (*labels.nodes, *labels.filters) if name not in (*known.nodes, *known.filters)]
+    if labels.states != known.states or labels.received > known.received or lacking:
+        raise fail(f"setting {setting}", f"states, nodes and filters of the store, {known}", labels)
+
+
+def _union(names: Sequence[Sequence[str]]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for part in names for name in part))

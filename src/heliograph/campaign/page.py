@@ -1,0 +1,90 @@
+"""The report of a campaign: one self-contained page."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from heliograph.campaign.failures import FAILURES
+from heliograph.campaign.figures import PANELS, campaign_figures
+from heliograph.campaign.plan import Campaign
+from heliograph.campaign.show import score_headers, score_row
+from heliograph.campaign.summary import SUMMARY, Score
+from heliograph.report.figures import svg
+from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
+
+REPORT = "report.html"
+ROWS = 200  # of the table on the page
+REPORTED = 20  # failures on the page
+
+
+def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
+    """Write the page beside the store; returns where it is."""
+    path = out / REPORT
+    entries = json.loads((out / FAILURES).read_text(encoding="utf-8")) if (out / FAILURES).is_file() else []
+    path.write_text(campaign_page(campaign, scores, entries).html(), encoding="utf-8")
+    return path
+
+
+def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[dict[str, Any]]) -> Page:
+    """The page of a campaign with its scores and what failed."""
+    name = Path(campaign.path).name
+    there = sum({score.setting: score.runs for score in scores}.values())
+    return Page(
+        kicker="Heliograph campaign",
+        title=f"{len(campaign.settings)} settings, {campaign.runs} runs each",
+        lead=f"{name}: {there} of {len(campaign.settings) * campaign.runs} runs of {campaign.horizon} steps are "
+        f"there. {_failed(failures)}",
+        sections=[
+            *([_failures(failures)] if failures else []),
+            Section("Results", _pictures(campaign, scores)),
+            Section("All scores", [_table(campaign, scores)]),
+            _reading(campaign),
+            Section("The campaign", [Code(campaign.text.strip())]),
+        ],
+        footer=", ".join(f"{package} {number}" for package, number in campaign.versions.items()),
+    )
+
+
+def _failed(failures: Sequence[dict[str, Any]]) -> str:
+    return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
+
+
+def _failures(failures: Sequence[dict[str, Any]]) -> Section:
+    points = [
+        f"setting {entry['setting']} {entry['parameters']}, runs {entry['runs'][0]} to {entry['runs'][1]}: "
+        f"{entry['error']}"
+        for entry in failures[:REPORTED]
+    ]
+    text = f"Tried three times. All of them, with tracebacks, are in {FAILURES}; run one again alone by its command:"
+    return Section("What failed", [Points(points), Text([text]), Code(failures[0]["command"])])
+
+
+def _pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
+    caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
+    return [
+        Picture(svg(figure), f"{name} of every filter.", caption if i == 0 else "")
+        for i, (name, figure) in enumerate(campaign_figures(campaign, scores).items())
+    ]
+
+
+def _table(campaign: Campaign, scores: Sequence[Score]) -> Table:
+    rows = [[str(score.setting), *score_row(campaign, score)] for score in scores[:ROWS]]
+    more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
+    caption = (
+        "**RMSE**: root of the mean over runs and steps of the squared error summed over the state. **NEES / dim**: "
+        "squared error in units of the claimed covariance, per dimension; 1 is honest, above 1 is too sure. **±**: one "
+        f"standard error of the number before it, from the scatter between runs. Only finite runs count.{more}"
+    )
+    return Table(["setting", *score_headers(campaign)], rows, caption)
+
+
+def _reading(campaign: Campaign) -> Section:
+    lines = [
+        "import heliograph as hg",
+        "",
+        'results = hg.open_results("THIS FOLDER")  # an xarray.Dataset',
+        'results.error.sel(setting=0).mean("run")',
+    ]
+    text = f"The errors of every run are in the store; axes: {', '.join(['setting', 'run', 'time', 'node', 'filter'])}."
+    return Section("All runs", [Text([text]), Code("\n".join(lines))])

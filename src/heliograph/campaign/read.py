@@ -1,0 +1,192 @@
+"""A campaign from its TOML file; whatever is wrong in it is one line that names the key."""
+
+import inspect
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+from heliograph.campaign.plan import DIMENSIONS, Campaign, canonical, versions
+from heliograph.check import check_count, fail
+from heliograph.simulate import BLOCK
+
+KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "grid", "settings")
+KEEP = ("errors", "trajectories")
+# Names that the store's variables and the table's columns have already.
+VARIABLES = ("error", "variance", "nees_per_dimension", "truth", "measurement", "claim")
+COLUMNS = ("rmse", "rmse_error", "nees_error", "runs", "finite_runs")
+CHUNK = 256
+
+
+def load_campaign(path: str | Path) -> Campaign:
+    """Read a campaign from a TOML file, and the source of the network it names.
+
+    Keys: network = "my_network.py:build" (a function of the settings; the path counts from the campaign's folder),
+    horizon, runs, and [grid] name = [values], whose product is taken, or [[settings]], one table for each. Optional:
+    seed (0), chunk (runs computed and stored at once, 256; a multiple of 64), keep ("errors", or "trajectories" for
+    truth and measurements too), [inputs] name = a number or one for each step.
+
+    Raises:
+        ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
+            network's function does not take.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise fail(f"campaign {path}", "a TOML file", "a folder" if path.is_dir() else "nothing of that name")
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise fail(f"campaign {path}", "a TOML file in UTF-8", str(error)) from None
+    table = _parse(text, path.name)
+    file = path.parent / _network(table, path.name).rpartition(":")[0]
+    if not file.is_file():
+        raise fail(f"{path.name}, network", f"a Python file in {path.parent}", f"{file.name}: nothing of that name")
+    campaign = read_campaign(text, file.read_text(encoding="utf-8"), path)
+    _check_arguments(campaign, path.name)
+    return campaign
+
+
+def read_campaign(text: str, source: str, path: Path) -> Campaign:
+    """The campaign in the text of a file, with the source of its network's module.
+
+    Raises:
+        ValueError: as `load_campaign`, but for the settings that the function does not take.
+    """
+    name = path.name
+    table = _parse(text, name)
+    for key in table:
+        if key not in KEYS:
+            close = get_close_matches(key, KEYS, 1)
+            hint = f" (closest: {close[0]!r})" if close else ""
+            raise fail(f"{name}, key {key!r}", f"one of {', '.join(KEYS)}", f"an unknown key{hint}")
+    runs, horizon = _count(table, "runs", name), _count(table, "horizon", name)
+    return Campaign(
+        text=text,
+        network=_network(table, name),
+        source=source,
+        path=str(path.absolute()),
+        horizon=horizon,
+        runs=runs,
+        seed=_seed(table.get("seed", 0), name),
+        chunk=min(_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
+        keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
+        inputs=_inputs(table.get("inputs", {}), horizon, name),
+        settings=_settings(table, name),
+        versions=versions(),
+    )
+
+
+def _parse(text: str, name: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise fail(f"campaign {name}", "TOML", str(error)) from None
+
+
+def _network(table: Mapping[str, Any], name: str) -> str:
+    value = table.get("network")
+    file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
+    if not file.endswith(".py") or not function.isidentifier():
+        raise fail(f"{name}, network", 'a file and a function in it, as "my_network.py:build"', _shown(value))
+    return str(value)
+
+
+def _shown(value: Any) -> str:
+    return "none" if value is None else repr(value)
+
+
+def _count(table: Mapping[str, Any], key: str, name: str) -> int:
+    return check_count(f"{name}, {key}", table.get(key, "none"))
+
+
+def _seed(value: Any, name: str) -> int:
+    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
+        raise fail(f"{name}, seed", "a whole number from 0 to 4294967295", _shown(value))
+    return value
+
+
+def _chunk(value: Any, name: str) -> int:
+    if check_count(f"{name}, chunk", value) % BLOCK:
+        raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", value)
+    return int(value)
+
+
+def _one_of(value: Any, choices: Sequence[str], name: str) -> str:
+    if value not in choices:
+        raise fail(name, " or ".join(map(repr, choices)), repr(value))
+    return str(value)
+
+
+def _inputs(table: Any, horizon: int, name: str) -> dict[str, float | list[float]]:
+    if not isinstance(table, dict):
+        raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
+    for key, value in table.items():
+        values = value if isinstance(value, list) else [value]
+        if not all(_is_number(v) for v in values) or (isinstance(value, list) and len(value) != horizon):
+            raise fail(f"{name}, inputs.{key}", f"a number or one for each of {horizon} steps", _short(value))
+    return dict(table)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} values" if isinstance(value, list) else repr(value)
+
+
+def _settings(table: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+    if ("grid" in table) == ("settings" in table):
+        raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
+    settings = _grid(table["grid"], name) if "grid" in table else _listed(table["settings"], name)
+    taken = {*DIMENSIONS, *VARIABLES, *COLUMNS}
+    for i, setting in enumerate(settings):
+        for key, value in setting.items():
+            if not key.isidentifier() or key in taken:
+                raise fail(f"{name}, parameter {key!r}", f"a Python name other than {', '.join(sorted(taken))}", key)
+            _check_value(value, f"{name}, {key} of setting {i}")
+    seen: dict[str, int] = {}
+    for i, setting in enumerate(settings):
+        first = seen.setdefault(canonical(setting), i)
+        if first != i:
+            raise fail(
+                f"{name}, setting {i}", "distinct settings", f"the same as setting {first}, {canonical(setting)}"
+            )
+    return settings
+
+
+def _grid(grid: Any, name: str) -> list[dict[str, Any]]:
+    if not isinstance(grid, dict) or not grid:
+        raise fail(f"{name}, grid", "a table of lists of values by parameter", _shown(grid))
+    for key, values in grid.items():
+        if not isinstance(values, list) or not values:
+            raise fail(f"{name}, grid.{key}", "a list of values", repr(values))
+    return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
+
+
+def _listed(settings: Any, name: str) -> list[dict[str, Any]]:
+    if not isinstance(settings, list) or not settings or not all(isinstance(s, dict) for s in settings):
+        raise fail(f"{name}, settings", "tables [[settings]]", repr(settings))
+    return settings
+
+
+def _check_value(value: Any, name: str) -> None:
+    """Only what JSON can hold without loss."""
+    if isinstance(value, dict | list):
+        for item in value.values() if isinstance(value, dict) else value:
+            _check_value(item, name)
+    elif not isinstance(value, str | bool) and not _is_number(value):
+        raise fail(name, "finite numbers, strings, booleans, lists or tables", repr(value))
+
+
+def _check_arguments(campaign: Campaign, name: str) -> None:
+    """Raise before any work if the network's function does not take the settings."""
+    signature = inspect.signature(campaign.function())
+    for i, setting in enumerate(campaign.settings):
+        try:
+            signature.bind(**setting)
+        except TypeError as error:
+            raise fail(f"{name}, setting {i}", f"arguments of {campaign.network}{signature}", str(error)) from None

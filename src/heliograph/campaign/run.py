@@ -1,0 +1,159 @@
+"""Run a campaign: describe its settings, make the store, compute the chunks that it lacks, report what failed."""
+
+import os
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from heliograph.campaign.engines import Engine, start_engine
+from heliograph.campaign.failures import Failure, failure, write_failures
+from heliograph.campaign.labels import check_within, join, labels_from
+from heliograph.campaign.plan import Campaign
+from heliograph.campaign.store import (
+    STORE,
+    check_same,
+    create,
+    described,
+    done_chunks,
+    remove_partial,
+    remove_unmade,
+    stored_labels,
+    write_claims,
+)
+from heliograph.campaign.summary import SUMMARY, write_summary
+from heliograph.campaign.work import Job, Reply
+from heliograph.check import fail
+from heliograph.output_folder import check_replaceable
+
+TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
+Tell = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class CampaignRun:
+    """What a call did: how many chunks were there, how many it computed, and what failed."""
+
+    folder: Path
+    already: int
+    computed: int
+    failures: list[Failure]
+
+
+def run_campaign(
+    campaign: Campaign,
+    out: str | Path,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    only: Sequence[tuple[int, int]] | None = None,
+    tell: Tell | None = None,
+) -> CampaignRun:
+    """Compute what a campaign's results folder lacks: results.zarr, summary.csv, and failures.json if a chunk failed.
+
+    workers: processes of this machine, one for each CPU unless given; 0 computes in this process. scheduler: the
+    address of a Dask scheduler instead. only: (setting, chunk) pairs instead of all. tell(what, done, total) is called
+    as the work goes on. The store's bytes depend on the campaign alone: neither on the workers, nor on how often and
+    where it was interrupted. A chunk that fails is tried three times, then reported; the rest goes on.
+
+    Raises:
+        ValueError: a folder of something else or of another campaign, a setting or chunk that is none, no setting
+            that can be built, settings whose plants differ in their states.
+        OSError: no scheduler at the address.
+        ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
+    """
+    out, tell = Path(out), tell or (lambda what, done, total: None)
+    store = (out / STORE).absolute()
+    remove_unmade(store)
+    check_replaceable(out, f"{STORE}/zarr.json")
+    wanted = _wanted(campaign, only)
+    done: set[tuple[int, int]] = set()
+    if store.is_dir():
+        check_same(store, campaign)
+        done = done_chunks(store, campaign)
+    missing = [job for job in wanted if (job.setting, job.chunk) not in done]
+    already = len(wanted) - len(missing)
+    if not missing and (out / SUMMARY).is_file():
+        return CampaignRun(out, already, 0, [])
+    failed: dict[Job, Reply] = {}
+    if missing:
+        with start_engine(campaign.as_json(), store, _count(workers, len(missing)), scheduler) as engine:
+            (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
+            failed = _compute(engine, campaign, store, missing, already, tell)
+    remove_partial(store)
+    failures = [failure(campaign, job, reply) for job, reply in failed.items()]
+    write_failures(out, campaign, failures, tried=wanted)
+    write_summary(store, campaign, out / SUMMARY)
+    lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
+    return CampaignRun(out, already, len(missing) - lacking, failures)
+
+
+def _compute(
+    engine: Engine, campaign: Campaign, store: Path, missing: Sequence[Job], already: int, tell: Tell
+) -> dict[Job, Reply]:
+    """Describe what is not described, then compute the chunks of all that could be; returns what failed, in order."""
+    failed = _describe(engine, campaign, store, {job.setting for job in missing}, tell)
+    possible = [job for job in missing if Job(job.setting) not in failed]
+    total = already + len(missing)
+    tell("simulating", already, total)
+    failed |= _try(engine, possible, lambda job, value, done: tell("simulating", already + done, total))
+    return dict(sorted(failed.items(), key=lambda item: (item[0].setting, item[0].chunk or 0)))
+
+
+def _wanted(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
+    every = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
+    if only is None:
+        return every
+    chosen, known = [Job(*pair) for pair in only], set(every)
+    unknown = [job for job in chosen if job not in known]
+    if unknown:
+        expected = f"a setting from 0 to {every[-1].setting} and a chunk from 0 to {every[-1].chunk}"
+        raise fail("setting and chunk", expected, f"{unknown[0].setting} and {unknown[0].chunk}")
+    return chosen
+
+
+def _count(workers: int | None, jobs: int) -> int:
+    if workers is None:
+        cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        return min(cpus, jobs)
+    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
+        raise fail("workers", "a whole number of processes, or 0", workers)
+    return min(workers, jobs)
+
+
+def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int], tell: Tell) -> dict[Job, Reply]:
+    """Make the store if it is not there, and write the claims it lacks; returns the settings that cannot be built."""
+    new = not store.is_dir()
+    lacking = range(len(campaign.settings)) if new else sorted(settings - described(store))
+    jobs, found = [Job(setting) for setting in lacking], {}
+
+    def accept(job: Job, value: Any, done: int) -> None:
+        found[job.setting] = value
+        tell("building", done, len(jobs))
+
+    failed = _try(engine, jobs, accept)
+    if new and not found:
+        first = next(iter(failed.values()))
+        raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
+    labels = {setting: labels_from(found[setting]["labels"]) for setting in sorted(found)}
+    if new:
+        create(store, campaign, join(labels))
+    for setting, own in labels.items():
+        check_within(own, stored_labels(store), setting)
+        write_claims(store, setting, found[setting]["claims"])
+    return failed
+
+
+def _try(engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Any, int], None]) -> dict[Job, Reply]:
+    """Have jobs done, accept(job, value, how many are done) the good replies; return the last of those that failed."""
+    done, left = 0, {job: Reply() for job in jobs}
+    for _ in range(TRIES):
+        for job, reply in engine(list(left)):
+            if reply.error:
+                left[job] = reply
+            else:
+                del left[job]
+                done += 1
+                accept(job, reply.value, done)
+        if not left:
+            break
+    return left

@@ -1,0 +1,213 @@
+"""The labelled Zarr store of a campaign: made whole before the first run, then filled file by file.
+
+Every chunk of runs has files of its own, each written under another name and then renamed. So a chunk is done when its
+files are there, whoever wrote them and whatever was killed meanwhile, and the bytes depend on the campaign alone.
+"""
+
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from zarr.codecs import ZstdCodec
+
+from heliograph.campaign.labels import Claims, Labels, labels_from
+from heliograph.campaign.plan import Campaign, Chunk
+from heliograph.campaign.read import read_campaign
+from heliograph.check import fail
+from heliograph.output_folder import whole_folder
+
+STORE = "results.zarr"
+ERRORS = {  # variables by name: their axes and what they are
+    "error": (("setting", "run", "time", "node", "filter", "state"), "true state less its estimate"),
+    "variance": (("setting", "run", "time", "node", "filter", "state"), "claimed variance of the error"),
+    "nees_per_dimension": (("setting", "run", "time", "node", "filter"), "e' B^-1 e / n, 1 if the claim is exact"),
+}
+WORLD = {
+    "truth": (("setting", "run", "time", "state"), "true state"),
+    "measurement": (("setting", "run", "time", "node", "received"), "what reached the node, NaN beyond its length"),
+}
+CLAIM = "claim"
+
+
+def variables(campaign: Campaign) -> dict[str, tuple[tuple[str, ...], str]]:
+    """The variables that chunks of runs are written to, with their axes and meaning."""
+    return ERRORS | (WORLD if campaign.keep == "trajectories" else {})
+
+
+def create(path: Path, campaign: Campaign, labels: Labels) -> None:
+    """Make the store, whole but for the claims and the chunks of runs."""
+    with whole_folder(path) as folder:
+        attributes = {
+            "campaign": campaign.text,
+            "network_source": campaign.source,
+            "versions": campaign.versions,
+            "labels": asdict(labels),
+            "coordinates": " ".join(campaign.parameters),
+        }
+        group = zarr.create_group(folder, zarr_format=3, attributes=attributes)
+        coordinates = _coordinates(campaign, labels)
+        for name, values in coordinates.items():
+            _write_coordinate(group, name, values, "setting" if name in campaign.parameters else name)
+        sizes = {name: len(values) for name, values in coordinates.items()}
+        for name, (axes, meaning) in variables(campaign).items():
+            shape = tuple(sizes[axis] for axis in axes)
+            _create(group, name, axes, shape, (1, campaign.chunk, *shape[2:]), np.nan, {"long_name": meaning})
+        axes = ("setting", "node", "filter")
+        shape = tuple(sizes[axis] for axis in axes)
+        _create(group, CLAIM, axes, shape, (1, *shape[1:]), "", {"long_name": "what the filter claims of its variance"})
+        with warnings.catch_warnings():  # zarr says that consolidated metadata are not in the format's text yet
+            warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+            zarr.consolidate_metadata(folder)
+
+
+def _coordinates(campaign: Campaign, labels: Labels) -> dict[str, np.ndarray]:
+    steps = {
+        "setting": np.arange(len(campaign.settings)),
+        "run": np.arange(campaign.runs),
+        "time": np.arange(1, campaign.horizon + 1),
+    }
+    names = {"node": labels.nodes, "filter": labels.filters, "state": labels.states}
+    received = {"received": np.arange(labels.received)} if campaign.keep == "trajectories" else {}
+    parameters = {name: parameter_values(campaign, name) for name in campaign.parameters}
+    return steps | {name: np.array(value) for name, value in names.items()} | received | parameters
+
+
+def parameter_values(campaign: Campaign, name: str) -> np.ndarray:
+    """A parameter along the settings: numbers or booleans where all values are, else text; NaN or "" if absent."""
+    values = [setting.get(name) for setting in campaign.settings]
+    if all(isinstance(value, bool) for value in values):
+        return np.array(values)
+    if all(value is None or (isinstance(value, int | float) and not isinstance(value, bool)) for value in values):
+        whole = all(isinstance(value, int) for value in values)
+        return np.array(values, dtype=np.int64 if whole else np.float64)
+    return np.array([_text(value) for value in values])
+
+
+def _text(value: Any) -> str:
+    if value is None or isinstance(value, str):
+        return value or ""
+    return json.dumps(value, sort_keys=True, ensure_ascii=False)
+
+
+def _write_coordinate(group: zarr.Group, name: str, values: np.ndarray, axis: str) -> None:
+    fill = "" if values.dtype.kind == "U" else values.dtype.type(0)
+    _create(group, name, (axis,), values.shape, values.shape, fill, {}, values.dtype)
+    _open(group, name)[...] = values
+
+
+def _create(
+    group: zarr.Group,
+    name: str,
+    axes: tuple[str, ...],
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    fill: Any,
+    attributes: Mapping[str, str],
+    kind: Any = np.float64,
+) -> None:
+    text = isinstance(fill, str)
+    group.create_array(
+        name,
+        shape=shape,
+        chunks=chunks,
+        dtype=str if text else kind,
+        fill_value=fill,
+        compressors=None if text else ZstdCodec(level=1),
+        dimension_names=axes,
+        attributes=dict(attributes),
+        chunk_key_encoding={"name": "default", "separator": "."},  # one flat folder for each variable
+    )
+
+
+def _open(group: zarr.Group, name: str) -> Any:
+    """An array that writes a chunk's file even if nothing but fill values are in it: the file says that it is done."""
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return array.with_config({"write_empty_chunks": True})
+
+
+def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> None:
+    """Write the values (run, ...) of one chunk of runs, one file for each variable."""
+    group = zarr.open_group(path, mode="r+")
+    for name, block in values.items():
+        _open(group, name)[chunk.setting : chunk.setting + 1, chunk.start : chunk.stop] = block[None]
+
+
+def write_claims(path: Path, setting: int, claims: Claims) -> None:
+    """Write what the filters of one setting claim."""
+    labels = stored_labels(path)
+    table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
+    _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
+
+
+def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, int]]:
+    """(setting, chunk) of the chunks whose files are all there."""
+    return set.intersection(*(_written(path / name, 2) for name in variables(campaign)))
+
+
+def described(path: Path) -> set[int]:
+    """Settings whose claims are written."""
+    return {setting for (setting,) in _written(path / CLAIM, 1)}
+
+
+def _written(folder: Path, indices: int) -> set[Any]:
+    files = (name.split(".") for name in os.listdir(folder) if name.startswith("c."))
+    return {tuple(int(part) for part in parts[1 : 1 + indices]) for parts in files if all(map(str.isdigit, parts[1:]))}
+
+
+def remove_unmade(path: Path) -> None:
+    """Remove what a process left that was killed while it made the store."""
+    for left in path.parent.glob(f".{path.name}-*"):
+        shutil.rmtree(left)
+
+
+def remove_partial(path: Path) -> None:
+    """Remove what a killed process left half written."""
+    for folder in path.iterdir():
+        for file in folder.iterdir() if folder.is_dir() else ():
+            if file.name.startswith("c.") and not all(map(str.isdigit, file.name.split(".")[1:])):
+                file.unlink(missing_ok=True)
+
+
+def stored_labels(path: Path) -> Labels:
+    """The labels that the store was made for."""
+    found: Any = zarr.open_group(path, mode="r").attrs["labels"]
+    return labels_from(found)
+
+
+def check_same(path: Path, campaign: Campaign) -> None:
+    """Raise ValueError unless the store was begun with this campaign, saying what differs."""
+    attributes: Any = zarr.open_group(path, mode="r").attrs
+    begun = dict(attributes["versions"])
+    differs = [
+        f"{name} {campaign.versions.get(name)} (was {begun.get(name)})"
+        for name in campaign.versions
+        if campaign.versions[name] != begun.get(name)
+    ]
+    if not differs:
+        stored = read_campaign(attributes["campaign"], attributes["network_source"], Path(campaign.path))
+        differs = list(_differences(stored, campaign))
+    if differs:
+        raise fail(
+            f"results folder {path.parent}", "the campaign it was begun with, or another folder", "; ".join(differs)
+        )
+
+
+def _differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:
+    for name in ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs"):
+        new, old = getattr(campaign, name), getattr(stored, name)
+        if new != old:
+            yield f"{name} {new!r} (was {old!r})"
+    if campaign.source != stored.source:
+        yield f"another source of {campaign.network.rpartition(':')[0]}"
+    if campaign.settings != stored.settings:
+        pairs = zip(campaign.settings, stored.settings, strict=False)
+        changed = [f"setting {i} {new} (was {old})" for i, (new, old) in enumerate(pairs) if new != old]
+        yield changed[0] if changed else f"{len(campaign.settings)} settings (was {len(stored.settings)})"

@@ -1,0 +1,131 @@
+"""The results of a campaign: the labelled store, and a table of RMSE and NEES by setting, node and filter."""
+
+import csv
+import os
+from dataclasses import astuple, dataclass, fields
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+import zarr
+
+from heliograph.campaign.plan import Campaign
+from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
+from heliograph.check import fail
+
+SUMMARY = "summary.csv"
+
+
+def open_results(out: str | Path) -> Any:
+    """The results of a campaign's folder as an xarray.Dataset, read when used.
+
+    error and variance (setting, run, time, node, filter, state), nees_per_dimension (setting, run, time, node, filter),
+    claim (setting, node, filter); where kept truth (setting, run, time, state) and measurement (setting, run, time,
+    node, received). The parameters of the settings are coordinates along `setting`. NaN where a node lacks a filter,
+    and where chunks are missing.
+
+    Raises:
+        ValueError: a folder without results.
+        ModuleNotFoundError: the extra `sweep` is not installed.
+    """
+    import xarray
+
+    path = Path(out) / STORE
+    if not path.is_dir():
+        raise fail(f"results folder {out}", f"a folder with {STORE}", "none")
+    results = xarray.open_zarr(path)
+    return results.assign_coords({name: values.compute() for name, values in results.coords.items()})
+
+
+@dataclass(frozen=True)
+class Score:
+    """One filter of one node in one setting, over the runs that are there and finite; NaN where there are none.
+
+    rmse: root of the mean over runs and steps of the squared error summed over the state. nees_per_dimension: 1 if the
+    claim is exact. Standard errors are from the scatter between runs.
+    """
+
+    setting: int
+    node: str
+    filter: str
+    claim: str
+    rmse: float
+    rmse_error: float
+    nees_per_dimension: float
+    nees_error: float
+    runs: int
+    finite_runs: int
+
+
+def read_summary(path: Path) -> list[Score]:
+    """The scores that `write_summary` wrote."""
+    kinds = get_type_hints(Score)
+    with path.open(newline="", encoding="utf-8") as file:
+        return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in csv.DictReader(file)]
+
+
+def summarize(store: Path, campaign: Campaign) -> list[Score]:
+    """Scores of every filter; the store is read chunk by chunk."""
+    group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
+    claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
+    scores = []
+    for setting in range(len(campaign.settings)):
+        parts = [
+            _per_run(group, setting, slice(chunk.start, chunk.stop), claims[setting])
+            for chunk in campaign.chunks(setting)
+            if (setting, chunk.number) in done
+        ]
+        empty = np.empty((2, 0, len(labels.nodes), len(labels.filters)))
+        squared, nees = np.concatenate(parts, axis=1) if parts else empty
+        for i, node in enumerate(labels.nodes):
+            for j, name in enumerate(labels.filters):
+                if claims[setting, i, j]:
+                    label = setting, node, name, str(claims[setting, i, j])
+                    scores.append(_score(label, squared[:, i, j], nees[:, i, j]))
+    return scores
+
+
+def _per_run(group: zarr.Group, setting: int, runs: slice, claims: np.ndarray) -> np.ndarray:
+    """Squared error summed over the state and NEES per dimension, means over time, (2, run, node, filter).
+
+    The squared error is NaN where a variance that is claimed is not finite.
+    """
+    error, variance, nees = (_read(group, name, setting, runs) for name in ("error", "variance", "nees_per_dimension"))
+    squared = np.sum(error**2, axis=-1).mean(axis=1)
+    squared[~np.isfinite(variance).all(axis=(1, -1)) & (claims != "none")] = np.nan
+    return np.stack([squared, nees.mean(axis=1)])
+
+
+def _read(group: zarr.Group, name: str, setting: int, runs: slice) -> np.ndarray:
+    array = group[name]
+    assert isinstance(array, zarr.Array)
+    return np.asarray(array[setting, runs])
+
+
+def _score(label: tuple[int, str, str, str], squared: np.ndarray, nees: np.ndarray) -> Score:
+    finite = np.isfinite(squared)
+    mse, mse_error = _mean(squared[finite])
+    rmse = float(np.sqrt(mse))
+    return Score(
+        *label, rmse, mse_error / (2 * rmse) if rmse else 0.0, *_mean(nees[finite]), len(squared), int(finite.sum())
+    )
+
+
+def _mean(values: np.ndarray) -> tuple[float, float]:
+    """Mean and its standard error."""
+    if not len(values):
+        return np.nan, np.nan
+    return float(values.mean()), float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.nan
+
+
+def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
+    """Write the scores with the parameters of their settings as CSV."""
+    partial = path.with_name(f".{path.name}.partial")
+    with partial.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(["setting", *campaign.parameters, *(field.name for field in fields(Score)[1:])])
+        for score in summarize(store, campaign):
+            setting = campaign.settings[score.setting]
+            values = [setting.get(name, "") for name in campaign.parameters]
+            writer.writerow([score.setting, *values, *astuple(score)[1:]])
+    os.replace(partial, path)

@@ -1,0 +1,142 @@
+"""One piece of a campaign's work, as any process does it: describe a setting, or compute a chunk of its runs."""
+
+import traceback
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.campaign.keep import Errors
+from heliograph.campaign.labels import Labels, check_within, describe, labels_from
+from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
+from heliograph.campaign.store import stored_labels, write_chunk
+from heliograph.check import fail
+from heliograph.network import Network
+from heliograph.over_time import alike
+from heliograph.simulate import monte_carlo
+
+COMPILED = 16  # structures of networks whose compiled programs are kept
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do for one setting: compute a chunk of runs, or, without one, tell the labels and claims."""
+
+    setting: int
+    chunk: int | None = None
+
+
+@dataclass(frozen=True)
+class Reply:
+    """What came of a job: a value as JSON can hold it, or an error in one line with its traceback."""
+
+    value: Any = None
+    error: str = ""
+    traceback: str = ""
+
+
+def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
+    """Do one job of a campaign given as JSON; an error becomes a reply, since nobody else's work shall suffer."""
+    try:
+        plan = from_json(campaign)
+        _check_versions(plan)
+        network = _network(campaign, setting)
+        if chunk is None:
+            return Reply(describe(network))
+        compute(plan, network, plan.chunks(setting)[chunk], Path(store))
+        return Reply()
+    except Exception as error:
+        message = " ".join(str(error).split())
+        return Reply(error=f"{type(error).__name__}: {message}", traceback=traceback.format_exc())
+
+
+def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> None:
+    """Simulate a chunk of runs and write it.
+
+    Every chunk is simulated at full width, so that the last one of a setting needs no compilation of its own.
+    """
+    if not store.is_dir():
+        raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
+    labels = stored_labels(store)
+    check_within(labels_from(describe(network)["labels"]), labels, chunk.setting)
+    kept = monte_carlo(
+        network,
+        campaign.horizon,
+        campaign.chunk,
+        campaign.key(chunk.setting),
+        Errors(campaign.keep == "trajectories"),
+        inputs(campaign, network),
+        campaign.chunk,
+        first_run=chunk.start,
+    )
+    arrays = _arrays(kept, labels)
+    write_chunk(store, chunk, {name: values[: chunk.stop - chunk.start] for name, values in arrays.items()})
+
+
+def inputs(campaign: Campaign, network: Network) -> np.ndarray | None:
+    """The network's inputs over the campaign's steps, (horizon, inputs).
+
+    Raises:
+        ValueError: inputs of other names than the network's.
+    """
+    if sorted(campaign.inputs) != sorted(network.inputs):
+        raise fail("inputs", f"values of {list(network.inputs)}", list(campaign.inputs))
+    if not network.inputs:
+        return None
+    columns = [np.broadcast_to(np.asarray(campaign.inputs[n], float), campaign.horizon) for n in network.inputs]
+    return np.stack(columns, axis=1)
+
+
+def _check_versions(campaign: Campaign) -> None:
+    here = versions()
+    if here != campaign.versions:
+        raise fail("versions on this worker", str(campaign.versions), here)
+
+
+@lru_cache(maxsize=4)
+def _network(campaign: str, setting: int) -> Network:
+    plan = from_json(campaign)
+    network = plan.function()(**plan.settings[setting])
+    network.check_horizon(plan.horizon)
+    inputs(plan, network)
+    _bound_memory(network)
+    return network
+
+
+_seen: list[Network] = []
+
+
+def _bound_memory(network: Network) -> None:
+    """Drop compiled programs once networks of more than `COMPILED` structures came by."""
+    if any(alike(network, other) for other in _seen):
+        return
+    if len(_seen) == COMPILED:
+        jax.clear_caches()  # type: ignore[no-untyped-call]
+        _seen.clear()
+    _seen.append(network)
+
+
+def _arrays(kept: Any, labels: Labels) -> dict[str, np.ndarray]:
+    """What the reducer kept on the store's axes, (run, time, ...); NaN where a node lacks a filter."""
+    estimates = kept["estimates"]
+    example = next(iter(next(iter(e for e in estimates.values() if e)).values()))
+    runs, horizon = example["nees_per_dimension"].shape
+    tail = (len(labels.nodes), len(labels.filters))
+    result = {
+        name: np.full((runs, horizon, *tail, *example[name].shape[2:]), np.nan)
+        for name in ("error", "variance", "nees_per_dimension")
+    }
+    for node, filters in estimates.items():
+        for name, values in filters.items():
+            place = labels.nodes.index(node), labels.filters.index(name)
+            for variable, array in result.items():
+                array[:, :, place[0], place[1]] = values[variable]
+    if "truth" in kept:
+        result["truth"] = kept["truth"]
+        result["measurement"] = np.full((runs, horizon, tail[0], labels.received), np.nan)
+        for node, z in kept["measurements"].items():
+            result["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
+    return result

@@ -1,0 +1,31 @@
+"""A worker process: it reads a campaign and then jobs from its standard input, a line each, and answers each in a line.
+
+Started as a program of its own instead of by multiprocessing: nothing is forked from under JAX, and the script that
+called the library is not run again.
+"""
+
+import json
+import os
+import signal
+import sys
+from dataclasses import asdict
+
+
+def main() -> None:
+    """Serve until the input ends, as it does when the parent dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
+    answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
+    os.dup2(2, 1)  # what a user's module prints must not be taken for an answer
+    from heliograph.campaign.work import perform
+
+    campaign, store = json.loads(sys.stdin.readline())
+    for line in sys.stdin:
+        answer = json.dumps(asdict(perform(campaign, store, *json.loads(line))))
+        try:
+            print(answer, file=answers, flush=True)
+        except BrokenPipeError:
+            os._exit(1)  # the parent is dead: nobody wants an answer, nor a word of complaint
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""A second process does not compile again what a first one has."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+import heliograph as hg
+
+PROGRAM = """
+import sys, heliograph
+heliograph.keep_compilations(sys.argv[1])
+import jax, numpy as np
+heard = []
+jax.monitoring.register_event_listener(lambda name, **_: heard.append(name))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+plant = heliograph.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
+sensor, channel = heliograph.LinearSensor([[1.0]], 0.1), heliograph.hop(1.0, 0.1)
+item = heliograph.cubature_filter(plant, sensor, channel)
+network = heliograph.Network(plant, {"a": heliograph.Node(sensor, channel, {"f": item})})
+print(repr(float(heliograph.monte_carlo(network, 3, 2, 0).truth.sum())))
+print(heard.count("/jax/compilation_cache/cache_hits"), heard.count("/jax/compilation_cache/cache_misses"))
+"""
+
+
+def clean():
+    return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    def run():
+        command = [sys.executable, "-c", PROGRAM, str(tmp_path / "cache")]
+        value, counts = subprocess.run(command, env=clean(), capture_output=True, text=True, check=True).stdout.split(
+            "\n"
+        )[:2]
+        return value, *map(int, counts.split())
+
+    first, second = run(), run()
+    assert first[0] == second[0]  # bit for bit
+    assert first[2] > 0 and second[2] == 0 and second[1] >= first[2]
+
+
+def test_the_users_own_choice_stays(monkeypatch, tmp_path):
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    assert hg.keep_compilations(tmp_path / "other") == tmp_path
+    assert not (tmp_path / "other").exists()
+
+
+def test_a_folder_that_cannot_be_made_is_refused(monkeypatch, tmp_path):
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"folder .*file/inside: expected one that can be made"):
+        hg.keep_compilations(tmp_path / "file" / "inside")
+
+
+def test_import_is_lazy_and_changes_no_configuration():
+    program = (
+        "import sys, heliograph; assert 'jax' not in sys.modules; heliograph.Network; import jax, os; "
+        "assert not jax.config.jax_enable_x64 and jax.config.jax_compilation_cache_dir is None"
+    )
+    subprocess.run([sys.executable, "-c", program], env=clean(), check=True)
