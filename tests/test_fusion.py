@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.filter.base import STRENGTH, weakest
-from heliograph.fusion import relative_gap, trace_optimal_weights
+from heliograph.intersection import relative_gap, trace_optimal_weights
 from heliograph.testing import check_fusion
 from tests.oracles import cubature_fusion as oracle
 

@@ -11,15 +11,15 @@ import heliograph
 SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
-    ["float64", "check", "progress", "compilation_cache"],
+    ["float64", "check", "progress", "compilation_cache", "small_matrix"],
     ["linalg", "over_time"],
     ["random_affine"],
     ["plant", "sensor", "channel"],
-    ["filter.base", "filter.transform", "filter.update"],
+    ["filter.base", "filter.transform", "filter.correction", "filter.update"],
     ["design"],
     ["filter"],
     ["quantizer"],
-    ["fusion", "fusion_level"],
+    ["intersection", "fusion", "fusion_level"],
     ["network"],
     ["groups", "record", "stream"],
     ["simulate", "simulate_relays", "consistency"],

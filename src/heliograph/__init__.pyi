@@ -58,11 +58,13 @@ from .filter.transform import (
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
 )
+from .filter.correction import (
+    Scalars as Scalars,
+)
 from .filter.update import (
     Interval as Interval,
     LooseInterval as LooseInterval,
     Polytope as Polytope,
-    Scalars as Scalars,
     ZeroMean as ZeroMean,
 )
 from .design.linear_system import (
@@ -119,6 +121,9 @@ from .filter.gaussian import (
     extended_filter as extended_filter,
     gaussian_filter as gaussian_filter,
     mean_gain_filter as mean_gain_filter,
+)
+from .filter.prediction import (
+    prediction_of as prediction_of,
 )
 from .filter.boundedness import (
     Ceiling as Ceiling,
@@ -241,6 +246,9 @@ from .campaign.run import (
 )
 from .campaign.summary import (
     open_results as open_results,
+)
+from .progress import (
+    show_progress as show_progress,
 )
 from .compilation_cache import (
     keep_compilations as keep_compilations,

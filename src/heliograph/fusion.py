@@ -11,15 +11,9 @@ import numpy as np
 from heliograph.check import array, fail, probabilities
 from heliograph.filter.base import Claim, Estimate, weakest
 from heliograph.float64 import compiled
-from heliograph.linalg import psd_solve, symmetrize
+from heliograph.intersection import intersect, intersect_inversely, inverses, trace_optimal_weights
 from heliograph.over_time import OverTime, first, stack
 from heliograph.quantizer import AbstractQuantizer, Quantizer
-
-GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
-ITERATIONS = 60  # of the interior point method; it needs about 12
-CENTERING = 0.1  # complementarity aimed at, relative to the present one
-STEP_BACK = 0.99  # share of the way to the boundary
-SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks to 1e-8, the flat minimum to 1e-16
 
 
 class AbstractFusion(eqx.Module):
@@ -80,7 +74,7 @@ class CovarianceIntersection(AbstractFusion):
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Find the weights and intersect."""
-        information = _inverses(bounds)
+        information = inverses(bounds)
         return intersect(means, information, trace_optimal_weights(information))
 
 
@@ -97,7 +91,7 @@ class EqualIntersection(AbstractFusion):
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Intersect with equal weights."""
         count = means.shape[0]
-        return intersect(means, _inverses(bounds), jnp.full(count, 1 / count))
+        return intersect(means, inverses(bounds), jnp.full(count, 1 / count))
 
 
 class FixedIntersection(AbstractFusion):
@@ -123,7 +117,7 @@ class FixedIntersection(AbstractFusion):
 
     def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
         """Intersect with the given weights."""
-        return intersect(means, _inverses(bounds), jnp.asarray(self.weights))
+        return intersect(means, inverses(bounds), jnp.asarray(self.weights))
 
 
 class WeightedFusion(AbstractFusion):
@@ -173,109 +167,8 @@ class InverseCovarianceIntersection(AbstractFusion):
         """Fuse the first two, the result with the third, and so on."""
         mean, bound = means[0], bounds[0]
         for other_mean, other_bound in zip(means[1:], bounds[1:], strict=True):
-            mean, bound = _inverse_pair(mean, bound, other_mean, other_bound)
+            mean, bound = intersect_inversely(mean, bound, other_mean, other_bound)
         return mean, bound
-
-
-def intersect(means: jax.Array, information: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(sum w J)^-1 sum w J x and (sum w J)^-1, from information matrices J (count, n, n)."""
-    weighted = weights[:, None, None] * information
-    total = weighted.sum(axis=0)
-    bound = _inverse(total)
-    return bound @ jnp.einsum("kij,kj->i", weighted, means), symmetrize(bound)
-
-
-def trace_optimal_weights(information: jax.Array) -> jax.Array:
-    """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
-
-    The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
-    iteration stops when this certificate is below GAP tr P.
-
-    Shapes: (count, n, n) -> (count,).
-    """
-    count = information.shape[0]
-    scaled = information / jnp.mean(jnp.trace(information, axis1=1, axis2=2))
-
-    def unfinished(carry: Any) -> jax.Array:
-        _, _, gap, iteration = carry
-        more: jax.Array = (gap > GAP) & (iteration < ITERATIONS)
-        return more
-
-    def step(carry: Any) -> Any:
-        w, slack, _, iteration = carry
-        _, gradient, hessian = _trace_derivatives(scaled, w)
-        w, slack = _newton_step(w, slack, gradient, hessian)
-        w = w / w.sum()
-        return w, slack, relative_gap(scaled, w), iteration + 1
-
-    w = jnp.full(count, 1 / count)
-    trace, gradient, _ = _trace_derivatives(scaled, w)
-    slack = gradient - gradient.min() + 0.1 * trace
-    start = (w, slack, relative_gap(scaled, w), jnp.asarray(0))
-    weights: jax.Array = jax.lax.while_loop(unfinished, step, start)[0]
-    return weights
-
-
-def relative_gap(information: jax.Array, weights: jax.Array) -> jax.Array:
-    """Certificate max_k tr(P J_k P) / tr P - 1 of how far tr P may be above its minimum, relative to itself."""
-    bound = _inverse(jnp.tensordot(weights, information, axes=1))
-    square = bound @ bound
-    return jnp.max(jnp.einsum("kij,ij->k", information, square)) / jnp.trace(bound) - 1
-
-
-def _trace_derivatives(information: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
-    bound = _inverse(jnp.tensordot(w, information, axes=1))
-    half = jnp.einsum("ij,kjl->kil", bound, information)  # P J_k
-    full = half @ bound
-    return jnp.trace(bound), -jnp.trace(full, axis1=1, axis2=2), 2 * jnp.einsum("kij,lji->kl", half, full)
-
-
-def _newton_step(
-    w: jax.Array, slack: jax.Array, gradient: jax.Array, hessian: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """One step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m."""
-    target = CENTERING * jnp.mean(w * slack)
-    matrix = hessian + jnp.diag(slack / w)
-    sides = jnp.stack([target / w - gradient, jnp.ones_like(w)], axis=1)
-    solved = psd_solve(matrix, sides)
-    multiplier = solved[:, 0].sum() / solved[:, 1].sum()
-    move = solved[:, 0] - multiplier * solved[:, 1]
-    slack_move = (target - slack * move) / w - slack
-    length = jnp.minimum(_longest(w, move), _longest(slack, slack_move))
-    return w + length * move, slack + length * slack_move
-
-
-def _longest(value: jax.Array, move: jax.Array) -> jax.Array:
-    """Largest step, at most 1, that keeps value + step move positive."""
-    return jnp.minimum(1.0, STEP_BACK * jnp.min(jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)))
-
-
-def _inverse_pair(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Inverse covariance intersection of (a, P) and (b, Q), with its weight by golden-section search."""
-    p_information, q_information = _inverse(p), _inverse(q)
-
-    def fused_information(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        common = _inverse(w * p + (1 - w) * q)
-        return p_information + q_information - common, common
-
-    def cost(w: jax.Array) -> jax.Array:
-        return jnp.trace(_inverse(fused_information(w)[0]))
-
-    ratio = (np.sqrt(5) - 1) / 2
-
-    def shrink(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        low, high = ends
-        left, right = high - ratio * (high - low), low + ratio * (high - low)
-        better = cost(left) < cost(right)
-        return jnp.where(better, low, left), jnp.where(better, right, high)
-
-    low, high = jax.lax.fori_loop(0, SEARCH_STEPS, shrink, (jnp.asarray(0.0), jnp.asarray(1.0)))
-    w = (low + high) / 2
-    information, common = fused_information(w)
-    bound = _inverse(information)
-    mean = bound @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
-    return mean, symmetrize(bound)
 
 
 def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
@@ -283,14 +176,6 @@ def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
     if "none" in claims:
         raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
     return weakest([*claims, strongest])
-
-
-def _inverse(a: jax.Array) -> jax.Array:
-    return psd_solve(a, jnp.eye(a.shape[-1]))
-
-
-def _inverses(bounds: jax.Array) -> jax.Array:
-    return jax.vmap(_inverse)(bounds)
 
 
 class Fusion(eqx.Module):

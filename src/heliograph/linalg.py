@@ -1,16 +1,10 @@
-"""Small symmetric matrices: factors, solves and the half-vectorised form.
-
-Loops over rows are unrolled when traced (the matrices of state estimation are small), so that a batch of runs
-becomes elementwise arithmetic that vectorises, instead of one library call per matrix.
-"""
+"""Small symmetric matrices: products, factors and solves, fast for batches of runs."""
 
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import cho_solve
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
-UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
-PIVOT_TOLERANCE = 1e-14  # relative to the largest diagonal entry: a pivot this small is zero up to rounding
+from heliograph.small_matrix import PIVOT_TOLERANCE, UNROLL_LIMIT, factor, runs_last, solve
 
 
 def symmetrize(a: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -26,25 +20,28 @@ def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
 
     Shapes: (n, n) -> (n, n).
     """
-    n = a.shape[-1]
+    return _long_cholesky(a) if a.shape[-1] > UNROLL_LIMIT else _short_cholesky(jnp.asarray(a))
 
-    def eliminate(j: int | Int[Array, ""], carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
-        a, factor = carry
+
+@runs_last
+def _short_cholesky(a: jax.Array) -> jax.Array:
+    return jnp.stack(factor(a)[0], axis=1)
+
+
+def _long_cholesky(a: jax.Array) -> jax.Array:
+    n = a.shape[-1]
+    tolerance = PIVOT_TOLERANCE * jnp.max(jnp.abs(jnp.diagonal(a)))
+
+    def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        a, done = carry
         pivot = a[j, j]
         root = jnp.where(pivot > tolerance, jnp.sqrt(pivot), jnp.nan)
         scale = jnp.where(jnp.abs(pivot) <= tolerance, 0.0, 1 / root)
         column = jnp.where(jnp.arange(n) >= j, a[:, j] * scale, 0.0)
-        return a - jnp.outer(column, column), factor.at[:, j].set(column)  # a: the Schur complement of the pivot
+        return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
 
-    tolerance = PIVOT_TOLERANCE * jnp.max(jnp.abs(jnp.diagonal(a)))
-    carry = (jnp.asarray(a), jnp.zeros_like(a))
-    if n > UNROLL_LIMIT:
-        carry = jax.lax.fori_loop(0, n, eliminate, carry)
-    else:
-        for j in range(n):
-            carry = eliminate(j, carry)
-    factor: jax.Array = carry[1]
-    return factor
+    result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
+    return result
 
 
 def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -52,16 +49,7 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n
 
     Shapes: (n, n), (n, k) -> (n, k). An indefinite A gives NaN.
     """
-    n = a.shape[-1]
-    if n > UNROLL_LIMIT:
-        return jnp.asarray(cho_solve((jnp.linalg.cholesky(a), True), b))
-    factor = cholesky(a)
-    forward: list[jax.Array] = []
-    for i in range(n):  # L Y = B
-        known = sum((factor[i, j] * forward[j] for j in range(i)), jnp.zeros_like(b[i]))
-        forward.append((b[i] - known) / factor[i, i])
-    backward: list[jax.Array] = [jnp.zeros_like(b[0])] * n
-    for i in reversed(range(n)):  # L' X = Y
-        known = sum((factor[j, i] * backward[j] for j in range(i + 1, n)), jnp.zeros_like(b[i]))
-        backward[i] = (forward[i] - known) / factor[i, i]
-    return jnp.stack(backward)
+    return _solve(jnp.asarray(a), jnp.asarray(b))
+
+
+_solve = runs_last(solve)

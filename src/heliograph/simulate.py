@@ -116,14 +116,16 @@ def _flat(leaf: np.ndarray) -> np.ndarray:
     return leaf.reshape(-1, *leaf.shape[2:])
 
 
+@eqx.filter_jit
 def _block(network: Network, u: Any, key: jax.Array, runs: jax.Array) -> Any:
     """Trajectories of one block of runs."""
     parts = groups(network)
     return jax.vmap(lambda index: _one_run(network, parts, u, jax.random.fold_in(key, index)))(runs)
 
 
+@eqx.filter_jit
 def _initial(network: Network, u: Any, key: jax.Array, reducer: AbstractReducer) -> Any:
-    """What the reducer holds before the first block."""
+    """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
     shapes = eqx.filter_eval_shape(_block, network, u, key, np.arange(BLOCK))
     return reducer.initial(shapes)
 

@@ -5,8 +5,8 @@ import pytest
 from heliograph import cli
 from heliograph.campaign.figures import NEES, RMSE, against, by_setting, campaign_figures
 from heliograph.campaign.page import campaign_page
-from heliograph.campaign.show import Countdown, spoken
 from heliograph.campaign.summary import read_summary
+from heliograph.progress import Countdown, spoken
 from tests.campaign.example import CAMPAIGN, write
 
 

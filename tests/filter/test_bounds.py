@@ -8,7 +8,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.filter.transform import PolynomialMoments
-from heliograph.filter.update import Signal
+from heliograph.filter.correction import Signal
 from tests import machine
 from tests.filter.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG

@@ -10,13 +10,15 @@ import numpy as np
 from heliograph.channel import Channel, check_link, mean_gain
 from heliograph.check import array, covariance
 from heliograph.filter.base import AbstractFilter, Claim, Estimate
+from heliograph.filter.correction import Signal
 from heliograph.filter.transform import AbstractTransform, Cubature, Linearization
-from heliograph.filter.update import AbstractUpdate, Polytope, Signal
+from heliograph.filter.update import AbstractUpdate, Polytope
 from heliograph.float64 import compiled, in_float64
 from heliograph.over_time import OverTime, at, first, over_time, unstack
 from heliograph.plant import AnyPlant
 from heliograph.random_affine.second_order import SecondOrder
 from heliograph.sensor import AnySensor, is_linear
+from heliograph.small_matrix import runs_last, times_vector
 
 
 class Belief(NamedTuple):
@@ -73,12 +75,18 @@ class GaussianFilter(AbstractFilter):
 
 def corrected(prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array) -> Belief:
     """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
+    gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
+    return _use(prior, gain, bound, signal.mean, channel, z)
+
+
+@runs_last
+def _use(
+    prior: Belief, gain: jax.Array, bound: jax.Array, expected: jax.Array, channel: SecondOrder, z: jax.Array
+) -> Belief:
     present = ~jnp.isnan(z)
-    gain, bound = update.correct(prior.covariance, signal, channel, present)
-    expected = channel.gain @ signal.mean + channel.offset
-    innovation = jnp.where(present, z - expected, 0.0)
-    covariance_after = jnp.where(jnp.any(present), bound, prior.covariance)
-    return Belief(prior.mean + gain @ innovation, covariance_after)
+    innovation = jnp.where(present, z - times_vector(channel.gain, expected) - channel.offset, 0.0)
+    covariance_after = jnp.where(jnp.any(present, axis=0), bound, prior.covariance)
+    return Belief(prior.mean + times_vector(gain, innovation), covariance_after)
 
 
 def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:

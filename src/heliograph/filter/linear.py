@@ -10,9 +10,10 @@ import numpy as np
 from heliograph.channel import Channel, check_link
 from heliograph.check import array, covariance, fail
 from heliograph.filter.base import AbstractFilter, Claim, Estimate
+from heliograph.filter.correction import Signal
 from heliograph.filter.gaussian import Belief, describe
 from heliograph.filter.transform import AbstractTransform, Cubature
-from heliograph.filter.update import Polytope, Signal
+from heliograph.filter.update import Polytope
 from heliograph.float64 import compiled, in_float64
 from heliograph.over_time import OverTime, at, first
 from heliograph.plant import AnyPlant, LinearPlant

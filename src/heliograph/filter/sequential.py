@@ -6,12 +6,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.check import fail
 from heliograph.filter.base import AbstractFilter, Claim, Estimate, weakest
 from heliograph.filter.gaussian import Belief, GaussianFilter
 from heliograph.float64 import compiled, in_float64
-from heliograph.over_time import OverTime, first
+from heliograph.over_time import OverTime, alike, first, stack
 
 
 class SequentialFilter(AbstractFilter):
@@ -34,12 +35,23 @@ class SequentialFilter(AbstractFilter):
     @compiled
     def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
         """Predict over step k, then use what arrived from each node."""
-        after, start = self.filters[0].predict(state, u, k), 0
-        measurements: jax.Array = jnp.asarray(z, dtype=float)
-        for item, length in zip(self.filters, self.lengths, strict=True):
-            after = item.correct(after, measurements[start : start + length], k)
-            start += length
+        after = self.filters[0].predict(state, u, k)
+        after = self._correct(after, jnp.asarray(z, dtype=float), k)
         return after, Estimate(after.mean, after.covariance, self.claim)
+
+    def _correct(self, prior: Belief, z: jax.Array, k: Any) -> Belief:
+        if all(alike(item, self.filters[0]) for item in self.filters):  # one correction compiled, run over the nodes
+            arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
+
+            def correct(belief: Belief, item: tuple[Any, jax.Array]) -> tuple[Belief, None]:
+                one: GaussianFilter = eqx.combine(item[0], rest)
+                return one.correct(belief, item[1], k), None
+
+            return jax.lax.scan(correct, prior, (arrays, z.reshape(len(self.filters), -1)))[0]
+        ends = np.cumsum(self.lengths)
+        for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
+            prior = item.correct(prior, part, k)
+        return prior
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.check import check_count, fail
-from heliograph.linalg import cholesky, symmetrize
+from heliograph.linalg import cholesky
+from heliograph.small_matrix import add, runs_last, symmetric, times, transpose
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
 
@@ -42,13 +43,33 @@ class Cubature(AbstractTransform):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Propagate the points and take their sample moments."""
-        n = mean.shape[0]
-        offsets = jnp.sqrt(float(n)) * cholesky(covariance).T  # row j: sqrt(n) L e_j
-        deviations = jnp.concatenate([offsets, -offsets])
-        values = jax.vmap(function)(mean + deviations)
-        center = values.mean(axis=0)
-        spread = values - center
-        return Transformed(center, spread.T @ spread / (2 * n), deviations.T @ spread / (2 * n))
+        offsets, points = _cubature_points(mean, cholesky(covariance))
+        return _cubature_moments(offsets, jax.vmap(function, in_axes=1, out_axes=1)(points))
+
+
+@runs_last
+def _cubature_points(mean: jax.Array, factor: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Offsets sqrt(n) L (n, n), and the points mean + offsets, mean - offsets as columns (n, 2 n)."""
+    offsets = mean.shape[0] ** 0.5 * factor
+    return offsets, jnp.concatenate([mean[:, None] + offsets, mean[:, None] - offsets], axis=1)
+
+
+def _cubature_moments(offsets: jax.Array, values: jax.Array) -> Transformed:
+    """Sample moments of values (m, 2 n) in the order of the points."""
+    return _about(offsets, values, _center(values))
+
+
+@runs_last
+def _center(values: jax.Array) -> jax.Array:
+    return add([values[:, j] for j in range(values.shape[1])]) / values.shape[1]
+
+
+@runs_last
+def _about(offsets: jax.Array, values: jax.Array, center: jax.Array) -> Transformed:
+    n = offsets.shape[0]
+    spread = values - center[:, None]
+    cross = times(offsets, transpose(values[:, :n] - values[:, n:])) / (2 * n)
+    return Transformed(center, times(spread, transpose(spread)) / (2 * n), cross)
 
 
 class Linearization(AbstractTransform):
@@ -56,9 +77,14 @@ class Linearization(AbstractTransform):
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
         """Evaluate f and its Jacobian at the mean."""
-        jacobian = jax.jacfwd(function)(mean)
-        cross = covariance @ jacobian.T
-        return Transformed(function(mean), symmetrize(jacobian @ cross), cross)
+        return Transformed(function(mean), *_linear_moments(covariance, jax.jacfwd(function)(mean)))
+
+
+@runs_last
+def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """J P J' and P J'."""
+    cross = times(covariance, transpose(jacobian))
+    return symmetric(times(jacobian, cross)), cross
 
 
 class PolynomialMoments(AbstractTransform):

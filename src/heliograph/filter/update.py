@@ -9,47 +9,15 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.check import array, fail
-from heliograph.linalg import psd_solve, symmetrize
+from heliograph.filter.correction import Scalars, Signal, young_correction, zero_mean_correction
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.second_order import QuadraticMap, SecondOrder, second_order, symmetric_product
-
-SWEEPS = 200  # most alternations between gain and scalars; each lowers the jointly convex trace
-SETTLED = 1e-8  # relative change of the scalars; the trace is flat there, so its error is of second order
-SMALLEST_SCALAR = 1e-12  # keeps 1/beta finite where nothing is gained by a larger one
-
-
-class Signal(NamedTuple):
-    """The sensor's signal as the filter sees it before the measurement.
-
-    mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m).
-    """
-
-    mean: jax.Array
-    covariance: jax.Array
-    cross: jax.Array
-    second: jax.Array
-
-
-class Scalars(eqx.Module):
-    """Fixed positive scalars (beta_1, beta_2) of Young's inequality, as published bounds use them.
-
-    Raises:
-        ValueError: a scalar that is not positive.
-    """
-
-    values: np.ndarray
-
-    def __init__(self, first: float, second: float):
-        self.values = array("scalars of the bound", [first, second], (2,))
-        if np.any(self.values <= 0):
-            raise fail("scalars of the bound", "two positive numbers", (first, second))
 
 
 class AbstractUpdate(eqx.Module):
@@ -116,26 +84,7 @@ class ZeroMean(AbstractUpdate):
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Minimise the trace over K, and over beta unless it is fixed."""
-        m = signal.mean.shape[0]
-        known_part = homogeneous(signal.second - signal.covariance, signal.mean)
-        own = homogeneous(signal.covariance, jnp.zeros(m)).at[m, m].set(0.0)
-        base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
-        cross = jnp.where(present[:, None], channel.gain @ signal.cross.T, 0.0)
-        if not channel.uncertain:
-            return gain_and_bound(prior, cross, base)
-        shift = channel.shift(own, present)
-        explained = symmetrize(signal.cross @ psd_solve(signal.covariance, signal.cross.T))
-
-        def omega(beta: jax.Array) -> jax.Array:
-            return base + shift / beta
-
-        def refine(beta: jax.Array) -> jax.Array:
-            k = psd_solve(omega(beta), cross).T
-            return jnp.maximum(jnp.sqrt(jnp.trace(k @ shift @ k.T) / jnp.trace(explained)), SMALLEST_SCALAR)
-
-        beta = settle(refine, jnp.asarray(0.1)) if self.scalar is None else jnp.asarray(self.scalar)
-        gain, bound = gain_and_bound(prior, cross, omega(beta))
-        return gain, bound + beta * explained
+        return zero_mean_correction(prior, signal, channel, present, self.scalar)
 
 
 class Interval(AbstractUpdate):
@@ -236,61 +185,3 @@ def _interval_description(channel: AbstractRandomAffine, variance: Callable[[_Ho
     zero = np.zeros_like(noise)
     parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
     return SecondOrder(gain, np.zeros(len(noise)), *parts, shift > 0)
-
-
-def young_correction(
-    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Scalars | None
-) -> tuple[jax.Array, jax.Array]:
-    """The update of `Polytope` for any description of the channel."""
-    w = homogeneous(signal.second, signal.mean)
-    mean_part = jnp.where(present[:, None] & present[None, :], channel.gain @ signal.covariance @ channel.gain.T, 0.0)
-    base = channel.spread(w, present) + absent(present)
-    cross = jnp.where(present[:, None], channel.gain @ signal.cross.T, 0.0)
-    if not channel.uncertain:
-        return gain_and_bound(prior, cross, base + mean_part)
-    shift = channel.shift(w, present)
-
-    def omega(beta: jax.Array) -> jax.Array:
-        return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
-
-    def refine(beta: jax.Array) -> jax.Array:
-        k = psd_solve(omega(beta), cross).T
-        moved = jnp.trace(k @ shift @ k.T)
-        ratios = jnp.stack([moved / jnp.trace(prior), moved / jnp.trace(k @ mean_part @ k.T)])
-        return jnp.maximum(jnp.sqrt(jnp.nan_to_num(ratios, posinf=0.0)), SMALLEST_SCALAR)
-
-    beta = settle(refine, jnp.asarray([0.1, 0.1])) if scalars is None else jnp.asarray(scalars.values)
-    gain, bound = gain_and_bound(prior, cross, omega(beta))
-    return gain, bound + beta[0] * prior
-
-
-def settle(refine: Callable[[jax.Array], jax.Array], start: jax.Array) -> jax.Array:
-    """Apply `refine` until its values stop changing."""
-
-    def moving(carry: tuple[jax.Array, jax.Array, jax.Array]) -> jax.Array:
-        beta, previous, sweeps = carry
-        return (sweeps < SWEEPS) & jnp.any(jnp.abs(beta - previous) > SETTLED * beta)
-
-    def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        beta, _, sweeps = carry
-        return refine(beta), beta, sweeps + 1
-
-    beta: jax.Array = jax.lax.while_loop(moving, sweep, (refine(start), start, jnp.asarray(1)))[0]
-    return beta
-
-
-def homogeneous(second: jax.Array, mean: jax.Array) -> jax.Array:
-    """E[(y, 1)(y, 1)'] from E[y y'] and E[y]."""
-    top = jnp.concatenate([second, mean[:, None]], axis=1)
-    return jnp.concatenate([top, jnp.append(mean, 1.0)[None, :]], axis=0)
-
-
-def absent(present: jax.Array) -> jax.Array:
-    """Unit variance for components that did not arrive, so that the reduced system keeps its full size."""
-    return jnp.diag(jnp.where(present, 0.0, 1.0))
-
-
-def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """K = C' Omega^-1 and P - C' Omega^-1 C, which minimise P - K C - C' K' + K Omega K'."""
-    gain = psd_solve(omega, cross).T
-    return gain, symmetrize(prior - gain @ cross)

@@ -9,6 +9,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.monomials import exponents
+from heliograph.small_matrix import add, contract, diagonal
 
 PROPORTIONAL_TOLERANCE = 1e-12  # relative: two tensors computed by different sums are one multiple of the other
 
@@ -28,9 +29,9 @@ class QuadraticMap(eqx.Module):
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
         mask = present[:, None] & present[None, :]
-        center = jnp.where(mask, jnp.einsum("ijab,ab->ij", self.center, second_moment), 0.0)
-        entries = jnp.where(mask, jnp.einsum("ijab,ab->ij", self.radius, jnp.abs(second_moment)), 0.0)
-        return center + jnp.diag(entries.sum(axis=1))
+        center = jnp.where(mask, contract(self.center, second_moment), 0.0)
+        entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
+        return center + diagonal(add([entries[:, j] for j in range(entries.shape[1])]))
 
 
 class SecondOrder(eqx.Module):

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 import heliograph as hg
 from heliograph.filter.base import AbstractFilter, Claim, Estimate
+from heliograph.filter.correction import Signal
 from heliograph.filter.gaussian import Belief, GaussianFilter, corrected
-from heliograph.filter.update import AbstractUpdate, Signal
+from heliograph.filter.update import AbstractUpdate
 from heliograph.float64 import compiled
 from heliograph.linalg import cholesky
 from heliograph.over_time import at

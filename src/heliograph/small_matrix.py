@@ -1,0 +1,164 @@
+"""Arithmetic on batches of small matrices, written once for one matrix and for many.
+
+The leading axes of an array are the matrix's own; any further axes (runs) are carried along elementwise, so the runs
+are innermost in memory, a[i, j] is a contiguous vector over them, and loops over them vectorise. `runs_last` makes vmap
+feed a kernel like that. Larger matrices go to the library.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.scipy.linalg import cho_solve
+
+UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
+PIVOT_TOLERANCE = 1e-14  # relative to the largest diagonal entry: a pivot this small is zero up to rounding
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
+    """Have vmap put its axis last in every argument and result of a kernel; derivatives are those of its arithmetic."""
+    traced = jax.jit(kernel)  # once per shapes, however many filters use it
+    batched = custom_vmap(lambda *args: jax.lax.platform_dependent(*args, cpu=_alone(traced), default=traced))
+
+    @batched.def_vmap
+    def rule(size: int, is_batched: Any, *args: Any) -> Any:
+        moved = jax.tree.map(_to_last, args, tuple(is_batched))
+        results = jax.tree.map(lambda x: _to_first(x, size), batched(*moved))
+        return results, jax.tree.map(lambda _: True, results)
+
+    differentiable = jax.custom_jvp(batched)
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(kernel, primals, tangents))
+    return wraps(kernel)(differentiable)
+
+
+def _alone(kernel: Callable[..., Any]) -> Callable[..., Any]:
+    """The kernel as the branch of a conditional that is always taken, since the compiler fuses nothing across it.
+
+    Without it (barriers are dropped for processors) a covariance is computed again inside each of its uses. The
+    condition hangs on the data, or the compiler would see through it: a number's bits with the last one set are not 0.
+    """
+
+    def call(*args: Any) -> Any:
+        number = next(leaf for leaf in jax.tree.leaves(args) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
+        taken = jnp.any((jnp.ravel(number)[:1].view(jnp.uint32) | 1) != 0)
+        shapes = jax.eval_shape(kernel, *args)
+        return jax.lax.cond(
+            taken, kernel, lambda *_: jax.tree.map(lambda s: jnp.zeros(s.shape, s.dtype), shapes), *args
+        )
+
+    return call
+
+
+def _to_last(x: Any, is_batched: bool) -> jax.Array:
+    return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
+
+
+def _to_first(x: jax.Array, size: int) -> jax.Array:
+    return jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], size)), -1, 0)
+
+
+def transpose(a: jax.Array | np.ndarray) -> jax.Array:
+    """A', (n, m, ...)."""
+    return jnp.swapaxes(a, 0, 1)
+
+
+def symmetric(a: jax.Array) -> jax.Array:
+    """(A + A') / 2."""
+    return (a + transpose(a)) / 2
+
+
+def add(terms: Sequence[Any]) -> jax.Array:
+    """Sum of terms one by one: a library reduction over a short axis costs more than all its additions."""
+    total: jax.Array = sum(terms[1:], terms[0])
+    return total
+
+
+def times(a: jax.Array | np.ndarray, b: jax.Array) -> jax.Array:
+    """A B, as a sum of columns of A times rows of B."""
+    inner = b.shape[0]
+    if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
+        return jnp.einsum("ij...,jk...->ik...", a, b)
+    return add([a[:, j, None] * b[None, j] for j in range(inner)])
+
+
+def times_vector(a: jax.Array | np.ndarray, x: jax.Array) -> jax.Array:
+    """A x."""
+    return times(a, x[:, None])[:, 0]
+
+
+def congruence(a: jax.Array | np.ndarray, p: jax.Array) -> jax.Array:
+    """A P A'."""
+    return times(times(a, p), transpose(a))
+
+
+def inner(a: jax.Array, b: jax.Array) -> jax.Array:
+    """tr(A' B)."""
+    return add([a[i, j] * b[i, j] for i in range(a.shape[0]) for j in range(a.shape[1])])
+
+
+def trace(a: jax.Array) -> jax.Array:
+    """tr A."""
+    return add([a[i, i] for i in range(a.shape[0])])
+
+
+def diagonal(d: jax.Array) -> jax.Array:
+    """diag(d)."""
+    n = d.shape[0]
+    return d[None] * jnp.eye(n).reshape(n, n, *[1] * (d.ndim - 1))
+
+
+def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Columns of the lower factor, (n, ...) each, and the reciprocals of its diagonal (zero for a zero column).
+
+    Column by column: what is left of a column after those before it, times the reciprocal root of its pivot.
+    """
+    n = a.shape[0]
+    tolerance = PIVOT_TOLERANCE * jnp.max(jnp.abs(jnp.stack([a[i, i] for i in range(n)])), axis=0)
+    columns: list[jax.Array] = []
+    scales: list[jax.Array] = []
+    for j in range(n):
+        rest = add([a[j:, j], *(-c[j:] * c[j] for c in columns)])
+        root = jnp.where(rest[0] > tolerance, jnp.sqrt(rest[0]), jnp.nan)
+        scales.append(jnp.where(jnp.abs(rest[0]) <= tolerance, 0.0, 1 / root))
+        columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
+    return columns, scales
+
+
+def solve(a: jax.Array, b: jax.Array) -> jax.Array:
+    """X with A X = B for a positive definite A; NaN for any other."""
+    n = a.shape[0]
+    if n > UNROLL_LIMIT:
+        return _each(lambda a, b: jnp.asarray(cho_solve((jnp.linalg.cholesky(a), True), b)), a, b)
+    columns, scales = factor(a)
+    scales = [jnp.where(s == 0, jnp.nan, s) for s in scales]
+    forward: list[jax.Array] = []
+    for i in range(n):  # L Y = B
+        forward.append(add([b[i], *(-columns[j][i] * forward[j] for j in range(i))]) * scales[i])
+    backward = forward[:]
+    for i in reversed(range(n)):  # L' X = Y
+        backward[i] = add([forward[i], *(-columns[i][j] * backward[j] for j in range(i + 1, n))]) * scales[i]
+    return jnp.stack(backward)
+
+
+def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
+    """A function of two single matrices, for each of the further axes."""
+    shape = jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
+    a, b = (jnp.broadcast_to(x, (*x.shape[:2], *shape)) for x in (a, b))
+    for _ in shape:
+        function = jax.vmap(function, in_axes=-1, out_axes=-1)
+    return function(a, b)
+
+
+def contract(tensor: jax.Array | np.ndarray, matrix: jax.Array) -> jax.Array:
+    """sum_ab T_ijab W_ab."""
+    n = matrix.shape[0]
+    if n > UNROLL_LIMIT // 2:
+        return jnp.einsum("ijab...,ab...->ij...", tensor, matrix)
+    return add([tensor[:, :, a, b] * matrix[a, b] for a in range(n) for b in range(n)])
