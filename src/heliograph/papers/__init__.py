@@ -4,4 +4,5 @@ METHODS: dict[str, str] = {  # the module whose `reproduce(out, runs, seed)` it 
     "cubature-fusion": "heliograph.papers.cubature_fusion.run",
     "successive-relays": "heliograph.papers.successive_relays.run",
     "quadratic-bias": "heliograph.papers.quadratic_bias.run",
+    "h-infinity-fusion": "heliograph.papers.h_infinity_fusion.run",
 }

@@ -1,0 +1,152 @@
+"""The disturbance that a filter stands worst: a lower bound on its true H-infinity level, whatever a design claims.
+
+The ratio sum E|M e|^2 / (sum |v|^2 + |rho|^2 + xi_0' W xi_0) is climbed over all w = (x_0, e_0, v, rho) of one energy,
+E over a fixed set of draws of the channel. At w the direction is the gradient: if the error were linear in w this is
+the power method. What is found is judged on new draws, so the search cannot flatter it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as hg
+
+SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken
+FIRST = (1.0, 1.0, 0.1, 1e-3)  # sizes of x_0, e_0, v, rho where a climb starts; where it ends they are what they are
+
+
+class World(eqx.Module):
+    """x+ = f(x, k) + B v, y = h(x) + D v, received = G y + N rho, z = M x, over the steps of `inputs`.
+
+    Shapes: disturbance (n, v), feedthrough (y, v), wanted (z, n), weight (2n, 2n), inputs (time, inputs) of the filter.
+    """
+
+    dynamics: Callable[[Any, Any], Any] = eqx.field(static=True)
+    measure: Callable[[Any], Any] = eqx.field(static=True)
+    disturbance: np.ndarray
+    feedthrough: np.ndarray
+    wanted: np.ndarray
+    weight: np.ndarray
+    inputs: np.ndarray
+
+
+class Draws(NamedTuple):
+    """Gains G (draw, time, m, y) and noise gains N (draw, time, m, r) of a channel."""
+
+    gain: np.ndarray
+    noise: np.ndarray
+
+
+class Disturbance(NamedTuple):
+    """x_0, e_0 (n,), v (time, v), rho (time, r)."""
+
+    state: Any
+    error: Any
+    plant: Any
+    channel: Any
+
+
+class Worst(NamedTuple):
+    """The root of the largest ratio found, on new draws, its standard error, and the disturbance."""
+
+    level: float
+    standard_error: float
+    disturbance: Disturbance
+
+
+def worst_disturbance(
+    filter: hg.AbstractFilter,
+    world: World,
+    draws: Draws,
+    new_draws: Draws,
+    energies: Any,
+    seed: int = 0,
+    starts: int = 4,
+    rounds: int = 60,
+) -> Worst:
+    """Climb from `starts` random disturbances of each of the energies, and judge the best one on new draws."""
+    (time, _), n = world.inputs.shape, world.wanted.shape[1]
+    sizes = (n,), (n,), (time, world.disturbance.shape[1]), (time, draws.noise.shape[-1])
+    random, each = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
+    points = Disturbance(*(s * random.normal(size=(len(each), *size)) for s, size in zip(FIRST, sizes, strict=True)))
+    with jax.enable_x64(True):
+        found, reached = jax.tree.map(np.asarray, _climb(filter, world, draws, points, each, rounds))
+        best = Disturbance(*(part[int(np.argmax(reached))] for part in found))
+        output = np.asarray(_output_energy(filter, world, new_draws, best))
+        energy = float(_energy(world, best))
+    ratio = output / energy
+    level = float(np.sqrt(ratio.mean()))
+    return Worst(level, float(ratio.std(ddof=1) / np.sqrt(len(ratio)) / (2 * level)), best)
+
+
+@eqx.filter_jit
+def _climb(
+    filter: hg.AbstractFilter, world: World, draws: Draws, points: Disturbance, energies: Any, rounds: int
+) -> tuple[Disturbance, jax.Array]:
+    """Points of each energy and the ratios reached."""
+
+    def gained(w: Disturbance) -> jax.Array:
+        return jnp.mean(_output_energy(filter, world, draws, w))
+
+    def one(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
+        def improve(w: Disturbance, _: Any) -> tuple[Disturbance, jax.Array]:
+            uphill = _scaled(world, _raised(world, jax.grad(gained)(w)), energy)
+            tries = jax.vmap(lambda t: _scaled(world, _between(w, uphill, t), energy))(jnp.append(0.0, SHARES))
+            values = jax.lax.map(gained, tries)
+            best = jnp.argmax(values)
+            return jax.tree.map(lambda leaf: leaf[best], tries), values[best]
+
+        w, values = jax.lax.scan(improve, _scaled(world, point, energy), None, length=rounds)
+        return w, values[-1] / energy
+
+    result: tuple[Disturbance, jax.Array] = jax.vmap(one)(points, jnp.asarray(energies))
+    return result
+
+
+def _between(a: Disturbance, b: Disturbance, share: Any) -> Disturbance:
+    return Disturbance(*((1 - share) * p + share * q for p, q in zip(a, b, strict=True)))
+
+
+def _stacked(w: Disturbance) -> jax.Array:
+    return jnp.concatenate([w.state, w.error])
+
+
+def _energy(world: World, w: Disturbance) -> jax.Array:
+    start = _stacked(w)
+    return jnp.sum(w.plant**2) + jnp.sum(w.channel**2) + start @ world.weight @ start
+
+
+def _scaled(world: World, w: Disturbance, energy: Any) -> Disturbance:
+    factor = jnp.sqrt(energy / _energy(world, w))
+    return Disturbance(*(factor * part for part in w))
+
+
+def _raised(world: World, gradient: Disturbance) -> Disturbance:
+    """The gradient as a disturbance: in the metric in which energy is measured."""
+    state, error = jnp.split(jnp.linalg.solve(world.weight, _stacked(gradient)), 2)
+    return gradient._replace(state=state, error=error)
+
+
+@eqx.filter_jit
+def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
+    """sum |M e|^2 for each draw, (draw,)."""
+
+    def one(gains: Any, noises: Any) -> jax.Array:
+        def step(carry: Any, item: Any) -> tuple[Any, jax.Array]:
+            x, state = carry
+            k, u, v, rho, gain, noise = item
+            z = gain @ (world.measure(x) + world.feedthrough @ v) + noise @ rho
+            state, estimate = filter.step(state, z, u, k)
+            missed = world.wanted @ (x - estimate.mean)
+            return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
+
+        begin = jax.tree.map(jnp.asarray, filter.init())._replace(mean=w.state - w.error)
+        items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
+        return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
+
+    result: jax.Array = jax.vmap(one)(*draws)
+    return result
