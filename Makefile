@@ -24,8 +24,8 @@ test: .venv/.test  ## Lint, check types and run the tests
 	$(BIN)/mypy --strict src
 	$(BIN)/pytest -n 2
 
-bench: .venv/.test  ## Run the benchmarks
-	@for file in benchmarks/*.py; do echo "$$file"; $(BIN)/python "$$file" || exit 1; done
+bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
+	@$(BIN)/python benchmarks/run.py
 
 clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache

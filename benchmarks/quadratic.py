@@ -1,12 +1,18 @@
 """Time of one covariance step of the quadratic filter: half-vectorised against the full Kronecker square.
 
-Run: OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 python benchmarks/quadratic.py (threads would hide the operation count).
-Prints one row per dimension of state plus bias. Both forms run the library's own
-`covariance_step` on the same model; the full one has y (x) y with every product twice.
+Run: python benchmarks/quadratic.py, on one thread (more would hide the operation count). Prints one row per dimension
+of state plus bias. Both forms run the library's own `covariance_step` on the same model; the full one has y (x) y with
+every product twice.
 """
+
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import time
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -60,18 +66,44 @@ def seconds(call: Callable[[], object], dimension: int) -> float:
     return float(best)
 
 
+class Row(NamedTuple):
+    """Sizes, seconds and relative difference of the two forms."""
+
+    half: int
+    full: int
+    fast: float
+    slow: float
+    gap: float
+
+
+def row(dimension: int) -> Row:
+    """Both forms at one dimension."""
+    system = square_of(dimension)
+    full, start, copy = duplicated(system, dimension)
+    step, spread = system.step(1), system.covariance
+    fast = seconds(lambda: covariance_step(spread, step), dimension)
+    slow = seconds(lambda: covariance_step(start, full), dimension)
+    a, b = covariance_step(spread, step).covariance, covariance_step(start, full).covariance
+    gap = float(np.abs(copy @ a @ copy.T - b).max() / np.abs(b).max())
+    return Row(len(spread), len(start), fast, slow, gap)
+
+
+def measure() -> dict[str, Any]:
+    """Milliseconds of a step in both forms."""
+    values = {}
+    for dimension in DIMENSIONS:
+        r = row(dimension)
+        values[f"dimension {dimension}, half-vectorised"] = 1e3 * r.fast
+        values[f"dimension {dimension}, full square"] = 1e3 * r.slow
+    return {"unit": "ms", "values": values, "at_most": {}}
+
+
 def main() -> None:
     print("dimension  half  full  half (ms)  full (ms)  ratio  difference")
     for dimension in DIMENSIONS:
-        system = square_of(dimension)
-        full, start, copy = duplicated(system, dimension)
-        step, spread = system.step(1), system.covariance
-        fast = seconds(lambda: covariance_step(spread, step), dimension)  # noqa: B023
-        slow = seconds(lambda: covariance_step(start, full), dimension)  # noqa: B023
-        a, b = covariance_step(spread, step).covariance, covariance_step(start, full).covariance
-        gap = np.abs(copy @ a @ copy.T - b).max() / np.abs(b).max()
-        sizes = f"{dimension:>9} {len(spread):>5} {len(start):>5}"
-        print(f"{sizes} {1e3 * fast:>10.4f} {1e3 * slow:>10.4f} {slow / fast:>6.2f} {gap:>11.1e}")
+        r = row(dimension)
+        sizes = f"{dimension:>9} {r.half:>5} {r.full:>5}"
+        print(f"{sizes} {1e3 * r.fast:>10.4f} {1e3 * r.slow:>10.4f} {r.slow / r.fast:>6.2f} {r.gap:>11.1e}")
 
 
 if __name__ == "__main__":

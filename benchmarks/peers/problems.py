@@ -1,0 +1,103 @@
+"""The two problems that every program solves, drawn with a fixed seed, and the least work that a step of each needs."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+Arrays = dict[str, np.ndarray]
+
+
+class Problem(NamedTuple):
+    """Arrays for the programs' input file, and the least arithmetic (flops) and traffic (bytes) of a step of a run."""
+
+    title: str
+    arrays: Arrays
+    flops: int
+    bytes: int
+
+
+def kalman(runs: int = 10_000, steps: int = 100) -> Problem:
+    """x+ = A x + w, z = diag(g) C x + n with n = 4, m = 2; gains g known to the filter, others at each step and run."""
+    draw = np.random.default_rng(20)
+    n, m = 4, 2
+    a = draw.normal(size=(n, n))
+    a *= 0.95 / np.abs(np.linalg.eigvals(a)).max()
+    c, q, r = draw.normal(size=(m, n)), 0.1 * np.eye(n), 0.2 * np.eye(m)
+    gains = draw.rayleigh(np.sqrt(0.5), size=(runs, steps, m))
+    z, x = np.empty((runs, steps, m)), draw.normal(size=(runs, n))
+    for k in range(steps):
+        x = x @ a.T + np.sqrt(0.1) * draw.normal(size=(runs, n))
+        z[:, k] = gains[:, k] * (x @ c.T) + np.sqrt(0.2) * draw.normal(size=(runs, m))
+    arrays = {"A": a, "C": c, "Q": q, "R": r, "mean": np.zeros(n), "covariance": np.eye(n), "gains": gains, "z": z}
+    title = f"Kalman step, {n} states, {m} measurements, a known random gain at each step and run"
+    return Problem(title, arrays, kalman_flops(n, m), 8 * (m + m + n))
+
+
+def kalman_flops(n: int, m: int) -> int:
+    """Multiplications and additions of a textbook step, of symmetric results one half: prediction, then update."""
+    half = n * (n + 1)  # twice the entries of a symmetric matrix: one multiplication and one addition each
+    prediction = 2 * n**2 + 2 * n**3 + half * n + half // 2  # A m, A P, (A P) A', + Q
+    innovation = m * n + 2 * m * n**2 + m * (m + 1) * n + m  # diag(g) C = H, H P, (H P) H', + R
+    gain = m**3 // 3 + 2 * m**2 * n  # factor, and two triangular solves with n right-hand sides
+    return prediction + innovation + gain + 4 * m * n + half * m  # z - H m, m + K (...), P - K (H P)
+
+
+# The induction machine of the cubature fusion paper, one node, in the strong scenario with known laws of the gains.
+MACHINE = {"h": 0.1, "k1": 2.0, "k2": 2.0, "b1": -0.186, "b2": -1.778, "b3": 6.125, "b4": -6.234, "b5": 0.081}
+START = np.array([0.25, -0.55, -0.4, 0.2, 0.15])
+SENSOR_GAINS, RELAY_GAINS = ([0.7, 0.85, 1.0], [0.3, 0.3, 0.4]), ([0.8, 0.9, 1.0], [0.2, 0.3, 0.5])
+AMPLITUDE, PROCESS, NOISE = 2.0, 1e-5, 1e-3  # NOISE: of sensor, relay and receiver
+
+
+def transition(x: Any) -> list[Any]:
+    """One Euler step of the machine; components first, so x may be one state or many."""
+    h, k1, k2, b1, b2, b3, b4, b5 = MACHINE.values()
+    slip = k1 - x[4]
+    return [
+        x[0] + h * (b1 * x[0] + k1 * x[1] + b2 * x[2] + k2),
+        x[1] + h * (b1 * x[1] - k1 * x[0] + b2 * x[3]),
+        x[2] + h * (b3 * x[0] + b4 * x[2] + slip * x[3]),
+        x[3] + h * (b3 * x[1] - slip * x[2] + b4 * x[3]),
+        x[4] + h * b5 * (x[0] * x[3] - x[1] * x[2]),
+    ]
+
+
+def moment(law: tuple[list[float], list[float]], order: int) -> float:
+    """E g^order."""
+    return float(np.asarray(law[1]) @ np.asarray(law[0]) ** order)
+
+
+def cubature(runs: int = 20_000, steps: int = 40) -> Problem:
+    """z = a xi gamma y + a xi m + n with y = C x + v: five states, two measurements, gains of known law alone."""
+    draw = np.random.default_rng(21)
+    c = np.array([[-4.448, 0, 1.11, 0, 0], [0, -4.448, 0, 1.11, 0]])
+    x = START[:, None] + np.sqrt(0.02) * draw.normal(size=(5, runs))
+    z = np.empty((runs, steps, 2))
+    for k in range(steps):
+        x = np.array(transition(x)) + np.sqrt(PROCESS) * draw.normal(size=x.shape)
+        v, relay, receiver = np.sqrt(NOISE) * draw.normal(size=(3, 2, runs))
+        gamma, xi = (draw.choice(law[0], size=runs, p=law[1]) for law in (SENSOR_GAINS, RELAY_GAINS))
+        z[:, k] = (AMPLITUDE * xi * (gamma * (c @ x + v) + relay) + receiver).T
+    mean = AMPLITUDE * moment(SENSOR_GAINS, 1) * moment(RELAY_GAINS, 1)
+    power = AMPLITUDE**2 * moment(SENSOR_GAINS, 2) * moment(RELAY_GAINS, 2)
+    noise = (AMPLITUDE**2 * moment(RELAY_GAINS, 2) + 1) * NOISE
+    arrays = {
+        "C": c, "Q": PROCESS * np.eye(5), "R": NOISE * np.eye(2), "gain": np.array(mean),
+        "gain_variance": np.array(power - mean**2), "noise": noise * np.eye(2), "mean": START,
+        "covariance": 0.02 * np.eye(5), "z": z,
+    }  # fmt: skip
+    title = "Cubature filter with relay gains, 5 states, 2 measurements"
+    return Problem(title, arrays, cubature_flops(5, 2, 35), 8 * (2 + 5))
+
+
+def cubature_flops(n: int, m: int, function: int) -> int:
+    """As `kalman_flops`: factor and points, 2 n values of a function of so many flops, their moments, then the update.
+
+    The sensor is linear, so its moments are products with C and no second factor is needed.
+    """
+    factor, points = n**3 // 3 + n**2, n * (n + 1) // 2 + 2 * n * (n + 1) // 2
+    moments = 2 * n * n + 2 * n * n + 2 * n * n * (n + 1) + n
+    sensor = 2 * m * n + 2 * m * n**2 + m * (m + 1) * n + m
+    relay = 5 * m * (m + 1) // 2  # Omega = var g (Pyy + y y') + mu^2 Pyy + N
+    update = m * n + m**3 // 3 + 2 * m**2 * n + 2 * m + 2 * m * n + n * (n + 1) * m
+    return factor + points + 2 * n * function + moments + sensor + relay + update

@@ -1,0 +1,44 @@
+"""The driver's side of `timed`: a program in a process of its own, asked for one time after another."""
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HERE = Path(__file__).resolve().parent
+
+
+class Running:
+    """A program in its own process, which has written its estimates and waits to be asked for times."""
+
+    def __init__(self, file: str, python: Path, data: Path):
+        self.file, written = file, data.with_name(f"{file}.npy")
+        command = [str(python), str(HERE / f"{file}.py"), str(data), str(written)]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        self.about = self._read()
+        self.means = np.load(written)
+        self.times: list[float] = []
+
+    def _read(self) -> Any:
+        assert self.process.stdout is not None
+        line = self.process.stdout.readline()
+        if not line:
+            raise SystemExit(f"{self.file} failed: expected a line, got none (exit status {self.process.wait()})")
+        return json.loads(line)
+
+    def ask(self) -> None:
+        """Time one pass."""
+        assert self.process.stdin is not None
+        print(file=self.process.stdin, flush=True)
+        self.times.append(self._read())
+
+    def result(self) -> dict[str, Any]:
+        """Nanoseconds per step and run."""
+        best, median = round(min(self.times), 2), round(float(np.median(self.times)), 2)
+        return {"best": best, "median": median, **self.about}
+
+    def stop(self) -> None:
+        """Let it end."""
+        self.process.communicate()
