@@ -1,0 +1,133 @@
+"""The induction machine as the filters believe it: currents, rotor flux and speed in the stator frame, per unit.
+
+With i stator current, psi rotor flux, omega mechanical speed, p pole pairs, T the load's torque (0 if it is no state):
+
+sigma L_s i' = u - (R_s + R_r k^2) i + (k / tau_r - k p omega J) psi,   k = L_m / L_r,   J = [[0, -1], [1, 0]],
+psi' = (L_m i - psi) / tau_r + p omega J psi,   tau_r = L_r / R_r,
+inertia omega' = 3/2 p k (i x psi turned: psi_alpha i_beta - psi_beta i_alpha) - T.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as hg
+
+STEP = 5e-4  # s, of the drive's control and of the filters
+POLE_PAIRS = 2
+STATOR_RESISTANCE, ROTOR_RESISTANCE = 2.9338, 1.355  # ohm, the simulator's own motor
+MAIN_INDUCTANCE, STRAY_INDUCTANCE = 143.75e-3, 5.87e-3  # H, the stray one on each side
+LOAD_INERTIA, ROTOR_INERTIA = 4e-3, 1.1e-3  # kg m^2
+INERTIA = LOAD_INERTIA + ROTOR_INERTIA
+
+WINDING_INDUCTANCE = MAIN_INDUCTANCE + STRAY_INDUCTANCE  # L_s = L_r
+COUPLING = MAIN_INDUCTANCE / WINDING_INDUCTANCE  # k
+TRANSIENT_INDUCTANCE = WINDING_INDUCTANCE - MAIN_INDUCTANCE * COUPLING  # sigma L_s
+TORQUE_FACTOR = 1.5 * POLE_PAIRS * COUPLING
+
+CURRENT = 3.9  # A, the simulator's nominal amplitude
+FLUX = MAIN_INDUCTANCE * CURRENT / np.sqrt(2)  # Vs: as much current magnetises as makes torque
+SPEED = 2 * np.pi * 50 / POLE_PAIRS  # rad/s, synchronous at 50 Hz
+TORQUE = TORQUE_FACTOR * FLUX * CURRENT / np.sqrt(2)  # Nm
+RATED = np.array([CURRENT, CURRENT, FLUX, FLUX, SPEED, TORQUE])
+STATES = ("i_alpha", "i_beta", "psi_alpha", "psi_beta", "omega", "load")
+INPUTS = ("u_alpha", "u_beta")
+
+# One step's process noise, stated before any run. Load: 1 Nm that lasts 50 ms, as white noise of the same intensity
+# 2 sigma^2 tau where it is no state; where it is one, a walk of 1 Nm in 100 ms.
+CURRENT_WALK, FLUX_WALK = 0.05, 5e-4  # A, Vs
+SPEED_WALK = float(np.sqrt(2 * 1.0**2 * 0.05 * STEP)) / INERTIA  # rad/s
+KNOWN_LOAD_SPEED_WALK = 0.02  # rad/s
+LOAD_WALK = float(np.sqrt(1.0**2 / 0.1 * STEP))  # Nm
+START_DEVIATION = np.array([0.1, 0.1, 0.01, 0.01, 1.0, 0.5])  # A, Vs, rad/s, Nm: at rest and without flux
+
+Rate = Callable[[Any], Any]
+
+
+def euler(rate: Rate, x: Any, step: float) -> Any:
+    """x + h x'."""
+    return x + step * rate(x)
+
+
+def runge_kutta(rate: Rate, x: Any, step: float) -> Any:
+    """The classical method of fourth order."""
+    a = rate(x)
+    b = rate(x + step / 2 * a)
+    c = rate(x + step / 2 * b)
+    d = rate(x + step * c)
+    return x + step / 6 * (a + 2 * b + 2 * c + d)
+
+
+class Machine(eqx.Module):
+    """One step of the machine, x per unit of `RATED` (5 states, or 6 with the load's torque), u in volts."""
+
+    rotor_resistance: np.ndarray
+    integrate: Callable[[Rate, Any, float], Any] = eqx.field(static=True)
+
+    def __init__(
+        self,
+        rotor_resistance: float = ROTOR_RESISTANCE,
+        integrate: Callable[[Rate, Any, float], Any] = runge_kutta,
+    ):
+        self.rotor_resistance = np.asarray(rotor_resistance, dtype=float)
+        self.integrate = integrate
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        """State after one step with the voltage held."""
+        scale = RATED[: x.shape[0]]
+        return self.integrate(lambda physical: self.rates(physical, u), x * scale, STEP) / scale
+
+    def rates(self, x: Any, u: Any) -> Any:
+        """x' in SI units."""
+        i, psi, omega = x[:2], x[2:4], x[4]
+        damping = self.rotor_resistance / WINDING_INDUCTANCE
+        turned = POLE_PAIRS * omega * jnp.stack([-psi[1], psi[0]])
+        resistance = STATOR_RESISTANCE + self.rotor_resistance * COUPLING**2
+        current = (u - resistance * i + COUPLING * (damping * psi - turned)) / TRANSIENT_INDUCTANCE
+        flux = damping * (MAIN_INDUCTANCE * i - psi) + turned
+        load = x[5:6]  # nothing where it is no state
+        speed = (torque(x) - jnp.sum(load)) / INERTIA
+        return jnp.concatenate([current, flux, speed[None], 0 * load])
+
+
+def torque(x: Any) -> Any:
+    """Torque of the machine in Nm, x (..., states) in SI units: 3/2 p k (psi_alpha i_beta - psi_beta i_alpha)."""
+    return TORQUE_FACTOR * (x[..., 2] * x[..., 1] - x[..., 3] * x[..., 0])
+
+
+def plant(machine: Machine, load_is_state: bool = False, trust: float = 1.0) -> hg.Plant:
+    """The machine as a plant per unit, from rest; `trust` divides the deviations of the process noise."""
+    speed_walk = KNOWN_LOAD_SPEED_WALK if load_is_state else SPEED_WALK
+    walk = np.array([CURRENT_WALK, CURRENT_WALK, FLUX_WALK, FLUX_WALK, speed_walk, LOAD_WALK])
+    n = 6 if load_is_state else 5
+    covariances = [np.diag((deviation / RATED)[:n] ** 2) for deviation in (walk / trust, START_DEVIATION)]
+    return hg.Plant(machine, covariances[0], np.zeros(n), covariances[1], STATES[:n], INPUTS)
+
+
+def steady_state(speed: float, frequency: float, amplitude: float) -> tuple[complex, complex]:
+    """Current (A) and rotor flux (Vs) of a machine turned at `speed` (rad/s) by a voltage turning at `frequency` (Hz).
+
+    psi (1 / tau_r + j (omega_1 - p omega)) = L_m i / tau_r,  u = (R_s + j omega_1 sigma L_s) i + j omega_1 k psi.
+    """
+    omega = 2 * np.pi * frequency
+    damping = ROTOR_RESISTANCE / WINDING_INDUCTANCE
+    flux_of_current = damping * MAIN_INDUCTANCE / (damping + 1j * (omega - POLE_PAIRS * speed))
+    impedance = STATOR_RESISTANCE + 1j * omega * (TRANSIENT_INDUCTANCE + COUPLING * flux_of_current)
+    current = complex(amplitude / impedance)
+    return current, complex(flux_of_current * current)
+
+
+def draw_truth(model: hg.Plant, voltages: np.ndarray, key: Any) -> Any:
+    """One trajectory of the filters' own model with its process noise, (steps, n) per unit."""
+
+    def body(x: Any, item: tuple[Any, Any]) -> tuple[Any, Any]:
+        draw, u = item
+        x = model.transition(x, u) + model.sample_noise(draw, u)
+        return x, x
+
+    start, *_ = keys = jax.random.split(key, len(voltages) + 1)
+    return jax.lax.scan(body, model.sample_initial(start), (keys[1:], voltages))[1]
