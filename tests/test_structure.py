@@ -21,14 +21,14 @@ ORDER = [
     ["quantizer"],
     ["intersection", "fusion", "fusion_level"],
     ["network"],
-    ["groups", "record", "stream"],
+    ["groups", "record", "stream", "lanes", "batch"],
     ["simulate", "simulate_relays", "consistency"],
     ["testing"],
     ["table", "recording", "plaza_recording", "output_folder", "load"],
     ["examples"],
     ["report"],
     ["campaign"],
-    ["demo", "papers"],
+    ["demo", "papers", "examples.motor_drive"],
     ["cli"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}

@@ -220,6 +220,9 @@ from .simulate import (
     monte_carlo as monte_carlo,
     run as run,
 )
+from .batch import (
+    over_runs as over_runs,
+)
 from .stream import (
     Stream as Stream,
 )

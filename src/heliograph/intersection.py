@@ -10,6 +10,7 @@ from heliograph.small_matrix import (
     add,
     diagonal,
     inner,
+    rounding,
     runs_last,
     solve,
     symmetric,
@@ -20,6 +21,7 @@ from heliograph.small_matrix import (
 )
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
+LOOP = 1000  # units of rounding below which the certificate makes no progress
 ITERATIONS = 60  # of the interior point method; it needs about 12
 STEP_BACK = 0.99  # share of the way to the boundary
 SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks to 1e-8, the flat minimum to 1e-16
@@ -47,7 +49,7 @@ def trace_optimal_weights(information: jax.Array) -> jax.Array:
     scaled = information / (add([trace(j) for j in information]) / count)
 
     def unfinished(point: _Point) -> jax.Array:
-        return jnp.max(-point.gradient, axis=0) > (1 + GAP) * point.trace
+        return jnp.max(-point.gradient, axis=0) > (1 + rounding(GAP, point.trace, LOOP)) * point.trace
 
     def step(carry: tuple[_Point, jax.Array]) -> tuple[_Point, jax.Array]:
         point, iteration = carry

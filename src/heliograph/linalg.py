@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from heliograph.small_matrix import PIVOT_TOLERANCE, UNROLL_LIMIT, factor, runs_last, solve
+from heliograph.small_matrix import PIVOT_TOLERANCE, UNROLL_LIMIT, factor, rounding, runs_last, solve
 
 
 def symmetrize(a: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -30,7 +30,7 @@ def _short_cholesky(a: jax.Array) -> jax.Array:
 
 def _long_cholesky(a: jax.Array) -> jax.Array:
     n = a.shape[-1]
-    tolerance = PIVOT_TOLERANCE * jnp.max(jnp.abs(jnp.diagonal(a)))
+    tolerance = rounding(PIVOT_TOLERANCE, a) * jnp.max(jnp.abs(jnp.diagonal(a)))
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         a, done = carry

@@ -1,7 +1,8 @@
 """The one scan: it simulates the world, feeds every filter, and serves Monte Carlo runs and recordings alike."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from functools import partial
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import numpy as np
 from heliograph.check import array, check_count, fail
 from heliograph.float64 import compiled, to_numpy
 from heliograph.groups import AllFilters, Group, groups
+from heliograph.lanes import BLOCK, Lanes
 from heliograph.network import Network
 from heliograph.over_time import at
 from heliograph.random_affine.base import apply
@@ -22,7 +24,7 @@ Progress = Callable[[int, int], None]
 INITIAL, PROCESS, SENSOR, CHANNEL = range(4)
 WORLD = 0  # the plant's place among the node checksums
 
-BLOCK = 64  # runs simulated side by side: wide enough for vector units, small enough for the cache
+Precision = Literal["float64", "float32"]
 
 
 def monte_carlo(
@@ -32,9 +34,10 @@ def monte_carlo(
     key: int | jax.Array,
     keep: AbstractReducer | None = None,
     inputs: Any = None,
-    chunk: int = 512,
+    chunk: int = 2048,
     progress: Progress | None = None,
     first_run: int = 0,
+    precision: Precision = "float64",
 ) -> Any:
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
@@ -44,11 +47,14 @@ def monte_carlo(
     `progress(done, total)` is called after each chunk of runs. The runs are first_run, first_run + 1, ...: a part of a
     larger simulation, bit for bit; it starts at a multiple of 64, since so many are simulated side by side.
 
+    All cores are used, and all devices where JAX sees others than a processor. `precision` "float32" simulates and
+    filters in single precision, with other draws; what is kept is summed in double precision either way.
+
     Returns a `Record` for trajectories, else what the reducer makes.
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
-            that is no multiple of 64.
+            that is no multiple of 64, an unknown precision.
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
@@ -58,17 +64,19 @@ def monte_carlo(
     reducer = Trajectories() if keep is None else keep
     u = _check_inputs(network, inputs, horizon)
     base = jax.random.key(key) if isinstance(key, int | np.integer) else key
-    chunk = BLOCK * -(-min(chunk, runs) // BLOCK)
+    if precision not in get_args(Precision):
+        raise fail("precision", f"one of {', '.join(get_args(Precision))}", repr(precision))
+    job = _Job(network, u, base, np.asarray(first_run + runs), reducer, precision == "float32")
+    parts = []
     with jax.enable_x64(True):
-        carry, parts = _initial(network, u, base, reducer), []
-        for start in range(0, runs, chunk):
-            blocks = first_run + np.arange(start, start + chunk).reshape(-1, BLOCK)
-            done = min(start + chunk, runs)
-            carry, kept = _chunk(network, u, base, blocks, np.asarray(first_run + runs), reducer, carry)
-            parts.append(jax.tree.map(lambda leaf: _flat(leaf)[: done - start], to_numpy(kept)))  # noqa: B023
+        lanes = Lanes(partial(_lane, job), partial(_all_lanes, job), to_numpy(_initial(job)), first_run)
+        blocks = lanes.blocks_of(min(chunk, runs))
+        for start in range(0, -(-runs // BLOCK), blocks):
+            begun, done = start * BLOCK, min((start + blocks) * BLOCK, runs)
+            parts.append(jax.tree.map(lambda leaf: leaf[: done - begun], lanes.advance(start, blocks)))  # noqa: B023
             if progress is not None:
                 progress(done, runs)
-    return reducer.finish(to_numpy(carry), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), network)
+    return reducer.finish(lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), network)
 
 
 def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, time: Any = None) -> Record:
@@ -112,52 +120,90 @@ def _run_filters(network: Network, z: dict[str, Any], u: Any) -> Any:
     return jax.lax.scan(body, step.init(), (jnp.arange(u.shape[0]), u, z))[1]
 
 
-def _flat(leaf: np.ndarray) -> np.ndarray:
-    return leaf.reshape(-1, *leaf.shape[2:])
+class _Job(eqx.Module):
+    """What is simulated, up to which run, what is kept of it, and whether in single precision."""
+
+    network: Network
+    inputs: Any
+    key: jax.Array
+    stop: np.ndarray
+    reducer: AbstractReducer
+    single: bool = eqx.field(static=True)
 
 
 @eqx.filter_jit
-def _block(network: Network, u: Any, key: jax.Array, runs: jax.Array) -> Any:
-    """Trajectories of one block of runs."""
-    parts = groups(network)
-    return jax.vmap(lambda index: _one_run(network, parts, u, jax.random.fold_in(key, index)))(runs)
-
-
-@eqx.filter_jit
-def _initial(network: Network, u: Any, key: jax.Array, reducer: AbstractReducer) -> Any:
+def _initial(job: _Job) -> Any:
     """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
-    shapes = eqx.filter_eval_shape(_block, network, u, key, np.arange(BLOCK))
-    return reducer.initial(shapes)
+    return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
 
 
 @eqx.filter_jit
-def _chunk(
-    network: Network, u: Any, key: jax.Array, blocks: Any, stop: Any, reducer: AbstractReducer, carry: Any
-) -> tuple[Any, Any]:
+def _lane(job: _Job, blocks: Any, carry: Any) -> tuple[Any, Any]:
     """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
 
     def body(carry: Any, runs: jax.Array) -> tuple[Any, Any]:
-        return reducer.reduce(carry, _block(network, u, key, runs), runs, runs < stop)
+        return job.reducer.reduce(carry, _block(job, runs), runs, runs < job.stop)
 
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
 
 
-def _one_run(network: Network, parts: list[Group], u: jax.Array, key: jax.Array) -> Any:
-    """One world and all filters on it: truth (time, n), measurements and estimates by node, links."""
-    step = AllFilters(network, parts)
-    x0 = at(network.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
+@eqx.filter_jit
+def _all_lanes(job: _Job, blocks: Any, carries: Any) -> tuple[Any, Any]:
+    """Every lane's blocks, with a leading axis for the lanes."""
+    result: tuple[Any, Any] = jax.vmap(partial(_lane, job))(blocks, carries)
+    return result
 
-    def body(carry: tuple[Any, Any], item: tuple[Any, ...]) -> tuple[Any, Any]:
-        (x, states), (k, u_k) = carry, item
-        plant = at(network.plant, k)
-        x = plant.transition(x, u_k) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u_k)
+
+def _block(job: _Job, runs: jax.Array) -> Any:
+    """Trajectories (run, time, ...) of one block of runs."""
+    if not job.single:
+        return _trajectories(job.network, job.inputs, job.key, runs)
+    with jax.enable_x64(False):
+        network, inputs = jax.tree.map(_single, (job.network, job.inputs))
+        found = _trajectories(network, inputs, job.key, runs)
+    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
+
+
+def _single(leaf: Any) -> Any:
+    return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
+
+
+def _trajectories(network: Network, u: Any, key: jax.Array, runs: jax.Array) -> Any:
+    """The runs are the last axis of everything on the way."""
+    world = _World(network)
+    keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
+    advance = jax.vmap(world.step, in_axes=(-1, 0, None, None), out_axes=-1)
+
+    def body(carry: Any, item: tuple[Any, ...]) -> tuple[Any, Any]:
+        result: tuple[Any, Any] = advance(carry, keys, *item)
+        return result
+
+    start = jax.vmap(world.init, out_axes=-1)(keys)
+    found = jax.lax.scan(body, start, (jnp.arange(u.shape[0]), u))[1]
+    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
+
+
+class _World:
+    """One run of a network, step by step: the plant's state and those of all filters."""
+
+    def __init__(self, network: Network):
+        self.network, self.parts = network, groups(network)
+        self.filters = AllFilters(network, self.parts)
+
+    def init(self, key: jax.Array) -> tuple[jax.Array, Any]:
+        """Before the first step."""
+        return at(self.network.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL)), self.filters.init()
+
+    def step(self, carry: tuple[Any, Any], key: jax.Array, k: jax.Array, u: jax.Array) -> tuple[Any, Any]:
+        """After step k, and what there is to see of it: truth (n,), measurements and estimates by node, links."""
+        x, states = carry
+        plant = at(self.network.plant, k)
+        x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
         z: dict[str, jax.Array] = {}
-        for part in parts:
+        for part in self.parts:
             z |= dict(zip(part.names, _observe(part, x, key, k), strict=True))
-        states, found = step(states, z, u_k, k)
+        states, found = self.filters(states, z, u, k)
         return (x, states), {"truth": x, "measurements": z, **found}
-
-    return jax.lax.scan(body, (x0, step.init()), (jnp.arange(u.shape[0]), u))[1]
 
 
 def _observe(part: Group, x: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:

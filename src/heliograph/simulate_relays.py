@@ -15,10 +15,11 @@ from heliograph.design.schedule import Schedule
 from heliograph.filter.base import AbstractFilter, Claim
 from heliograph.filter.scheduled import ScheduledFilter
 from heliograph.float64 import to_numpy
+from heliograph.lanes import BLOCK
 from heliograph.over_time import OverTime, alike, at, over_time
 from heliograph.random_affine.base import apply
 from heliograph.record import AbstractReducer, Trajectories
-from heliograph.simulate import BLOCK, CHANNEL, INITIAL, PROCESS, WORLD, Progress, draw_key
+from heliograph.simulate import CHANNEL, INITIAL, PROCESS, WORLD, Progress, draw_key
 from heliograph.simulate import SENSOR as SENSOR_NOISE
 
 

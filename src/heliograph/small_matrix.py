@@ -114,13 +114,18 @@ def diagonal(d: jax.Array) -> jax.Array:
     return d[None] * jnp.eye(n).reshape(n, n, *[1] * (d.ndim - 1))
 
 
+def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
+    """A relative tolerance, or so many units of an array's rounding where its precision does not allow that."""
+    return max(tolerance, units * float(np.finfo(like.dtype).eps))
+
+
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     """Columns of the lower factor, (n, ...) each, and the reciprocals of its diagonal (zero for a zero column).
 
     Column by column: what is left of a column after those before it, times the reciprocal root of its pivot.
     """
     n = a.shape[0]
-    tolerance = PIVOT_TOLERANCE * jnp.max(jnp.abs(jnp.stack([a[i, i] for i in range(n)])), axis=0)
+    tolerance = rounding(PIVOT_TOLERANCE, a) * jnp.max(jnp.abs(jnp.stack([a[i, i] for i in range(n)])), axis=0)
     columns: list[jax.Array] = []
     scales: list[jax.Array] = []
     for j in range(n):

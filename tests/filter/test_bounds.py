@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filter.transform import PolynomialMoments
 from heliograph.filter.correction import Signal
+from heliograph.filter.transform import PolynomialMoments
 from tests import machine
 from tests.filter.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG

@@ -11,7 +11,7 @@ from typing import Any
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, canonical, versions
 from heliograph.check import check_count, fail
-from heliograph.simulate import BLOCK
+from heliograph.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "grid", "settings")
 KEEP = ("errors", "trajectories")

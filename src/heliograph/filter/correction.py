@@ -17,6 +17,7 @@ from heliograph.small_matrix import (
     congruence,
     diagonal,
     inner,
+    rounding,
     runs_last,
     solve,
     symmetric,
@@ -28,6 +29,7 @@ from heliograph.small_matrix import (
 SWEEPS = 200  # most steps towards the scalars; about 5 are needed
 LONGEST = 5.0  # Newton step in the logarithm of a scalar: a longer one is not trusted
 SETTLED = 1e-8  # relative change of the scalars; the trace is flat there, so its error is of second order
+LOOP = 1000  # units of rounding below which an iteration makes no progress
 SMALLEST_SCALAR = 1e-12  # keeps 1/beta finite where nothing is gained by a larger one
 
 
@@ -125,7 +127,7 @@ def settle(refine: Callable[[jax.Array], jax.Array], start: list[float], like: j
     """
 
     def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
-        return jnp.any(jnp.abs(t - previous) > SETTLED, axis=0)
+        return jnp.any(jnp.abs(t - previous) > rounding(SETTLED, t, LOOP), axis=0)
 
     def sweep(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         t, previous, sweeps = carry

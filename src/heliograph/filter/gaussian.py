@@ -11,13 +11,13 @@ from heliograph.channel import Channel, check_link, mean_gain
 from heliograph.check import array, covariance
 from heliograph.filter.base import AbstractFilter, Claim, Estimate
 from heliograph.filter.correction import Signal
-from heliograph.filter.transform import AbstractTransform, Cubature, Linearization
+from heliograph.filter.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filter.update import AbstractUpdate, Polytope
 from heliograph.float64 import compiled, in_float64
 from heliograph.over_time import OverTime, at, first, over_time, unstack
-from heliograph.plant import AnyPlant
+from heliograph.plant import AnyPlant, LinearPlant
 from heliograph.random_affine.second_order import SecondOrder
-from heliograph.sensor import AnySensor, is_linear
+from heliograph.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.small_matrix import runs_last, times_vector
 
 
@@ -30,6 +30,8 @@ class Belief(NamedTuple):
 
 class GaussianFilter(AbstractFilter):
     """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
+
+    A linear plant or sensor needs no transform: its moments are exact.
 
     `channel` is what the filter believes; the world may have another. Built by `cubature_filter`, `extended_filter`
     and `mean_gain_filter`.
@@ -59,14 +61,20 @@ class GaussianFilter(AbstractFilter):
     def predict(self, state: Belief, u: Any = (), k: Any = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
         plant, u = at(self.plant, k), jnp.asarray(u, dtype=float)
-        moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
+        if isinstance(plant, LinearPlant):
+            moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
+        else:
+            moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
         return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
     @compiled
     def correct(self, prior: Belief, z: Any, k: Any = 0) -> Belief:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
-        measured = self.transform.apply(sensor.measure, *prior)
+        if isinstance(sensor, LinearSensor):
+            measured = linear_transform(sensor.matrix, sensor.measure(prior.mean), prior.covariance)
+        else:
+            measured = self.transform.apply(sensor.measure, *prior)
         mean = measured.mean + sensor.noise.mean
         spread = measured.covariance + sensor.noise.covariance
         signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -87,11 +87,17 @@ def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Arr
     return symmetric(times(jacobian, cross)), cross
 
 
-class PolynomialMoments(AbstractTransform):
-    """Exact mean and covariance of a polynomial of a Gaussian x, by Gauss-Hermite quadrature.
+def linear_transform(matrix: Any, center: jax.Array, covariance: jax.Array) -> Transformed:
+    """Moments of a linear function with this matrix and this value at the mean: what every transform would find."""
+    return Transformed(center, *_linear_moments(covariance, jnp.asarray(matrix)))
 
-    With d + 1 points in each of the n directions of the factor of P, products of two polynomials of degree d are
-    integrated exactly; (d + 1)^n evaluations of the function.
+
+class PolynomialMoments(AbstractTransform):
+    """Exact mean and covariance of a polynomial of a Gaussian x.
+
+    Degree 2 from the polynomial's own coefficients, 1 + 2 n + n (n - 1) / 2 evaluations. Other degrees d by
+    Gauss-Hermite quadrature: with d + 1 points in each of the n directions of the factor of P, products of two
+    polynomials of degree d are integrated exactly; (d + 1)^n evaluations.
 
     Raises:
         ValueError: a degree below one, or (when applied) more than 20,000 points.
@@ -104,7 +110,12 @@ class PolynomialMoments(AbstractTransform):
         self.degree = check_count("degree of the polynomial", degree)
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:
-        """Evaluate at the quadrature points and sum with their weights."""
+        """Read off the coefficients, or evaluate at the quadrature points and sum with their weights."""
+        if self.degree == 2:
+            factor = cholesky(covariance)
+            return _quadratic_moments(
+                factor, jax.vmap(function, in_axes=1, out_axes=1)(_quadratic_points(mean, factor))
+            )
         points, weights = map(jnp.asarray, _hermite_grid(mean.shape[0], self.degree + 1))
         deviations = points @ cholesky(covariance).T
         values = jax.vmap(function)(mean + deviations)
@@ -112,6 +123,32 @@ class PolynomialMoments(AbstractTransform):
         spread = values - center
         weighted = weights[:, None] * spread
         return Transformed(center, spread.T @ weighted, deviations.T @ weighted)
+
+
+@runs_last
+def _quadratic_points(mean: jax.Array, factor: jax.Array) -> jax.Array:
+    """m, m + L_i, m - L_i and m + L_i + L_j for i < j, as columns."""
+    n, center = mean.shape[0], mean[:, None]
+    rows, columns = np.triu_indices(n, 1)
+    both = factor[:, rows] + factor[:, columns]
+    return jnp.concatenate([center, center + factor, center - factor, center + both], axis=1)
+
+
+@runs_last
+def _quadratic_moments(factor: jax.Array, values: jax.Array) -> Transformed:
+    """f(m + L xi) = c + sum a_i xi_i + sum b_i xi_i^2 + sum_i<j b_ij xi_i xi_j, xi standard normal.
+
+    Mean c + sum b_i, covariance sum a_i a_i' + 2 sum b_i b_i' + sum b_ij b_ij', cross covariance L a'.
+    """
+    n = factor.shape[0]
+    rows, columns = np.triu_indices(n, 1)
+    start, ahead, behind, both = jnp.split(values, [1, n + 1, 2 * n + 1], axis=1)
+    slopes, squares = (ahead - behind) / 2, (ahead + behind) / 2 - start
+    mixed = both - ahead[:, rows] - ahead[:, columns] + start
+    terms = jnp.concatenate([slopes, 2**0.5 * squares, mixed], axis=1)
+    covariance = add([terms[:, None, i] * terms[None, :, i] for i in range(terms.shape[1])])
+    center = add([start[:, 0], *(squares[:, i] for i in range(n))])
+    return Transformed(center, covariance, times(factor, transpose(slopes)))
 
 
 def _hermite_grid(dimension: int, count: int) -> tuple[np.ndarray, np.ndarray]:
