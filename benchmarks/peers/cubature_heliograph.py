@@ -4,7 +4,6 @@ from dataclasses import replace
 from typing import Any
 
 import jax
-from batches import vectorised
 from problems import RELAY_GAINS, SENSOR_GAINS
 from timed import Arrays, Contender, serve
 
@@ -25,7 +24,7 @@ def prepare(p: Arrays) -> Contender:
         last, means = jax.lax.scan(step, start, z)
         return means, last.covariance
 
-    return vectorised(one_run, [p["z"]])
+    return Contender(lambda: hg.over_runs(one_run, p["z"]), lambda result: result[0], "over_runs, all cores")
 
 
 if __name__ == "__main__":

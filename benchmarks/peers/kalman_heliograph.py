@@ -3,7 +3,6 @@
 from typing import Any
 
 import jax
-from batches import vectorised
 from timed import Arrays, Contender, serve
 
 import heliograph as hg
@@ -23,7 +22,9 @@ def prepare(p: Arrays) -> Contender:
         last, means = jax.lax.scan(step, start, (gains, z))
         return means, last.covariance
 
-    return vectorised(one_run, [p["gains"], p["z"]])
+    return Contender(
+        lambda: hg.over_runs(one_run, p["gains"], p["z"]), lambda result: result[0], "over_runs, all cores"
+    )
 
 
 if __name__ == "__main__":
