@@ -332,7 +332,8 @@ def test_the_summary_has_every_key(folder):
     wanted = {"none", "dynamic", "static", "dynamic_decodable"}
     assert wanted | {f"{name}_se" for name in wanted} <= numbers["mean_fused_error"].keys()
     assert numbers["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
-    assert numbers["saturated_fraction"]["dynamic_decodable"] == 0
+    assert numbers["saturation"]["dynamic_decodable"] == 0
+    assert numbers["saturated_fraction"] == numbers["saturation"]["dynamic"]
     assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= numbers["contexts"]["ekf_told"].keys()
     assert len(numbers["index"]["J1"][RECURSIVE]) == 4
     assert {"growth", "discriminating", "claims", "saturated_fraction"} <= numbers.keys()

@@ -83,7 +83,8 @@ def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
         "fusion": fusion_numbers(result),
         "mean_fused_error_is": "mean over runs and s = 0 ... 15 of the norm of x - fused, of one-step predictions",
         "mean_fused_error": error_numbers(result),
-        "saturated_fraction": {
+        "saturated_fraction": result.saturated("dynamic"),
+        "saturation": {
             "dynamic": result.saturated("dynamic"),
             "dynamic_from_s_7": result.saturated("dynamic", 7),
             "dynamic_decodable": result.saturated("dynamic_decodable"),
