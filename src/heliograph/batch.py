@@ -34,16 +34,29 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
     share = -(-runs // (width * cores))  # blocks of each core
 
     def work(core: int) -> Any:
-        first = core * share * width
-        taken = np.minimum(np.arange(first, first + share * width), runs - 1)  # the last run fills up
-        parts = [a[taken].reshape(share, width, *a.shape[1:]) for a in values]
+        first, last = core * share * width, min((core + 1) * share * width, runs)
+        parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
-            return to_numpy(_blocks(function, parts))
+            found = to_numpy(_blocks(function, parts))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], found)
 
-    count = -(-runs // (share * width))
     with ThreadPoolExecutor(cores) as pool:
-        found = list(pool.map(work, range(count)))
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves).reshape(-1, *leaves[0].shape[2:])[:runs], *found)
+        found = list(pool.map(work, range(-(-runs // (share * width)))))
+        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), found[0])
+
+        def place(core: int) -> None:  # copied by all cores too: large results take their time
+            into, part = jax.tree.leaves(whole), jax.tree.leaves(found[core])
+            for target, leaf in zip(into, part, strict=True):
+                target[core * share * width :][: len(leaf)] = leaf
+
+        list(pool.map(place, range(len(found))))
+    return whole
+
+
+def _filled(part: np.ndarray, count: int) -> np.ndarray:
+    """As many runs as the program wants; the last one again where there are fewer."""
+    missing = count - len(part)
+    return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
 
 
 @eqx.filter_jit

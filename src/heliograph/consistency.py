@@ -174,23 +174,22 @@ class Statistics(AbstractReducer):
 
     def initial(self, shapes: Any) -> Any:
         """Zero sums."""
-        deal = np.zeros((shapes["truth"].shape[0], BATCHES))
-        sums = eqx.filter_eval_shape(self._block_sums, shapes, deal)
+        used = np.zeros(shapes["truth"].shape[0], dtype=bool)
+        sums = eqx.filter_eval_shape(self._block_sums, shapes, np.asarray(0), used)
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), sums)
 
     def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
         """Add the sums over the block's valid runs, dealt to batches."""
-        deal = jax.nn.one_hot(runs % BATCHES, BATCHES, dtype=float) * valid[:, None]
-        return jax.tree.map(jnp.add, carry, self._block_sums(batch, deal)), ()
+        return jax.tree.map(jnp.add, carry, self._block_sums(batch, runs[0], valid)), ()
 
-    def _block_sums(self, batch: Any, deal: jax.Array) -> Any:
+    def _block_sums(self, batch: Any, first: jax.Array, used: jax.Array) -> Any:
         errors = jax.tree.map(
-            lambda estimate: _sums(batch["truth"], estimate, deal),
+            lambda estimate: _sums(batch["truth"], estimate, first, used),
             batch["estimates"],
             is_leaf=lambda leaf: isinstance(leaf, Estimate),
         )
-        valid = deal.sum(axis=1)
-        return errors, jax.tree.map(lambda leaf: jnp.tensordot(valid, leaf, axes=1), batch.get("links", {}))
+        counted = used.astype(float)
+        return errors, jax.tree.map(lambda leaf: jnp.tensordot(counted, leaf, axes=1), batch.get("links", {}))
 
     def finish(self, carry: Any, collected: Any, network: Network) -> dict[str, dict[str, ErrorStatistics]]:
         """Statistics by node and filter."""
@@ -206,20 +205,28 @@ class Statistics(AbstractReducer):
         return result
 
 
-def _sums(truth: jax.Array, estimate: Estimate, deal: jax.Array) -> dict[str, jax.Array]:
-    used = (deal.sum(axis=1) > 0)[:, None, None]  # padding may hold anything
-    error = jnp.where(used, truth - estimate.mean, 0.0)
-    bound = jnp.where(used[..., None], estimate.bound, jnp.eye(error.shape[-1]))
+def _sums(truth: jax.Array, estimate: Estimate, first: Any, used: jax.Array) -> dict[str, jax.Array]:
+    """Sums over runs first, first + 1, ..., as far as they are used, by batch."""
+    rows = used[:, None, None]  # the others may hold anything
+    error = jnp.where(rows, truth - estimate.mean, 0.0)
+    bound = jnp.where(rows[..., None], estimate.bound, jnp.eye(error.shape[-1]))
 
     def squared_distance(b: jax.Array, e: jax.Array) -> jax.Array:
         return e @ psd_solve(b, e[:, None])[:, 0]
 
     return {
-        "count": deal.sum(axis=0),
-        "outer": jnp.einsum("rb,rti,rtj->btij", deal, error, error),
-        "bound": jnp.einsum("rb,rtij->btij", deal, bound),
-        "nees": jnp.einsum("rb,rt->bt", deal, jax.vmap(jax.vmap(squared_distance))(bound, error)),
+        "count": _dealt(used.astype(float), first),
+        "outer": _dealt(error[..., :, None] * error[..., None, :], first),
+        "bound": _dealt(jnp.where(rows[..., None], bound, 0.0), first),
+        "nees": _dealt(jax.vmap(jax.vmap(squared_distance))(bound, error), first),
     }
+
+
+def _dealt(values: jax.Array, first: Any) -> jax.Array:
+    """Sums by batch (BATCHES, ...) of values (runs, ...) of consecutive runs: run r goes to batch r mod BATCHES."""
+    missing = jnp.zeros((-len(values) % BATCHES, *values.shape[1:]), values.dtype)
+    rounds = jnp.concatenate([values, missing]).reshape(-1, BATCHES, *values.shape[1:])
+    return jnp.roll(rounds.sum(axis=0), first % BATCHES, axis=0)
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
@@ -231,10 +238,9 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     if record.truth is None or record.truth.ndim != 3:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
     estimate = record.estimates[node][name]
-    runs = np.arange(len(record.truth))
-    deal = (runs[:, None] % BATCHES == np.arange(BATCHES)).astype(float)
     with jax.enable_x64(True):
-        sums = to_numpy(_sums(jnp.asarray(record.truth), estimate, jnp.asarray(deal)))
+        used = jnp.ones(len(record.truth), dtype=bool)
+        sums = to_numpy(_sums(jnp.asarray(record.truth), estimate, 0, used))
     sent = record.links.get(name) if node == FUSED else None
     link = None if sent is None else Link(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
     return ErrorStatistics(**sums, claim=estimate.claim, link=link)

@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from heliograph.float64 import to_numpy
 
-BLOCK = 64  # runs simulated side by side: wide enough for vector units, small enough for the cache
+BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 
@@ -58,11 +58,9 @@ class Lanes:
                 self.carries[lane], kept = self.alone(runs[lanes[lane]], self.carries[lane])
                 return to_numpy(kept)
 
-        first, *rest = [lane for lane, mine in enumerate(lanes) if len(mine)]
-        if self.pool is None:  # the first lane compiles for all
+        if self.pool is None:
             self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
-            return [go(first), *self.pool.map(go, rest)]
-        return list(self.pool.map(go, [first, *rest]))
+        return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
 
     def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[Any]:
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]

@@ -45,7 +45,7 @@ def monte_carlo(
     neither the chunk size nor another node changes a bit of them. `keep` says what is kept: `Trajectories()` (all,
     the default) or `Statistics()` (bounded memory). `inputs` (horizon, inputs) are common to all runs.
     `progress(done, total)` is called after each chunk of runs. The runs are first_run, first_run + 1, ...: a part of a
-    larger simulation, bit for bit; it starts at a multiple of 64, since so many are simulated side by side.
+    larger simulation, bit for bit; it starts at a multiple of 32, since so many are simulated side by side.
 
     All cores are used, and all devices where JAX sees others than a processor. `precision` "float32" simulates and
     filters in single precision, with other draws; what is kept is summed in double precision either way.
@@ -54,7 +54,7 @@ def monte_carlo(
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
-            that is no multiple of 64, an unknown precision.
+            that is no multiple of 32, an unknown precision.
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)

@@ -56,7 +56,7 @@ BAD = {
     "missing key": ("runs = 100\n", "", ["runs", "positive whole number", "none"]),
     "no horizon": ("horizon = 4", "horizon = 0", ["horizon", "positive whole number", "0"]),
     "seed": ("seed = 5", "seed = -1", ["seed", "from 0 to 4294967295", "-1"]),
-    "chunk": ("chunk = 64", "chunk = 100", ["chunk", "a multiple of 64", "100"]),
+    "chunk": ("chunk = 64", "chunk = 100", ["chunk", "a multiple of 32", "100"]),
     "keep": ("seed = 5", 'keep = "all"', ["keep", "'errors' or 'trajectories'", "'all'"]),
     "no function": ("net.py:build", "net.py", ["network", "my_network.py:build", "'net.py'"]),
     "no file": ("net.py:build", "nets.py:build", ["network", "a Python file", "nets.py: nothing of that name"]),

@@ -56,7 +56,7 @@ def test_a_part_of_the_runs_is_the_same_part_of_all(tmp_path):
     everything = hg.monte_carlo(network, 4, 100, 1, chunk=64)
     assert np.array_equal(part.truth, everything.truth[64:])
     assert np.array_equal(part.estimates["near"]["trusting"].mean, everything.estimates["near"]["trusting"].mean[64:])
-    with pytest.raises(ValueError, match="first_run: expected a multiple of 64, got 63"):
+    with pytest.raises(ValueError, match="first_run: expected a multiple of 32, got 63"):
         hg.monte_carlo(network, 4, 36, 1, first_run=63)
 
 

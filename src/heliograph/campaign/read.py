@@ -26,7 +26,7 @@ def load_campaign(path: str | Path) -> Campaign:
 
     Keys: network = "my_network.py:build" (a function of the settings; the path counts from the campaign's folder),
     horizon, runs, and [grid] name = [values], whose product is taken, or [[settings]], one table for each. Optional:
-    seed (0), chunk (runs computed and stored at once, 256; a multiple of 64), keep ("errors", or "trajectories" for
+    seed (0), chunk (runs computed and stored at once, 256; a multiple of 32), keep ("errors", or "trajectories" for
     truth and measurements too), [inputs] name = a number or one for each step.
 
     Raises:
