@@ -31,7 +31,7 @@ from peers.running import Running
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results.json"
-ROUNDS = 7
+ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
 ALONE = ("startup", "h_infinity", "quadratic", "successive_relays", "cubature_fusion")
 

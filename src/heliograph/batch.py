@@ -32,6 +32,7 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
     runs, cores = len(values[0]), os.cpu_count() or 1
     width = min(width, runs)
     share = -(-runs // (width * cores))  # blocks of each core
+    width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
 
     def work(core: int) -> Any:
         first, last = core * share * width, min((core + 1) * share * width, runs)
