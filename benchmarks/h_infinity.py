@@ -45,12 +45,12 @@ def recursion() -> tuple[float, float]:
         found.append(1e3 * (time.perf_counter() - start))
         return result
 
-    StepProblem.solve = timed  # type: ignore[assignment]
+    StepProblem.solve = timed
     try:
         for _ in range(REPEATS):
             hg.recursive_design(system(), 1.8, 10 * np.eye(4))
     finally:
-        StepProblem.solve = solve  # type: ignore[method-assign]
+        StepProblem.solve = solve
     return found[0], float(np.median([t for i, t in enumerate(found) if i % 16]))
 
 

@@ -87,7 +87,7 @@ def theorem_matrix(
     """
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y, v = system.channel[k], system.states, system.output.shape[1], system.disturbance.shape[2]
-    r, I = link.disturbances, np.eye  # noqa: E741
+    r, eye = link.disturbances, np.eye
     at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
     q = 4 * n + 2 * y + v + r
 
@@ -97,9 +97,9 @@ def theorem_matrix(
             result[:, at[name] : at[name] + block.shape[1]] = block
         return result
 
-    signal = np.concatenate([row(y, x=C, h=I(y), v=D), row(r, r=I(r))])
-    expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=I(y), d=-I(y))  # G-bar (C xhat + h(xhat))
-    own = np.concatenate([row(n, x=A, f=I(n), v=B), row(n, e=A, g=I(n), v=B) + gain @ expected])
+    signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])
+    expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=eye(y), d=-eye(y))  # G-bar (C xhat + h(xhat))
+    own = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
     correction = np.concatenate([np.zeros_like(gain), gain])
     inner = correction.T @ following @ correction
     cross = own.T @ following @ correction @ link.mean @ signal
@@ -113,8 +113,8 @@ def theorem_matrix(
     for i, (constant, weight_of) in enumerate(zip(constants, multipliers, strict=True)):
         width, value_at, point_at = (n, n, y, y)[i], at["fghd"[i]], at["xexe"[i]]
         value, point = slice(value_at, value_at + width), slice(point_at, point_at + n)
-        phi[value, value] -= weight_of * I(width)
-        phi[point, point] += weight_of * constant**2 * I(n)
+        phi[value, value] -= weight_of * eye(width)
+        phi[point, point] += weight_of * constant**2 * eye(n)
     return _without_absent(phi, at, y, system)
 
 
