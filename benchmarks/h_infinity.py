@@ -34,7 +34,7 @@ def milliseconds(call: Callable[[], object]) -> float:
 
 def recursion() -> tuple[float, float]:
     """First and median solve of the steps of a recursive design."""
-    from heliograph.design.h_infinity_solver import StepProblem
+    from heliograph.h_infinity.solver import StepProblem
 
     found: list[float] = []
     solve = StepProblem.solve

@@ -15,7 +15,7 @@ from typing import Any
 import heliograph as hg
 from heliograph.papers.cubature_fusion.compute import network
 from heliograph.papers.cubature_fusion.setting import STRONG
-from heliograph.progress import Countdown
+from heliograph.report.progress import Countdown
 
 RUNS = 1_000_000
 FILTER, FUSED = "cubature_zero_mean", "ci_equal"

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.design.linear_system import Steps
-from heliograph.design.lmmse import covariance_step
+from heliograph.linear.recursion import covariance_step
+from heliograph.linear.system import Steps
 from heliograph.random_affine.monomials import position
 
 DIMENSIONS = (4, 8, 16)

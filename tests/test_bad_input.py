@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as h
-from heliograph.filter.base import Claim
+from heliograph.model.estimate import Claim
 
 EYE = np.eye(2)
 SKEWED = [[1.0, 0.5], [0.4, 1.0]]
@@ -191,4 +191,4 @@ def test_a_covariance_that_is_lost_is_flagged_and_kept():
     net = h.Network(plant(), {"a": h.Node(sensor(), h.perfect(), {"losing": Losing()})})
     record = h.run(net, {"a": np.zeros(4)})
     assert record.failures() == ["a/losing: no valid covariance from step 2 in 1 of 1 runs"]
-    np.testing.assert_array_equal(np.asarray(record.estimates["a"]["losing"].bound)[:, 1, 1], [1, 1, -1, -1])
+    np.testing.assert_array_equal(np.asarray(record.estimates["a"]["losing"].covariance)[:, 1, 1], [1, 1, -1, -1])

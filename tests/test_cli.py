@@ -9,9 +9,9 @@ import pytest
 
 import heliograph as h
 from heliograph import cli
-from heliograph.load import load_network
-from heliograph.recording import read_recording
-from heliograph.table import read_table
+from heliograph.files.network_file import load_network
+from heliograph.files.recording import read_recording
+from heliograph.files.table import read_table
 
 NETWORK = """
 import jax.numpy as jnp
@@ -83,7 +83,7 @@ def test_run_writes_what_the_library_computes(folder, capsys):
             estimate = stream.push(recording.measurements["remote"][k], recording.inputs[k])
             row = {key: table[f"{name}.{key}"][k] for key in ("p", "v", "p.sd", "v.sd", "cov.p.v", "valid")}
             found = [row["p"], row["v"], row["p.sd"] ** 2, row["v.sd"] ** 2, row["cov.p.v"]]
-            bound = estimate.bound
+            bound = estimate.covariance
             expected = [*estimate.mean, bound[0, 0], bound[1, 1], bound[0, 1]]
             # compiled apart, and the variance went through a root and back: rounding only
             np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)

@@ -11,9 +11,9 @@ from heliograph.demo import run
 from heliograph.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
 from heliograph.demo.run import run_demo
 from heliograph.examples import plaza
-from heliograph.filter.base import Estimate
-from heliograph.plaza_recording import PlazaRecording, read_recording
-from heliograph.recording import read_recording as read_measurements
+from heliograph.examples.plaza_recording import PlazaRecording, read_recording
+from heliograph.files.recording import read_recording as read_measurements
+from heliograph.model.estimate import Estimate
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +86,7 @@ def test_filters_are_the_textbook_ones(
     mean, covariance = cubature_oracle(recording, received, gain_variance, noise)
     # Rounding only; errors of 1e-16 grow over 1816 steps of a stable filter by little.
     np.testing.assert_allclose(trial.estimates[name].mean, mean, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(trial.estimates[name].bound, covariance, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(trial.estimates[name].covariance, covariance, rtol=0, atol=1e-9)
 
 
 def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:

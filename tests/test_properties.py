@@ -44,7 +44,7 @@ def follow(item, z):
     for k, row in enumerate(z):
         state, estimate = item.step(state, row, (), k)
         result.append(estimate)
-    return np.array([e.mean for e in result]), np.array([e.bound for e in result])
+    return np.array([e.mean for e in result]), np.array([e.covariance for e in result])
 
 
 def close(first, second):
@@ -90,7 +90,7 @@ def test_recordings_step_by_step(case):
     item = hg.cubature_filter(plant, sensor, channel(chains))
     network = hg.Network(plant, {"node": hg.Node(sensor, channel(chains), {"f": item})})
     together = hg.run(network, {"node": z}).estimates["node"]["f"]
-    close((together.mean, together.bound), follow(item, z))
+    close((together.mean, together.covariance), follow(item, z))
 
 
 @FEW

@@ -1,6 +1,6 @@
 """Public names, in the order data flows. The package loads them when first used; this list is the only one."""
 
-from .over_time import (
+from .model.over_time import (
     OverTime as OverTime,
     over_time as over_time,
 )
@@ -29,16 +29,16 @@ from .random_affine import (
     second_order as second_order,
     square as square,
 )
-from .plant import (
+from .model.plant import (
     LinearPlant as LinearPlant,
     Plant as Plant,
     with_bias as with_bias,
 )
-from .sensor import (
+from .model.sensor import (
     LinearSensor as LinearSensor,
     Sensor as Sensor,
 )
-from .channel import (
+from .model.channel import (
     amplify_and_forward as amplify_and_forward,
     dropout as dropout,
     erasure as erasure,
@@ -49,121 +49,123 @@ from .channel import (
     silent as silent,
     with_direct_link as with_direct_link,
 )
-from .filter.base import (
-    AbstractFilter as AbstractFilter,
+from .model.estimate import (
     Estimate as Estimate,
 )
-from .filter.transform import (
+from .filters.base import (
+    AbstractFilter as AbstractFilter,
+)
+from .filters.transform import (
     Cubature as Cubature,
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
 )
-from .filter.correction import (
+from .filters.correction import (
     Scalars as Scalars,
 )
-from .filter.update import (
+from .filters.update import (
     Interval as Interval,
     LooseInterval as LooseInterval,
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
-from .design.linear_system import (
+from .linear.system import (
     LinearSystem as LinearSystem,
     Steps as Steps,
     state_moments as state_moments,
 )
-from .design.lift import (
+from .linear.lift import (
     lifted_system as lifted_system,
 )
-from .design.schedule import (
+from .linear.schedule import (
     Gains as Gains,
     Schedule as Schedule,
     load_schedule as load_schedule,
 )
-from .design.lmmse import (
+from .linear.recursion import (
     lmmse as lmmse,
     true_covariance as true_covariance,
 )
-from .design.worth import (
-    Worth as Worth,
-    worth as worth,
+from .linear.comparison import (
+    GainOverLinear as GainOverLinear,
+    gain_over_linear as gain_over_linear,
 )
-from .design.bounded import (
+from .linear.bounded import (
     Boundedness as Boundedness,
     boundedness as boundedness,
 )
-from .design.growth_system import (
+from .h_infinity.growth_system import (
     Growth as Growth,
     GrowthSystem as GrowthSystem,
     growth_system as growth_system,
 )
-from .design.growth_check import (
+from .h_infinity.growth_check import (
     GrowthFinding as GrowthFinding,
     check_growth as check_growth,
     check_size as check_size,
 )
-from .design.h_infinity import (
+from .h_infinity.design import (
     HInfinityDesign as HInfinityDesign,
     horizon_design as horizon_design,
     recursive_design as recursive_design,
     smallest_recursive_level as smallest_recursive_level,
 )
-from .design.h_infinity_closed_form import (
+from .h_infinity.closed_form import (
     known_channel_design as known_channel_design,
     level_without_measurements as level_without_measurements,
 )
-from .design.h_infinity_certificate import (
+from .h_infinity.certificate import (
     HInfinityCertificate as HInfinityCertificate,
     certify_level as certify_level,
 )
-from .filter.gaussian import (
+from .filters.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
     gaussian_filter as gaussian_filter,
     mean_gain_filter as mean_gain_filter,
 )
-from .filter.prediction import (
+from .filters.prediction import (
     prediction_of as prediction_of,
 )
-from .filter.boundedness import (
+from .filters.boundedness import (
     Ceiling as Ceiling,
     GrowthCondition as GrowthCondition,
     empirical_ceiling as empirical_ceiling,
     growth_condition as growth_condition,
     provable_ceiling as provable_ceiling,
 )
-from .filter.linear import (
+from .filters.linear import (
     linear_filter as linear_filter,
     open_loop_filter as open_loop_filter,
 )
-from .filter.scheduled import (
-    KalmanFilter as KalmanFilter,
+from .filters.scheduled import (
+    LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
 )
-from .filter.polynomial import (
+from .filters.polynomial import (
     PolynomialFilter as PolynomialFilter,
     memory_filter as memory_filter,
     polynomial_filter as polynomial_filter,
     scheduled_polynomial_filter as scheduled_polynomial_filter,
 )
-from .filter.mixture import (
+from .filters.mixture import (
     mixture_filter as mixture_filter,
 )
-from .filter.h_infinity import (
+from .filters.h_infinity import (
     HInfinityFilter as HInfinityFilter,
     h_infinity_filter as h_infinity_filter,
 )
-from .filter.sequential import (
+from .filters.sequential import (
     sequential_filter as sequential_filter,
 )
-from .quantizer import (
+from .fusion.quantizer import (
     AbstractQuantizer as AbstractQuantizer,
     EscapeQuantizer as EscapeQuantizer,
     Quantized as Quantized,
     UniformQuantizer as UniformQuantizer,
     ZoomQuantizer as ZoomQuantizer,
 )
-from .fusion import (
+from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
     EqualIntersection as EqualIntersection,
     FixedIntersection as FixedIntersection,
@@ -172,66 +174,66 @@ from .fusion import (
     WeightedFusion as WeightedFusion,
     fuse as fuse,
 )
-from .fusion_level import (
+from .fusion.level import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
     level_weights as level_weights,
     published_fused_level as published_fused_level,
 )
-from .design.relay_network import (
+from .model.relays import (
     RelayNetwork as RelayNetwork,
 )
-from .design.relay_design import (
+from .relays.design import (
     RelayDesign as RelayDesign,
     given_design as given_design,
     relay_schedules as relay_schedules,
 )
-from .design.own_error import (
+from .relays.own_error import (
     own_error_design as own_error_design,
 )
-from .design.receiver_error import (
+from .relays.receiver_error import (
     receiver_error_design as receiver_error_design,
 )
-from .design.behind_relays import (
+from .relays.receiver import (
     receiver_behind_relays as receiver_behind_relays,
 )
-from .design.periodic import (
+from .relays.periodic import (
     periodic_behind_relays as periodic_behind_relays,
     periodic_given_design as periodic_given_design,
     periodic_own_error_design as periodic_own_error_design,
 )
-from .design.periodic_tuning import (
+from .relays.periodic_tuning import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
 )
-from .design.certificate import (
+from .relays.certificate import (
     RelayCertificate as RelayCertificate,
     certify_relays as certify_relays,
 )
-from .simulate_relays import (
+from .simulation.simulate_relays import (
     initial_states as initial_states,
     simulate_relays as simulate_relays,
 )
-from .network import (
+from .simulation.network import (
     Network as Network,
     Node as Node,
 )
-from .simulate import (
+from .simulation.simulate import (
     monte_carlo as monte_carlo,
     run as run,
 )
-from .batch import (
+from .simulation.over_runs import (
     over_runs as over_runs,
 )
-from .stream import (
+from .simulation.stream import (
     Stream as Stream,
 )
-from .record import (
-    Link as Link,
+from .simulation.record import (
+    Uplink as Uplink,
     Record as Record,
     Trajectories as Trajectories,
 )
-from .consistency import (
+from .simulation.statistics import (
     ErrorStatistics as ErrorStatistics,
     Statistics as Statistics,
     error_statistics as error_statistics,
@@ -250,10 +252,10 @@ from .campaign.run import (
 from .campaign.summary import (
     open_results as open_results,
 )
-from .progress import (
+from .report.progress import (
     show_progress as show_progress,
 )
-from .compilation_cache import (
+from .numerics.compilation_cache import (
     keep_compilations as keep_compilations,
 )
 

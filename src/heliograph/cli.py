@@ -12,7 +12,7 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 import heliograph
-from heliograph.compilation_cache import keep_compilations
+from heliograph.numerics.compilation_cache import keep_compilations
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143  # the last two are 128 + the signal's number
 
@@ -56,15 +56,15 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
-    from heliograph.check import fail
-    from heliograph.table import check_output
+    from heliograph.files.table import check_output
+    from heliograph.numerics.check import fail
 
     check_output(out)
     if out.resolve() == measurements.resolve():
         raise fail(f"output file {out}", "another file than the measurements", "the same")
     with _progress("Starting") as say:
-        from heliograph.load import load_network
-        from heliograph.recording import read_recording, write_estimates
+        from heliograph.files.network_file import load_network
+        from heliograph.files.recording import read_recording, write_estimates
 
         loaded = load_network(network)
         if not any(node.filters for node in loaded.nodes.values()):
@@ -111,8 +111,8 @@ def reproduce(
     if method is None:
         print("\n".join(METHODS))
         return
-    from heliograph.check import fail
-    from heliograph.table import check_output_folder
+    from heliograph.files.table import check_output_folder
+    from heliograph.numerics.check import fail
 
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":

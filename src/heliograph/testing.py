@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from heliograph.filter.base import STRENGTH, AbstractFilter, Claim, Estimate
-from heliograph.fusion import AbstractFusion, fuse
-from heliograph.quantizer import AbstractQuantizer
+from heliograph.filters.base import AbstractFilter
+from heliograph.fusion.quantizer import AbstractQuantizer
+from heliograph.fusion.rules import AbstractFusion, fuse
+from heliograph.model.estimate import STRENGTH, Claim, Estimate
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.monomials import monomials
 
@@ -88,7 +89,7 @@ def check_filter(item: AbstractFilter, received: int, inputs: Any = (), steps: i
 
 
 def _check_estimate(estimate: Estimate, k: int) -> None:
-    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.bound)
+    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
     n = mean.shape[-1]
     assert bound.shape == (n, n), f"step {k}: expected a bound of shape {(n, n)}, got {bound.shape}"
     if estimate.claim == "none":
@@ -176,16 +177,16 @@ def check_fusion(rule: AbstractFusion, count: int = 3, n: int = 2, seed: int = 0
         bounds = np.stack([joint[i, :, i] for i in range(count)])
         alike = _fused(rule, np.ones((count, n)), np.broadcast_to(bounds[0], bounds.shape))
         _close("identical estimates", alike.mean, np.ones(n))
-        _close("identical bounds", alike.bound, bounds[0])
+        _close("identical bounds", alike.covariance, bounds[0])
         # The mean is linear in the means, so unit means give the gain of each input.
         units = np.moveaxis(np.eye(count * n).reshape(count * n, count, n), 1, 0)
         together = _fused(rule, units, np.broadcast_to(bounds[:, None], (count, count * n, n, n)))
         _close("fusing inside vmap", together.mean[0], _fused(rule, units[:, 0], bounds).mean)
         gains = np.asarray(together.mean).T
         if rule.claim(["upper"] * count) == "upper":
-            excess = gains @ joint.reshape(count * n, count * n) @ gains.T - together.bound[0]
+            excess = gains @ joint.reshape(count * n, count * n) @ gains.T - together.covariance[0]
             worst = np.linalg.eigvalsh(excess)[-1]
-            limit = ROUNDING * np.trace(together.bound[0])
+            limit = ROUNDING * np.trace(together.covariance[0])
             assert worst <= limit, f"bound: expected an upper one, exceeded by {worst:g}"
 
 

@@ -32,7 +32,7 @@ def test_the_numbers_are_those_of_monte_carlo(tmp_path, finished):
         estimate = record.estimates["near"]["trusting"]
         # Two compilations of the same arithmetic: rounding only.
         np.testing.assert_allclose(stored.error, record.errors("near", "trusting"), rtol=1e-12, atol=1e-14)
-        np.testing.assert_allclose(stored.variance[..., 0], estimate.bound[..., 0, 0], rtol=1e-12)
+        np.testing.assert_allclose(stored.variance[..., 0], estimate.covariance[..., 0, 0], rtol=1e-12)
         nees = stored.error[..., 0] ** 2 / stored.variance[..., 0]
         np.testing.assert_allclose(stored.nees_per_dimension, nees, rtol=1e-12)
 

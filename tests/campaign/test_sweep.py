@@ -6,7 +6,7 @@ from heliograph import cli
 from heliograph.campaign.figures import NEES, RMSE, against, by_setting, campaign_figures
 from heliograph.campaign.page import campaign_page
 from heliograph.campaign.summary import read_summary
-from heliograph.progress import Countdown, spoken
+from heliograph.report.progress import Countdown, spoken
 from tests.campaign.example import CAMPAIGN, write
 
 

@@ -199,7 +199,7 @@ def test_claims_follow_the_numbers(result):
 
 
 def overstated(statistics):
-    return replace(statistics, bound=statistics.bound / 4)
+    return replace(statistics, covariance=statistics.covariance / 4)
 
 
 @pytest.mark.parametrize("runs", [0, 9, 64.5])

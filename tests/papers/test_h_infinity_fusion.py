@@ -132,7 +132,7 @@ def test_with_the_papers_start_only_the_start_counts():
 def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(monkeypatch):
     assert all(one_step.enumeration_gap(i) < 1e-14 for i in range(4))  # rounding
     honest = one_step.theorem_matrix
-    off = setting.system(1, hop=lambda link, noise: setting.lossy(link, noise if link else 1.01 * noise))
+    off = setting.system(1, hop=lambda uplink, noise: setting.lossy(uplink, noise if uplink else 1.01 * noise))
     monkeypatch.setattr(one_step, "theorem_matrix", lambda system, *rest: honest(off, *rest))
     assert one_step.enumeration_gap(1) > 1e-6  # one noise's variance 1 % too large
 
@@ -190,11 +190,11 @@ def test_errors_saturation_and_indices(outcome):
         assert abs(mean - expected) < 5 * error + 1e-4, quantizer  # the last printed digit, twice
     mean, error = outcome.mean_error("zero_gain", "none")
     assert mean == pytest.approx(0.0354, abs=5.1e-5) and error < 1e-15  # nothing is random without measurements
-    link = outcome.record.links[example.fused_name(RECURSIVE, "dynamic")]
-    assert link.saturated.mean() == pytest.approx(0.262, abs=0.01)  # 128 runs; the printed digits of the mean
+    uplink = outcome.record.uplinks[example.fused_name(RECURSIVE, "dynamic")]
+    assert uplink.saturated.mean() == pytest.approx(0.262, abs=0.01)  # 128 runs; the printed digits of the mean
     replayed = indices.replay(outcome)
     np.testing.assert_array_equal(np.abs(outcome.estimates(RECURSIVE)) > replayed.amplitude,
-                                  np.swapaxes(link.saturated, 1, 2))  # fmt: skip
+                                  np.swapaxes(uplink.saturated, 1, 2))  # fmt: skip
     found = indices.indices(outcome, replayed)
     np.testing.assert_allclose(found.local[RECURSIVE], [-310.5, -273.5, -309.5, -351.3], atol=0.051)
     assert found.fused[RECURSIVE] == pytest.approx(-2470.2, abs=0.051)

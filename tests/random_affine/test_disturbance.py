@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.random_affine.disturbance import disturbed_gain
-from tests.design.h_infinity_problems import channel
+from tests.h_infinity.h_infinity_problems import channel
 
 probability = st.floats(0.0, 1.0)
 

@@ -6,10 +6,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filter.base import Estimate
-from heliograph.linalg import psd_solve
-from heliograph.network import Network
-from heliograph.record import AbstractReducer
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.linalg import psd_solve
+from heliograph.simulation.network import Network
+from heliograph.simulation.record import AbstractReducer
 
 
 class Errors(AbstractReducer):
@@ -44,7 +44,7 @@ class Errors(AbstractReducer):
 
 
 def _errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    error, bound = truth - estimate.mean, jnp.asarray(estimate.bound)
+    error, bound = truth - estimate.mean, jnp.asarray(estimate.covariance)
 
     def squared_distance(b: jax.Array, e: jax.Array) -> jax.Array:
         return e @ psd_solve(b, e[:, None])[:, 0]

@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from heliograph.check import fail
-from heliograph.network import Network
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network
 
 Claims = dict[str, dict[str, str]]
 

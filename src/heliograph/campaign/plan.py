@@ -12,8 +12,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.load import load_function
-from heliograph.network import Network
+from heliograph.files.network_file import load_function
+from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
 BITWISE = ("heliograph", "jax", "jaxlib", "equinox", "numpy", "zarr")  # packages that decide about the store's bytes

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, canonical, versions
-from heliograph.check import check_count, fail
-from heliograph.lanes import BLOCK
+from heliograph.numerics.check import check_count, fail
+from heliograph.simulation.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "grid", "settings")
 KEEP = ("errors", "trajectories")

@@ -23,8 +23,8 @@ from heliograph.campaign.store import (
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
-from heliograph.check import fail
-from heliograph.output_folder import check_replaceable
+from heliograph.files.output_folder import check_replaceable
+from heliograph.numerics.check import fail
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]

@@ -13,7 +13,7 @@ import rich.table
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.run import Tell
 from heliograph.campaign.summary import Score
-from heliograph.progress import Countdown, counting
+from heliograph.report.progress import Countdown, counting
 
 ROWS = 30  # of the printed table; the file has all
 

@@ -20,8 +20,8 @@ from zarr.codecs import ZstdCodec
 from heliograph.campaign.labels import Claims, Labels, labels_from
 from heliograph.campaign.plan import Campaign, Chunk
 from heliograph.campaign.read import read_campaign
-from heliograph.check import fail
-from heliograph.output_folder import whole_folder
+from heliograph.files.output_folder import whole_folder
+from heliograph.numerics.check import fail
 
 STORE = "results.zarr"
 ERRORS = {  # variables by name: their axes and what they are

@@ -11,7 +11,7 @@ import zarr
 
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 
 SUMMARY = "summary.csv"
 

@@ -13,10 +13,10 @@ from heliograph.campaign.keep import Errors
 from heliograph.campaign.labels import Labels, check_within, describe, labels_from
 from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
 from heliograph.campaign.store import stored_labels, write_chunk
-from heliograph.check import fail
-from heliograph.network import Network
-from heliograph.over_time import alike
-from heliograph.simulate import monte_carlo
+from heliograph.model.over_time import alike
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network
+from heliograph.simulation.simulate import monte_carlo
 
 COMPILED = 16  # structures of networks whose compiled programs are kept
 

@@ -8,17 +8,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.channel import hop, perfect
-from heliograph.check import fail
 from heliograph.examples import plaza
-from heliograph.filter.base import Estimate
-from heliograph.filter.gaussian import cubature_filter
-from heliograph.float64 import compiled
-from heliograph.network import Network, Node
-from heliograph.plaza_recording import PlazaRecording
+from heliograph.examples.plaza_recording import PlazaRecording
+from heliograph.filters.gaussian import cubature_filter
+from heliograph.model.channel import hop, perfect
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import AbstractRandomAffine, apply
 from heliograph.random_affine.second_order import second_order
-from heliograph.simulate import run
+from heliograph.simulation.network import Network, Node
+from heliograph.simulation.simulate import run
 
 SEEDS = 5  # seeds of the relay for the spread: the one asked for and those after it
 NAMES = ("relay_aware", "extra_noise", "mean_gain", "perfect_channel", "open_loop")
@@ -113,7 +113,7 @@ def one_trial(recording: PlazaRecording, network: Network, seed: int) -> Trial:
 def position_nees(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
     """e' B^-1 e / 2 of the position at each row, (rows,)."""
     error = (np.asarray(estimate.mean) - truth)[:, :2, None]
-    weighted = np.linalg.solve(np.asarray(estimate.bound)[:, :2, :2], error)
+    weighted = np.linalg.solve(np.asarray(estimate.covariance)[:, :2, :2], error)
     result: np.ndarray = np.sum(error * weighted, axis=(1, 2)) / 2
     return result
 
@@ -122,7 +122,7 @@ def score(estimate: Estimate, truth: np.ndarray) -> Score:
     """Score one filter's estimates of the position."""
     nees = position_nees(estimate, truth)
     squared = np.sum((np.asarray(estimate.mean) - truth)[:, :2] ** 2, axis=1)
-    claimed = np.trace(np.asarray(estimate.bound)[:, :2, :2], axis1=1, axis2=2)
+    claimed = np.trace(np.asarray(estimate.covariance)[:, :2, :2], axis1=1, axis2=2)
     inside = np.mean(2 * nees <= INSIDE_95)
     return Score(float(np.sqrt(squared.mean())), float(np.sqrt(claimed.mean())), float(nees.mean()), float(inside))
 

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 
 from heliograph.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
 from heliograph.examples import plaza
-from heliograph.plaza_recording import WINDOW
+from heliograph.examples.plaza_recording import WINDOW
 from heliograph.report.figures import (
     BLUE,
     GREEN,
@@ -32,7 +32,7 @@ def demo_figures(outcome: Outcome) -> dict[str, Figure]:
     recording, trial = outcome.recording, outcome.trials[0]
     clock, truth = recording.time - recording.start, recording.truth[:, :2]
     means = {name: np.asarray(trial.estimates[name].mean)[:, :2] for name in NAMES}
-    variances = {n: np.diagonal(np.asarray(trial.estimates[n].bound), axis1=1, axis2=2)[:, :2] for n in SHOWN}
+    variances = {n: np.diagonal(np.asarray(trial.estimates[n].covariance), axis1=1, axis2=2)[:, :2] for n in SHOWN}
     errors = [Curve(LABELS[n], COLOURS[n], means[n] - truth, np.sqrt(variances[n])) for n in SHOWN]
     nees = [Curve(LABELS[n], COLOURS[n], position_nees(trial.estimates[n], recording.truth)) for n in SHOWN]
     return {

@@ -13,12 +13,12 @@ import rich.table
 
 from heliograph.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
 from heliograph.examples import plaza
-from heliograph.output_folder import check_replaceable, whole_folder
-from heliograph.plaza_recording import read_recording
-from heliograph.progress import progress
-from heliograph.record import Record
-from heliograph.recording import write_estimates
-from heliograph.table import write_table
+from heliograph.examples.plaza_recording import read_recording
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.files.recording import write_estimates
+from heliograph.files.table import write_table
+from heliograph.report.progress import progress
+from heliograph.simulation.record import Record
 
 SUMMARY = "summary.json"  # also tells an earlier demonstration from other folders
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.check import array
+from heliograph.numerics.check import array
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.monomials import (

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.law import Constant, Discrete

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from heliograph.check import fail, scalar
+from heliograph.numerics.check import fail, scalar
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 
 

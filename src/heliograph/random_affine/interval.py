@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Lift, Series, Stack

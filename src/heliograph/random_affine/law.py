@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import special
 
-from heliograph.check import array, fail, probabilities, radii, scalar
+from heliograph.numerics.check import array, fail, probabilities, radii, scalar
 
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 

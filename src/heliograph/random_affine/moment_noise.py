@@ -7,7 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.check import array, fail
+from heliograph.numerics.check import array, fail
 from heliograph.random_affine.monomials import Exponents, exponents
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.check import array, covariance, fail, probabilities
+from heliograph.numerics.check import array, covariance, fail, probabilities
 from heliograph.random_affine.monomials import Exponents, exponents
 
 

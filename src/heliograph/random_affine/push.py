@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series

@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.small_matrix import add, contract, diagonal
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.monomials import exponents
-from heliograph.small_matrix import add, contract, diagonal
 
 PROPORTIONAL_TOLERANCE = 1e-12  # relative: two tensors computed by different sums are one multiple of the other
 

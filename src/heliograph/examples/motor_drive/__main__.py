@@ -18,8 +18,8 @@ from heliograph.examples.motor_drive.compute import (
     compute,
 )
 from heliograph.examples.motor_drive.drive import simulator
-from heliograph.output_folder import check_replaceable, whole_folder
-from heliograph.progress import progress
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells earlier results from other folders
 

@@ -9,11 +9,11 @@ import numpy as np
 from scipy import stats
 
 import heliograph as hg
-from heliograph.check import check_count, fail
 from heliograph.examples.motor_drive.drive import Drive, simulate_drive
 from heliograph.examples.motor_drive.listeners import network, received
 from heliograph.examples.motor_drive.machine import RATED, ROTOR_RESISTANCE, Machine, draw_truth, euler, plant
-from heliograph.float64 import compiled
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.float64 import compiled
 
 SEEDS = 20
 DEAD_TIME = 2e-6  # s, of the inverter
@@ -116,7 +116,7 @@ def run_case(case: Case) -> hg.Record:
 
 def score(record: hg.Record, node: str, name: str) -> Score:
     """Score one filter of a record with a leading axis of seeds."""
-    errors, bound = record.errors(node, name), np.asarray(record.estimates[node][name].bound)
+    errors, bound = record.errors(node, name), np.asarray(record.estimates[node][name].covariance)
     seeds, _, n = errors.shape
     mean_square, claim = np.mean(errors**2, axis=0), np.diagonal(bound.mean(axis=0), axis1=1, axis2=2)
     bias = errors.mean(axis=0) ** 2 - errors.var(axis=0, ddof=1) / seeds

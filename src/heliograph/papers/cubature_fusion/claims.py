@@ -3,7 +3,7 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.filter.boundedness import empirical_ceiling, growth_condition
+from heliograph.filters.boundedness import empirical_ceiling, growth_condition
 from heliograph.papers.claim import Claim, Verdict, holds
 from heliograph.papers.cubature_fusion import one_step
 from heliograph.papers.cubature_fusion.compute import SIGNIFICANT, Outcome, Reproduction

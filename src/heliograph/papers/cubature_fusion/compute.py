@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 import heliograph as hg
-from heliograph.filter.update import AbstractUpdate
+from heliograph.filters.update import AbstractUpdate
 from heliograph.papers.cubature_fusion.setting import (
     NODES,
     PRINTED,

@@ -119,7 +119,7 @@ def _root(result: Reproduction) -> Claim:
 
 def _fusion(result: Reproduction) -> Claim:
     local = [result.printed.shown.estimates[node]["cubature_printed_fixed"] for node in NODES]
-    means, bounds = (np.stack([np.asarray(getattr(e, a))[0] for e in local], axis=1) for a in ("mean", "bound"))
+    means, bounds = (np.stack([np.asarray(getattr(e, a))[0] for e in local], axis=1) for a in ("mean", "covariance"))
     error = one_step.printed_fusion_error(means, bounds)
     ours = f"ΞΣw Ξᵢ⁻¹x̂ᵢ, as in (8); the printed inverse is off by up to {error:.1e} in a run of the printed example"
     return Claim("The fused estimate is Ξ⁻¹ Σ w Ξᵢ⁻¹ x̂ᵢ", "Step 6", "", ours, "fails")

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filter.transform import AbstractTransform
-from heliograph.float64 import to_numpy
+from heliograph.filters.transform import AbstractTransform
+from heliograph.numerics.float64 import to_numpy
 from heliograph.papers.cubature_fusion.setting import OUTPUTS, Setting, transition
 
 Array = np.ndarray

@@ -11,8 +11,8 @@ import rich.console
 import rich.progress
 
 import heliograph as hg
-from heliograph.check import fail
-from heliograph.output_folder import check_replaceable, whole_folder
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.numerics.check import fail
 from heliograph.papers.claim import Claim
 from heliograph.papers.cubature_fusion.claims import claims
 from heliograph.papers.cubature_fusion.compute import RUNS, Outcome, Reproduction, Tell, reproduction

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filter.gaussian import GaussianFilter
-from heliograph.filter.transform import AbstractTransform
-from heliograph.filter.update import AbstractUpdate
+from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.transform import AbstractTransform
+from heliograph.filters.update import AbstractUpdate
 
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2", "x3", "x4", "x5")

@@ -7,13 +7,14 @@ import jax
 import jax.numpy as jnp
 
 import heliograph as hg
-from heliograph.filter.base import AbstractFilter, Claim, Estimate
-from heliograph.filter.correction import Signal
-from heliograph.filter.gaussian import Belief, GaussianFilter, corrected
-from heliograph.filter.update import AbstractUpdate
-from heliograph.float64 import compiled
-from heliograph.linalg import cholesky
-from heliograph.over_time import at
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.correction import Signal
+from heliograph.filters.gaussian import Belief, GaussianFilter, corrected
+from heliograph.filters.update import AbstractUpdate
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.linalg import cholesky
 from heliograph.papers.cubature_fusion.setting import Setting, cubature
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import SecondOrder

@@ -74,8 +74,8 @@ class Reproduction:
 
     def saturated(self, quantizer: str, first: int = 0) -> float:
         """Share of samples out of reach from step `first` on."""
-        link = self.outcome.record.links[fused_name(RECURSIVE, quantizer)]
-        return float(link.saturated[:, first:].mean())
+        uplink = self.outcome.record.uplinks[fused_name(RECURSIVE, quantizer)]
+        return float(uplink.saturated[:, first:].mean())
 
 
 def reproduction(runs: int, seed: int, advance: Callable[[str], None] = lambda what: None) -> Reproduction:

@@ -102,7 +102,7 @@ def _quantizer(result: Reproduction) -> list[Claim]:
     share, late = 100 * result.saturated("dynamic"), 100 * result.saturated("dynamic", 7)
     away = [int(s) for s in np.flatnonzero(sent.broken_local > 0)]
     printed, ours = (outcome.mean_error(RECURSIVE, q)[0] for q in ("dynamic", "dynamic_decodable"))
-    symbols = outcome.record.links[f"{RECURSIVE}.dynamic_decodable"].symbols_per_value()
+    symbols = outcome.record.uplinks[f"{RECURSIVE}.dynamic_decodable"].symbols_per_value()
     return [
         Claim("|mu| <= u d / p", "(13)", "always",
               f"not where it saturates: {share:.1f} % of samples, {late:.1f} % from s = 7 on, where |mu| is up to "

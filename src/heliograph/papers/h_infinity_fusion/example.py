@@ -6,10 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filter.gaussian import GaussianFilter
-from heliograph.filter.prediction import prediction_of
+from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.prediction import prediction_of
+from heliograph.fusion.quantizer import Quantizer
 from heliograph.papers.h_infinity_fusion import setting
-from heliograph.quantizer import Quantizer
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
 QUANTIZERS: dict[str, Quantizer | None] = {

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.check import fail
-from heliograph.design.h_infinity_solver import Objective
+from heliograph.h_infinity.solver import Objective
+from heliograph.numerics.check import fail
 from heliograph.papers.h_infinity_fusion import setting
 
 OBJECTIVES: tuple[Objective, ...] = ("trace", "log_determinant", "largest_eigenvalue")

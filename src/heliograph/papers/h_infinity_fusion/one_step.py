@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.design.h_infinity_certificate import theorem_matrix
+from heliograph.h_infinity.certificate import theorem_matrix
 from heliograph.papers.h_infinity_fusion import setting
 
 WIDTHS = (2, 2, 2, 2, 1, 1, 1, 3)  # x, e, f, f~, h, h~, v, rho

@@ -129,8 +129,8 @@ def _growth(result: Reproduction) -> Figure:
 def _quantizer(result: Reproduction) -> Figure:
     d = result.replayed.amplitude.mean(axis=(0, 1))
     x = np.abs(result.outcome.estimates(RECURSIVE)).mean(axis=(0, 1))
-    link = result.outcome.record.links[fused_name(RECURSIVE, "dynamic")]
-    share = 100 * link.saturated.mean(axis=(0, 2))
+    uplink = result.outcome.record.uplinks[fused_name(RECURSIVE, "dynamic")]
+    share = 100 * uplink.saturated.mean(axis=(0, 2))
     states = list(zip(setting.STATES, (BLUE, VERMILION), (0, 1), strict=True))
     panels = [
         Panel("log₁₀ of size",

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.check import fail
-from heliograph.output_folder import check_replaceable, whole_folder
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.numerics.check import fail
 from heliograph.papers.claim import Claim
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.claims import claims
@@ -17,7 +17,7 @@ from heliograph.papers.h_infinity_fusion.discriminating import NODE, Discriminat
 from heliograph.papers.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZERS, RECURSIVE, Outcome, fused_name
 from heliograph.papers.h_infinity_fusion.levels import NodeDesigns
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
-from heliograph.progress import progress
+from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
 FOLDER = "h-infinity-fusion"
@@ -71,7 +71,7 @@ def write(result: Reproduction, folder: Path) -> None:
 def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
     """All numbers."""
     outcome = result.outcome
-    decodable = outcome.record.links[fused_name(RECURSIVE, "dynamic_decodable")]
+    decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
     return {
         "paper": "Distributed fusion filtering for nonlinear time-varying systems over amplify-and-forward relay "
         "networks: an H-infinity quantized framework",

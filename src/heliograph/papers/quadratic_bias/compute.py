@@ -8,26 +8,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.channel import Channel
-from heliograph.consistency import ErrorStatistics, Statistics
-from heliograph.design.bounded import Boundedness, boundedness
-from heliograph.design.lift import lifted_system
-from heliograph.design.lmmse import lmmse
-from heliograph.design.memory import memory_system
-from heliograph.design.schedule import Schedule
-from heliograph.design.worth import skewness
-from heliograph.filter.base import AbstractFilter
-from heliograph.filter.mixture import mixture_filter
-from heliograph.filter.polynomial import MemoryFilter, PolynomialFilter
-from heliograph.filter.scheduled import ScheduledFilter
-from heliograph.network import Network, Node
-from heliograph.over_time import first
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.mixture import mixture_filter
+from heliograph.filters.polynomial import MemoryFilter, PolynomialFilter
+from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.linear.bounded import Boundedness, boundedness
+from heliograph.linear.comparison import skewness
+from heliograph.linear.lift import lifted_system
+from heliograph.linear.memory import memory_system
+from heliograph.linear.recursion import lmmse
+from heliograph.linear.schedule import Schedule
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
 from heliograph.papers.quadratic_bias import setting
 from heliograph.papers.quadratic_bias.printed import Printed, printed_quadratic
-from heliograph.plant import AnyPlant
-from heliograph.record import AbstractReducer, Record, trajectories_record
-from heliograph.sensor import AnySensor
-from heliograph.simulate import monte_carlo
+from heliograph.simulation.network import Network, Node
+from heliograph.simulation.record import AbstractReducer, Record, trajectories_record
+from heliograph.simulation.simulate import monte_carlo
+from heliograph.simulation.statistics import ErrorStatistics, Statistics
 
 RUNS = 20_000
 RESOLUTION = 0.01  # of z for the mixture filter, where a link that is off leaves z with a few exact values

@@ -4,14 +4,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.channel import Channel
-from heliograph.design.lift import lifted_system
-from heliograph.design.linear_system import LinearSystem, state_moments
-from heliograph.design.lmmse import lmmse, true_covariance
-from heliograph.design.schedule import Schedule
-from heliograph.plant import AnyPlant
+from heliograph.linear.lift import lifted_system
+from heliograph.linear.recursion import lmmse, true_covariance
+from heliograph.linear.schedule import Schedule
+from heliograph.linear.system import LinearSystem, state_moments
+from heliograph.model.channel import Channel
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
 from heliograph.random_affine import known
-from heliograph.sensor import AnySensor
 
 
 class Printed(NamedTuple):

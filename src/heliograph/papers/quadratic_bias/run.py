@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from heliograph.check import fail
-from heliograph.output_folder import check_replaceable, whole_folder
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.numerics.check import fail
 from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
@@ -20,7 +20,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
     simulated_over_time,
 )
-from heliograph.progress import progress
+from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
 FOLDER = "quadratic-bias"

@@ -2,9 +2,10 @@
 
 import numpy as np
 
-from heliograph.channel import amplify_and_forward
-from heliograph.over_time import OverTime, over_time
-from heliograph.plant import LinearPlant, with_bias
+from heliograph.model.channel import amplify_and_forward
+from heliograph.model.over_time import OverTime, over_time
+from heliograph.model.plant import LinearPlant, with_bias
+from heliograph.model.sensor import LinearSensor
 from heliograph.random_affine import (
     AbstractRandomAffine,
     Discrete,
@@ -13,7 +14,6 @@ from heliograph.random_affine import (
     Independent,
     Shaped,
 )
-from heliograph.sensor import LinearSensor
 
 HORIZON = 100
 SETTLED = 30  # library step of t = 31: means are over t = 31 ... 100

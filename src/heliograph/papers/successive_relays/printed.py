@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.check import fail
+from heliograph.numerics.check import fail
 from heliograph.papers.successive_relays import setting
 
 MISPRINTS = ("none", "lemma_1", "theorem_1", "lemma_7", "lemma_6_sign", "lemma_6_last")

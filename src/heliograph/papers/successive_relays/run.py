@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.check import fail
-from heliograph.output_folder import check_replaceable, whole_folder
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.files.recording import write_estimates
+from heliograph.numerics.check import fail
 from heliograph.papers.successive_relays.claims import claims, tuned_mean_ratio
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
-from heliograph.progress import progress
-from heliograph.recording import write_estimates
+from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
 FOLDER = "successive-relays"
@@ -75,7 +75,8 @@ def write_record(result: Reproduction, folder: Path) -> None:
     assert run.truth is not None
     estimates = {
         NAMES[node]: {
-            name: hg.Estimate(np.asarray(e.mean)[0], np.asarray(e.bound)[0], e.claim) for name, e in filters.items()
+            name: hg.Estimate(np.asarray(e.mean)[0], np.asarray(e.covariance)[0], e.claim)
+            for name, e in filters.items()
         }
         for node, filters in run.estimates.items()
     }

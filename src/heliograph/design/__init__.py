@@ -1,1 +1,0 @@
-"""Offline design: from system and network to gains, before any data."""

@@ -1,0 +1,1 @@
+"""Networks, recordings and tables in files."""

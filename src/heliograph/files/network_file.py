@@ -1,0 +1,161 @@
+"""A network from a user's own Python module."""
+
+import importlib
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from functools import wraps
+from importlib.util import find_spec, module_from_spec, spec_from_file_location
+from pathlib import Path
+from types import ModuleType
+from typing import Any, TypeVar
+
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network
+
+T = TypeVar("T")
+
+
+def load_network(reference: str) -> Network:
+    """The network in "my_network.py", "my_network.py:name" or "package.module:name".
+
+    Without a name the module must hold exactly one network; the name may also be that of a function without
+    arguments that returns one. A file finds other modules in its own folder, as a script does.
+
+    Raises:
+        ValueError: no such module, an error inside it (with its type, message and line), no network, or several
+            and no name. One line that names the module.
+    """
+    place, _, name = reference.rpartition(":")
+    if not place or not name.isidentifier():  # no name, or the colon of a drive letter
+        place, name = reference, ""
+    if place.endswith(".py") or os.sep in place or Path(place).is_file():
+        path = Path(place)
+        if not path.is_file():
+            raise fail(f"network {place}", "a Python file", "a folder" if path.is_dir() else "nothing of that name")
+        with _importing_from(path.parent):
+            module = _guarded(lambda: _run_file(path), place, path)
+            return _pick(module, name, place, path)
+    with _importing_from(Path.cwd()):
+        source = _guarded(lambda: _source(place), place, None)
+        module = _guarded(lambda: importlib.import_module(place), place, source)
+        return _pick(module, name, place, source)
+
+
+def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
+    """The function `name` of a Python file with this source, which need not be the file's; it returns a network.
+
+    The module finds others in the file's folder, when it is loaded and when the function is called.
+
+    Raises:
+        ValueError: as `load_network`; calling the function raises the same.
+    """
+    place = f"{path.name}:{name}"
+    with _importing_from(path.parent):
+        module = _guarded(lambda: _run_source(path, source), path.name, path)
+    function = getattr(module, name, None)
+    if not callable(function):
+        came = "an unknown name" if function is None else type(function).__name__
+        raise fail(f"network {place}", "a function that returns a heliograph.Network", came)
+
+    @wraps(function)
+    def build(*args: Any, **kwargs: Any) -> Network:
+        with _importing_from(path.parent):
+            network = _guarded(lambda: function(*args, **kwargs), place, path)
+        if not isinstance(network, Network):
+            raise fail(f"network {place}", "a heliograph.Network", type(network).__name__)
+        return network
+
+    return build
+
+
+def _pick(module: ModuleType, name: str, place: str, path: Path | None) -> Network:
+    networks = {key: value for key, value in vars(module).items() if isinstance(value, Network)}
+    if name:
+        return _named(module, name, place, path, networks)
+    if len({id(network) for network in networks.values()}) == 1:
+        return next(iter(networks.values()))
+    if networks:
+        choices = " or ".join(f"{place}:{key}" for key in networks)
+        raise fail(f"network {place}", f"a name, as {choices}", f"none, and {len(networks)} networks")
+    raise fail(
+        f"network {place}",
+        f"a heliograph.Network (or {place}:FUNCTION that returns one)",
+        "none in the module",
+    )
+
+
+def _named(module: ModuleType, name: str, place: str, path: Path | None, networks: dict[str, Network]) -> Network:
+    if not hasattr(module, name):
+        close = get_close_matches(name, [key for key in vars(module) if not key.startswith("_")], 1)
+        holds = ", ".join(networks) or "no networks"
+        hint = f" (closest: {close[0]!r})" if close else ""
+        raise fail(f"network {place}:{name}", f"a name in the module, which holds {holds}", f"an unknown name{hint}")
+    value = getattr(module, name)
+    if callable(value) and not isinstance(value, Network):
+        value = _guarded(value, f"{place}:{name}", path)
+    if not isinstance(value, Network):
+        raise fail(f"network {place}:{name}", "a heliograph.Network", type(value).__name__)
+    return value
+
+
+def _source(module: str) -> Path | None:
+    """The file of an importable module, whose errors are then reported with their line."""
+    spec = find_spec(module)
+    if spec is None:
+        raise ModuleNotFoundError(f"No module named {module!r}")
+    return Path(spec.origin) if spec.origin else None
+
+
+def _run_file(path: Path) -> ModuleType:
+    return _run_source(path, path.read_bytes())
+
+
+def _run_source(path: Path, source: str | bytes) -> ModuleType:
+    """Run a file's source as a module of its own; unlike an import, nothing is written beside it."""
+    name = f"heliograph_network_{path.stem}"
+    spec = spec_from_file_location(name, path)
+    if spec is None:
+        raise ImportError(f"{path} is no Python source")
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up while it runs
+    try:
+        exec(compile(source, str(path), "exec"), vars(module))
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
+
+
+def _guarded(call: Callable[[], T], name: str, path: Path | None) -> T:
+    """Call the user's code; an error in it becomes one line with its type, message and line."""
+    try:
+        return call()
+    except (Exception, SystemExit) as error:
+        came = f"{type(error).__name__}{_line(error, path)}: {error}"
+        raise fail(f"network {name}", "Python that runs", " ".join(came.split())) from error
+
+
+def _line(error: BaseException, path: Path | None) -> str:
+    """Where in the user's file the error arose: the innermost frame there."""
+    if isinstance(error, SyntaxError):
+        return f" in line {error.lineno}"
+    if path is None:
+        return ""
+    lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+    return f" in line {lines[-1]}" if lines else ""
+
+
+@contextmanager
+def _importing_from(folder: Path) -> Iterator[None]:
+    """Let imports find modules in `folder` first."""
+    entry = str(folder.resolve())
+    sys.path.insert(0, entry)
+    try:
+        yield
+    finally:
+        if entry in sys.path:  # the user's module may have changed the path itself
+            sys.path.remove(entry)

@@ -1,0 +1,192 @@
+"""Measured data in, estimates out: a table of times, inputs and measurements, and one of means and covariances."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.files.table import read_table, write_table
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import first
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network, Node
+from heliograph.simulation.record import Record, is_sound
+
+TIME = "time"
+TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
+
+
+class Recording(NamedTuple):
+    """Measured data as `heliograph.run` takes it: `run(network, *recording)`.
+
+    Shapes: measurements[node] (steps, received), NaN where one did not arrive; inputs (steps, inputs); time (steps,).
+    """
+
+    measurements: dict[str, np.ndarray]
+    inputs: np.ndarray
+    time: np.ndarray
+
+
+def read_recording(path: str | Path, network: Network) -> Recording:
+    """Read measured data for a network from a CSV or Parquet file with the columns that `recording_of` takes.
+
+    Raises:
+        ValueError: a file that is no table of numbers, or columns and rows that `recording_of` refuses.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    return recording_of(read_table(path), network, str(path))
+
+
+def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str = "recording") -> Recording:
+    """Sort columns of numbers into what `run` takes.
+
+    Columns: `time`, which never goes backwards; each plant input by its name (an input `dt` may be left out: it is
+    the time since the previous row, 0 in the first); each received component by `node.name` or, where only one
+    thing has that name, by `name`. Components are named as the sensor's outputs where the channel keeps their
+    number, else z0, z1, ... A measurement that is NaN did not arrive.
+
+    Raises:
+        ValueError: unknown, missing or doubled columns; a time or an input that is missing; infinite numbers;
+            times that go backwards. One line that names the row, from 1, and the column.
+    """
+    inputs, received = network.inputs, _received_columns(network)
+    if TIME in inputs:
+        raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
+    expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
+    _refuse_unknown(columns, expected, source)
+
+    def find(names: tuple[str, ...]) -> str:
+        return _find(columns, names, source)
+
+    time = _complete(columns, find((TIME,)), source)
+    backwards = np.flatnonzero(np.diff(time) < 0)
+    if backwards.size:
+        row = int(backwards[0]) + 1
+        came = f"{time[row]:.10g} after {time[row - 1]:.10g}"
+        raise fail(f"{source}, row {row + 1}, column {TIME!r}", "a time that does not go backwards", came)
+    measurements = {
+        node: np.stack([_measured(columns, find(names), source) for names in components], axis=1)
+        for node, components in received.items()
+    }
+    u = np.zeros((len(time), len(inputs)))
+    for i, name in enumerate(inputs):
+        fill = name == TIME_STEP and name not in columns
+        u[:, i] = np.diff(time, prepend=time[0]) if fill else _complete(columns, find((name,)), source)
+    return Recording(measurements, u, time)
+
+
+def received_names(node: Node) -> tuple[str, ...]:
+    """Names of what reaches a node's filters: the sensor's outputs where they are as many, else z0, z1, ..."""
+    outputs: tuple[str, ...] = first(node.sensor).outputs
+    return outputs if len(outputs) == node.received else tuple(f"z{i}" for i in range(node.received))
+
+
+def estimate_columns(record: Record) -> dict[str, np.ndarray]:
+    """The estimates of a recording as columns.
+
+    `time`; then for each filter the mean `STATE`, the standard deviation `STATE.sd`, the covariances `cov.A.B` (A
+    before B in the state), and `valid`: false where mean or covariance are not finite, or the covariance is no
+    longer positive semidefinite. A filter that claims no covariance has no columns for one. Each name starts with
+    `NODE.` where there are several nodes, and with `FILTER.` where a node has several filters.
+
+    Raises:
+        ValueError: Monte Carlo runs, or names that coincide.
+    """
+    columns = [(TIME, record.time)]
+    several = len(record.estimates) > 1, any(len(filters) > 1 for filters in record.estimates.values())
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            prefix = "".join(f"{part}." for part, used in zip((node, name), several, strict=True) if used)
+            columns += [(prefix + key, values) for key, values in _claims(record.states, estimate)]
+    twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
+    if twice:
+        raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
+    return dict(columns)
+
+
+def write_estimates(record: Record, path: str | Path) -> None:
+    """Write `estimate_columns` to a CSV or Parquet file, whole or not at all; in CSV, valid is 1 or 0.
+
+    Raises:
+        ValueError: another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    write_table(estimate_columns(record), path)
+
+
+def _claims(states: Sequence[str], estimate: Estimate) -> list[tuple[str, np.ndarray]]:
+    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    if mean.ndim != 2:
+        raise fail("record", "the run over one recording", f"estimates of shape {mean.shape}")
+    result = []
+    for i, state in enumerate(states):
+        result.append((state, mean[:, i]))
+        if estimate.claim != "none":
+            variance = bound[:, i, i]
+            result.append((f"{state}.sd", np.sqrt(np.where(variance >= 0, variance, np.nan))))
+    if estimate.claim != "none":
+        for i, a in enumerate(states):
+            result += [(f"cov.{a}.{states[j]}", bound[:, i, j]) for j in range(i + 1, len(states))]
+    return [*result, ("valid", is_sound(estimate))]
+
+
+def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
+    """For each node and component the names its column may have, the preferred one first."""
+    names = {node: received_names(item) for node, item in network.nodes.items()}
+    uses = Counter([TIME, *network.inputs])
+    for node, components in names.items():
+        uses.update([*components, *(f"{node}.{name}" for name in components)])
+
+    def allowed(node: str, name: str) -> tuple[str, ...]:
+        full = f"{node}.{name}"
+        if uses[name] > 1:
+            return (full,)
+        return (name, full) if len(names) == 1 else (full, name)
+
+    return {node: [allowed(node, name) for name in components] for node, components in names.items()}
+
+
+def _refuse_unknown(columns: Mapping[str, np.ndarray], expected: list[tuple[str, ...]], source: str) -> None:
+    known = [name for names in expected for name in names]
+    for column in columns:
+        if column not in known:
+            close = get_close_matches(column, known, 1)
+            closest = f" (closest: {close[0]!r})" if close else ""
+            listed = ", ".join(names[0] for names in expected)
+            raise fail(f"{source}, header", f"only the columns {listed}", f"the unknown {column!r}{closest}")
+
+
+def _find(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str) -> str:
+    present = [name for name in names if name in columns]
+    if len(present) != 1:
+        came = f"both {' and '.join(map(repr, present))}" if present else f"only {', '.join(columns)}"
+        raise fail(f"{source}, header", f"one column {names[0]!r}", came)
+    return present[0]
+
+
+def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    values = np.asarray(columns[name], dtype=np.float64)
+    _refuse(~np.isfinite(values), values, f"column {name!r}", "a finite number", source)
+    return values
+
+
+def _measured(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    values = np.asarray(columns[name], dtype=np.float64)
+    _refuse(
+        np.isinf(values),
+        values,
+        f"column {name!r}",
+        "a finite number, or none where it did not arrive",
+        source,
+    )
+    return values
+
+
+def _refuse(bad: np.ndarray, values: np.ndarray, what: str, expected: str, source: str) -> None:
+    if np.any(bad):
+        row = int(np.argmax(bad))
+        came = "an empty cell" if np.isnan(values[row]) else f"{values[row]}"
+        raise fail(f"{source}, row {row + 1}, {what}", expected, came)

@@ -1,0 +1,160 @@
+"""Tables in files: columns of numbers read from and written to CSV or Parquet; the extension decides."""
+
+import csv
+import os
+import tempfile
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from heliograph.numerics.check import fail
+
+FORMATS = (".csv", ".parquet")
+
+
+def read_table(path: str | Path) -> dict[str, np.ndarray]:
+    """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN. Rows count from 1.
+
+    Raises:
+        ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no
+            number.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    path = Path(path)
+    kind = _format(path)
+    if not path.is_file():
+        raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
+    if path.stat().st_size == 0:
+        raise fail(str(path), "a table with a header and rows", "an empty file")
+    columns = _read_csv(path) if kind == ".csv" else _read_parquet(path)
+    if not columns or not len(next(iter(columns.values()))):
+        raise fail(str(path), "at least one row", "none")
+    return columns
+
+
+def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
+    """Write columns of equal length to a CSV or Parquet file; the file appears whole or not at all.
+
+    Raises:
+        ValueError: another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    path = Path(path)
+    check_output(path)
+    with _whole(path) as partial:
+        (_write_csv if _format(path) == ".csv" else _write_parquet)(columns, partial)
+
+
+def check_output(path: str | Path) -> None:
+    """Raise what `write_table` would, before the work starts."""
+    path = Path(path)
+    if _format(path) == ".parquet":
+        import pyarrow.parquet  # noqa: F401
+    if path.is_dir():
+        raise fail(f"output file {path}", "a file", "a folder")
+    if not path.parent.exists():
+        raise fail(f"output folder {path.parent}", "an existing folder", "nothing of that name")
+    check_output_folder(path.parent)
+
+
+def check_output_folder(folder: str | Path) -> None:
+    """Raise ValueError unless files can be written in the folder, or it can be made."""
+    folder = Path(folder)
+    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    name = f"output folder {folder}"
+    if not existing.is_dir():
+        raise fail(name, "a folder", "a file" if existing == folder else f"a file {existing} on its path")
+    try:
+        tempfile.TemporaryFile(dir=existing).close()
+    except OSError as error:
+        raise fail(name, "a folder that can be written", error.strerror) from None
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        yield partial
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def _format(path: Path) -> str:
+    kind = path.suffix.lower()
+    if kind not in FORMATS:
+        raise fail(str(path), f"a name that ends in {' or '.join(FORMATS)}", repr(path.suffix))
+    return kind
+
+
+def _check_distinct(path: Path, header: Sequence[str]) -> None:
+    twice = [name for name, count in Counter(header).items() if count > 1]
+    if twice:
+        raise fail(f"{path}, header", "distinct columns", f"{twice[0]!r} more than once")
+
+
+def _read_csv(path: Path) -> dict[str, np.ndarray]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            lines = (line for line in csv.reader(file, strict=True) if line)
+            header = [name.strip() for name in next(lines, [])]
+            _check_distinct(path, header)
+            rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(header))
+    return {name: values[:, i].copy() for i, name in enumerate(header)}
+
+
+def _numbers(path: Path, header: list[str], number: int, line: list[str]) -> list[float]:
+    if len(line) != len(header):
+        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
+    return [_number(path, name, number, cell.strip()) for name, cell in zip(header, line, strict=True)]
+
+
+def _number(path: Path, name: str, number: int, cell: str) -> float:
+    try:
+        return float(cell) if cell else np.nan
+    except ValueError:
+        raise fail(f"{path}, row {number}, column {name!r}", "a number or an empty cell", repr(cell)) from None
+
+
+def _read_parquet(path: Path) -> dict[str, np.ndarray]:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        table = pq.ParquetFile(path).read()
+    except pa.ArrowInvalid as error:
+        raise fail(str(path), "a Parquet file", str(error).splitlines()[0]) from None
+    _check_distinct(path, table.column_names)
+    columns = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        kind = column.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)):
+            raise fail(f"{path}, row 1, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
+        columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
+    return columns
+
+
+def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
+    with path.open("x", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows(zip(*(_plain(c).tolist() for c in columns.values()), strict=True))
+
+
+def _plain(column: np.ndarray) -> np.ndarray:
+    return column.astype(np.int64) if column.dtype == np.bool_ else column  # true is 1 in a CSV file
+
+
+def _write_parquet(columns: Mapping[str, np.ndarray], path: Path) -> None:
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    pq.write_table(pa.table({name: np.ascontiguousarray(c) for name, c in columns.items()}), path)

@@ -1,0 +1,1 @@
+"""What turns measurements into estimates: `base` says what a filter is, every other file holds one idea."""

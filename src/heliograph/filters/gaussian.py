@@ -1,0 +1,221 @@
+"""The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.correction import Signal
+from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
+from heliograph.filters.update import AbstractUpdate, Polytope
+from heliograph.model.channel import Channel, check_link, mean_gain
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.numerics.check import array, covariance
+from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.small_matrix import runs_last, times_vector
+from heliograph.random_affine.second_order import SecondOrder
+
+
+class Belief(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the state given the data so far."""
+
+    mean: jax.Array
+    covariance: jax.Array
+
+
+class GaussianFilter(AbstractFilter):
+    """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
+
+    A linear plant or sensor needs no transform: its moments are exact.
+
+    `channel` is what the filter believes; the world may have another. Built by `cubature_filter`, `extended_filter`
+    and `mean_gain_filter`.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+    transform: AbstractTransform
+    update: AbstractUpdate
+    initial_mean: np.ndarray
+    initial_covariance: np.ndarray
+    claim: Claim = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Belief:
+        """The prior."""
+        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
+
+    @compiled
+    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
+        """Predict over step k, then use what arrived of z."""
+        after = self.correct(self.predict(state, u, k), z, k)
+        return after, Estimate(after.mean, after.covariance, self.claim)
+
+    @compiled
+    def predict(self, state: Belief, u: Any = (), k: Any = 0) -> Belief:
+        """Mean and covariance of f(x, u) + w."""
+        plant, u = at(self.plant, k), jnp.asarray(u, dtype=float)
+        if isinstance(plant, LinearPlant):
+            moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
+        else:
+            moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
+        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+
+    @compiled
+    def correct(self, prior: Belief, z: Any, k: Any = 0) -> Belief:
+        """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
+        sensor, channel = at(self.sensor, k), at(self.channel, k)
+        if isinstance(sensor, LinearSensor):
+            measured = linear_transform(sensor.matrix, sensor.measure(prior.mean), prior.covariance)
+        else:
+            measured = self.transform.apply(sensor.measure, *prior)
+        mean = measured.mean + sensor.noise.mean
+        spread = measured.covariance + sensor.noise.covariance
+        signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
+        return corrected(prior, signal, channel, self.update, jnp.asarray(z, dtype=float))
+
+
+def corrected(prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array) -> Belief:
+    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
+    gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
+    return _use(prior, gain, bound, signal.mean, channel, z)
+
+
+@runs_last
+def _use(
+    prior: Belief, gain: jax.Array, bound: jax.Array, expected: jax.Array, channel: SecondOrder, z: jax.Array
+) -> Belief:
+    present = ~jnp.isnan(z)
+    innovation = jnp.where(present, z - times_vector(channel.gain, expected) - channel.offset, 0.0)
+    covariance_after = jnp.where(jnp.any(present, axis=0), bound, prior.covariance)
+    return Belief(prior.mean + times_vector(gain, innovation), covariance_after)
+
+
+def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
+    """The channel as an update reads it, for each step where it varies."""
+    if isinstance(channel, OverTime):
+        return over_time([update.describe(c) for c in unstack(channel)])
+    return update.describe(channel)
+
+
+def _build(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate,
+    initial_mean: Any,
+    initial_covariance: Any,
+    trusted: bool,
+) -> GaussianFilter:
+    start = first(plant)
+    n = len(start.states)
+    check_link(first(sensor), first(channel), n)
+    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    spread = start.initial_covariance
+    if initial_covariance is not None:
+        spread = covariance("filter's initial covariance", initial_covariance, n)
+    described = describe(channel, update)
+    linear = is_linear(plant, sensor) and not bool(np.any([s.random_gain for s in _each(described)]))
+    claim: Claim = "exact" if linear and trusted else "nominal"
+    return GaussianFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        transform=transform,
+        update=update,
+        initial_mean=mean,
+        initial_covariance=spread,
+        claim=claim,
+    )
+
+
+def _each(item: SecondOrder | OverTime) -> list[SecondOrder]:
+    return unstack(item) if isinstance(item, OverTime) else [item]
+
+
+def gaussian_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+
+    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
+    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    rule = Polytope() if update is None else update
+    return _build(plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True)
+
+
+def cubature_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """Cubature Kalman filter that knows its channel's moments.
+
+    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
+    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
+
+
+def extended_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """Extended Kalman filter that knows its channel's moments; Jacobians by automatic differentiation.
+
+    Claims, arguments and errors as `cubature_filter`.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
+    """
+    return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
+
+
+def mean_gain_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    initial_mean: Any = None,
+    initial_covariance: Any = None,
+) -> GaussianFilter:
+    """The cubature filter that most people would write: it takes the mean gain as the truth.
+
+    Claim: "nominal", and badly so where gains are random; it is here to be compared with.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
+    """
+    believed = mean_gain(channel)
+    return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)

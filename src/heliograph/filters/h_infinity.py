@@ -1,0 +1,92 @@
+"""The H-infinity filter: gains designed for a level, run on any plant and sensor."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.h_infinity.design import HInfinityDesign
+from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, check_sensor
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.float64 import compiled, in_float64
+
+
+class Pending(NamedTuple):
+    """The last estimate (n,), and the correction (n,) that what came since will make to the next."""
+
+    mean: jax.Array
+    correction: jax.Array
+
+
+class HInfinityFilter(AbstractFilter):
+    """xhat+ = f(xhat, u) + K (received - E[G] h(xhat)): an estimate at step k uses what came before step k.
+
+    It claims no covariance: its guarantee is a ratio of energies over the horizon. What did not arrive counts as what
+    the filter expected. At the first step there is nothing to correct with, and the estimate is f of the initial one.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    gains: OverTime
+    expected_gain: OverTime
+    initial_mean: np.ndarray
+    claim: Claim = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Pending:
+        """The initial estimate, with no correction."""
+        mean = jnp.asarray(self.initial_mean)
+        return Pending(mean, jnp.zeros_like(mean))
+
+    @compiled
+    def step(self, state: Pending, z: Any, u: Any = (), k: Any = 0) -> tuple[Pending, Estimate]:
+        """Predict over step k, and keep what z will correct in the next."""
+        plant, sensor = at(self.plant, k), at(self.sensor, k)
+        z, u = jnp.asarray(z, dtype=float), jnp.asarray(u, dtype=float)
+        mean = plant.transition(state.mean, u) + state.correction
+        innovation = z - at(self.expected_gain, k) @ sensor.measure(mean)
+        correction = at(self.gains, k) @ jnp.where(jnp.isnan(z), 0.0, innovation)
+        n = mean.shape[0]
+        return Pending(mean, correction), Estimate(mean, jnp.full((n, n), jnp.nan), self.claim)
+
+
+def h_infinity_filter(
+    plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign, initial_mean: Any = None
+) -> HInfinityFilter:
+    """The filter with designed gains; it covers the steps of the system, whose A x + f(x) must be `plant`'s transition.
+
+    `system` says what the filter expects of the channel. The initial mean is the plant's unless given.
+
+    Claim: "none" for a covariance; `certify_level` checks the level that it does guarantee.
+
+    Raises:
+        ValueError: a design that is not feasible, or a plant, sensor and system that do not fit.
+    Source: H-infinity fusion over amplify-and-forward relays, equation (6).
+    """
+    if not design.feasible:
+        smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
+        raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
+    start, inputs = first(plant), system.output.shape[1]
+    n = len(start.states)
+    if n != system.states or design.gains.shape != (system.steps, n, system.received):
+        raise fail("system", f"{n} states and gains {design.gains.shape}", f"{system.states} states")
+    check_sensor(first(sensor), n)
+    if len(first(sensor).outputs) != inputs:
+        raise fail("sensor", f"the system's {inputs} outputs", len(first(sensor).outputs))
+    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    expected = np.array([link.mean[:, :inputs] for link in system.channel])
+    return HInfinityFilter(
+        plant=plant,
+        sensor=sensor,
+        gains=OverTime(design.gains),
+        expected_gain=OverTime(expected),
+        initial_mean=mean,
+        claim="none",
+    )

@@ -1,0 +1,1 @@
+"""Several estimates made one: rules, intersection, levels, and quantizers on the way."""

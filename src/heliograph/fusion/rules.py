@@ -1,0 +1,223 @@
+"""Fusion of estimates whose errors are correlated in unknown ways: covariance intersection and its relatives."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.intersection import intersect, intersect_inversely, inverses, trace_optimal_weights
+from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
+from heliograph.model.estimate import Claim, Estimate, weakest
+from heliograph.model.over_time import OverTime, first, stack
+from heliograph.numerics.check import array, fail, probabilities
+from heliograph.numerics.float64 import compiled
+
+
+class AbstractFusion(eqx.Module):
+    """A rule that makes one estimate of several.
+
+    A fused claim is never stronger than the weakest of its inputs; what else a rule assumes is in `claim`.
+    """
+
+    def check(self, count: int) -> None:
+        """Raise ValueError if the rule cannot fuse this number of estimates."""
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """What the fused covariance claims, from what the inputs claim."""
+        raise NotImplementedError
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Fused mean (n,) and covariance (n, n) of means (count, n) and bounds (count, n, n)."""
+        raise NotImplementedError
+
+
+def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
+    """Fuse estimates of one state; leading axes (run, time) are carried along.
+
+    Raises:
+        ValueError: no estimates, or estimates of different state dimensions.
+    Source: cubature fusion under amplify-and-forward relays, equation (8).
+    """
+    if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
+        raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
+    rule.check(len(estimates))
+    means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
+    bounds = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
+    mean, bound = _combine_all(rule, means, bounds)
+    return Estimate(mean, bound, rule.claim([e.claim for e in estimates]))
+
+
+@compiled
+def _combine_all(rule: AbstractFusion, means: Any, bounds: Any) -> tuple[Any, Any]:
+    combine = rule.combine
+    for _ in range(means.ndim - 2):
+        combine = jax.vmap(combine)
+    return combine(means, bounds)
+
+
+class CovarianceIntersection(AbstractFusion):
+    """Covariance intersection with the weights that minimise the trace.
+
+    P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, w on the simplex; tr P is convex in w. An upper bound for
+    any correlation if the inputs are and if weights do not depend on the data. Where bounds depend on the data, so do
+    the weights, and choosing the smallest can overstate: then the inputs are "nominal", and so is the result.
+
+    Source: Julier and Uhlmann (1997); cubature fusion under amplify-and-forward relays, equations (8) and (34).
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return _of_covariances(claims, "upper")
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Find the weights and intersect."""
+        information = inverses(bounds)
+        return intersect(means, information, trace_optimal_weights(information))
+
+
+class EqualIntersection(AbstractFusion):
+    """Covariance intersection with equal weights: nothing is chosen, so data-dependent bounds cannot mislead.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (8) with w_i = 1 / M.
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return _of_covariances(claims, "upper")
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Intersect with equal weights."""
+        count = means.shape[0]
+        return intersect(means, inverses(bounds), jnp.full(count, 1 / count))
+
+
+class FixedIntersection(AbstractFusion):
+    """Covariance intersection with weights given once and for all.
+
+    Raises:
+        ValueError: weights off the simplex.
+    Source: cubature fusion under amplify-and-forward relays, equation (8).
+    """
+
+    weights: np.ndarray
+
+    def __init__(self, weights: Any):
+        self.weights = probabilities("fusion weights", weights)
+
+    def check(self, count: int) -> None:
+        """As many weights as estimates."""
+        array("fusion weights", self.weights, (count,))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return _of_covariances(claims, "upper")
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Intersect with the given weights."""
+        return intersect(means, inverses(bounds), jnp.asarray(self.weights))
+
+
+class WeightedFusion(AbstractFusion):
+    """The weighted mean sum_i c_i x_i, with weights on the simplex given once and for all.
+
+    The error is sum_i c_i e_i, so E[e e'] <= sum_i c_i E[e_i e_i'] for any correlation (convexity): the bound is
+    sum_i c_i P_i. It needs no covariance, so it fuses estimates that claim none.
+
+    Raises:
+        ValueError: weights off the simplex.
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equation (15).
+    """
+
+    weights: np.ndarray
+
+    def __init__(self, weights: Any):
+        self.weights = probabilities("fusion weights", weights)
+
+    def check(self, count: int) -> None:
+        """As many weights as estimates."""
+        array("fusion weights", self.weights, (count,))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Sum with the given weights."""
+        weights = jnp.asarray(self.weights)
+        return weights @ means, jnp.tensordot(weights, bounds, axes=1)
+
+
+class InverseCovarianceIntersection(AbstractFusion):
+    """Inverse covariance intersection, two estimates at a time in the order of the nodes.
+
+    P^-1 = A^-1 + B^-1 - (w A + (1 - w) B)^-1 with the w that minimises the trace. Tighter than covariance intersection,
+    and valid only for estimates that share information of a certain form; so it claims "nominal".
+
+    Source: Noack, Sijs, Reinhardt and Hanebeck, Decentralized data fusion with inverse covariance intersection (2017).
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """ "nominal": the assumed form of the correlation is not checked."""
+        return _of_covariances(claims, "nominal")
+
+    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Fuse the first two, the result with the third, and so on."""
+        mean, bound = means[0], bounds[0]
+        for other_mean, other_bound in zip(means[1:], bounds[1:], strict=True):
+            mean, bound = intersect_inversely(mean, bound, other_mean, other_bound)
+        return mean, bound
+
+
+def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
+    """The weakest claim, for rules that weigh by covariances."""
+    if "none" in claims:
+        raise fail("fusion by covariances", "estimates that claim one", "the claim 'none' (WeightedFusion needs none)")
+    return weakest([*claims, strongest])
+
+
+class Fusion(eqx.Module):
+    """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which uplinks.
+
+    `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each
+    node by its name, all of one kind. The local bound is widened by the quantizer's error. Covariances are taken to
+    arrive as they are: most are computed before any data.
+    """
+
+    filter: str = eqx.field(static=True)
+    rule: AbstractFusion
+    quantizer: Quantizer | Mapping[str, Quantizer] | None = None
+
+    def check(self, nodes: Sequence[str], n: int) -> None:
+        """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""
+        self.rule.check(len(nodes))
+        if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
+            raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
+        for item in self._each(nodes):
+            if not isinstance(first(item), AbstractQuantizer):
+                raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
+            first(item).check(n)
+        self.uplinks(nodes)
+
+    def uplinks(self, nodes: Sequence[str]) -> Any:
+        """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
+
+        Raises:
+            ValueError: quantizers of different kinds.
+        """
+        return None if self.quantizer is None else stack(self._each(nodes))
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """What the fused covariance claims, from what the filters claim."""
+        if self.quantizer is None:
+            return self.rule.claim(claims)
+        one = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
+        kind = one.values if isinstance(one, OverTime) else one
+        return self.rule.claim([kind.claim(claim) for claim in claims])
+
+    def _each(self, nodes: Sequence[str]) -> list[Quantizer]:
+        if self.quantizer is None:
+            return []
+        return [self.quantizer[n] if isinstance(self.quantizer, Mapping) else self.quantizer for n in nodes]

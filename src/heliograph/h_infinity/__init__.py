@@ -1,0 +1,1 @@
+"""Guaranteed ratios of energies: growth bounds, designs by matrix inequalities, certificates."""

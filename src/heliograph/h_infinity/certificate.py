@@ -1,0 +1,152 @@
+"""Whether gains, from anywhere, guarantee an H-infinity level: a check that shares nothing with the designs."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.h_infinity.growth_check import GrowthFinding
+from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.numerics.check import array, fail
+
+ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix whose diagonal is -1
+
+
+class HInfinityCertificate(NamedTuple):
+    """Whether the level is certified, and every number that this rests on.
+
+    largest_eigenvalues (steps,): of Theorem 1's matrix, which must be negative; steps_certified counts those from the
+    first on that are. initial: the smallest eigenvalue of level^2 W - P_0, which must be positive. margin: the smallest
+    distance of all of them from failing, relative to the level squared. `reasons` lists what fails; `growth` what is
+    known about the growth constants.
+    """
+
+    certified: bool
+    level: float
+    largest_eigenvalues: np.ndarray
+    steps_certified: int
+    initial: float
+    margin: float
+    growth: tuple[GrowthFinding, ...]
+    reasons: tuple[str, ...]
+
+
+def certify_level(
+    system: GrowthSystem,
+    gains: Any,
+    weights: Any,
+    multipliers: Any,
+    level: float,
+    growth: Sequence[GrowthFinding] = (),
+) -> HInfinityCertificate:
+    """Check that K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers guarantees the level.
+
+    Multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~. `growth`: what
+    `check_growth` found; what rests on a refuted constant is not certified. Without it the certificate holds for the
+    constants as stated.
+
+    Raises:
+        ValueError: arrays of the wrong shape, or a level that is not positive.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
+    """
+    n, m, T = system.states, system.received, system.steps
+    if not level > 0:
+        raise fail("level", "a positive number", level)
+    K, P = array("gains", gains, (T, n, m)), array("weights", weights, (T + 1, 2 * n, 2 * n))
+    lam = _multipliers(array("multipliers", multipliers, (T, None)))
+    matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
+    tops, negative = np.array([_largest(phi) for phi in matrices]), np.array([is_negative(phi) for phi in matrices])
+    initial = float(np.linalg.eigvalsh(level**2 * system.initial_weight - P[0])[0])
+    definite = np.array([np.linalg.eigvalsh((p + p.T) / 2)[0] for p in P])
+    margin = min(float(-tops.max()), initial) / level**2
+    reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
+    if not initial > 0:
+        reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
+    reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > 0))]
+    reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
+    reasons += [finding.text for finding in growth if finding.refuted]
+    count = T if negative.all() else int(np.argmin(negative))
+    return HInfinityCertificate(not reasons, float(level), tops, count, initial, margin, tuple(growth), tuple(reasons))
+
+
+def theorem_matrix(
+    system: GrowthSystem,
+    k: int,
+    gain: np.ndarray,
+    weight: np.ndarray,
+    following: np.ndarray,
+    multipliers: np.ndarray,
+    level: float,
+) -> np.ndarray:
+    """Phi of step k over (x, e, f, f~, h, h~, v, rho): the level holds over the step if it is negative definite.
+
+    The next (x, e) is R eta - [0; K] H V eta with H = [G, N] random, V eta = (C x + h + D v, rho) and R eta holding the
+    filter's own G-bar (C xhat + h(xhat)), so Phi needs E[H] and E[H_ab H_ij] and nothing else of the channel.
+
+    Source: H-infinity fusion over amplify-and-forward relays, equations (8) and (18).
+    """
+    A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
+    link, n, y, v = system.channel[k], system.states, system.output.shape[1], system.disturbance.shape[2]
+    r, eye = link.disturbances, np.eye
+    at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
+    q = 4 * n + 2 * y + v + r
+
+    def row(height: int, **blocks: np.ndarray) -> np.ndarray:
+        result = np.zeros((height, q))
+        for name, block in blocks.items():
+            result[:, at[name] : at[name] + block.shape[1]] = block
+        return result
+
+    signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])
+    expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=eye(y), d=-eye(y))  # G-bar (C xhat + h(xhat))
+    own = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
+    correction = np.concatenate([np.zeros_like(gain), gain])
+    inner = correction.T @ following @ correction
+    cross = own.T @ following @ correction @ link.mean @ signal
+    spread = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
+    phi = own.T @ following @ own - cross - cross.T + spread
+    phi[: 2 * n, : 2 * n] -= weight
+    phi[n : 2 * n, n : 2 * n] += M.T @ M
+    sizes = [level**2] * (v + r)
+    phi[4 * n + 2 * y :, 4 * n + 2 * y :] -= np.diag(sizes)
+    constants = [growth[k] for pair in (system.growth, system.output_growth) for growth in pair]
+    for i, (constant, weight_of) in enumerate(zip(constants, multipliers, strict=True)):
+        width, value_at, point_at = (n, n, y, y)[i], at["fghd"[i]], at["xexe"[i]]
+        value, point = slice(value_at, value_at + width), slice(point_at, point_at + n)
+        phi[value, value] -= weight_of * eye(width)
+        phi[point, point] += weight_of * constant**2 * eye(n)
+    return _without_absent(phi, at, y, system)
+
+
+def _without_absent(phi: np.ndarray, at: dict[str, int], y: int, system: GrowthSystem) -> np.ndarray:
+    """Leave out f and f~, or h and h~, where the function is zero throughout."""
+    kept = list(range(len(phi)))
+    for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
+        if growth.absent:
+            kept = [i for i in kept if not at[name] <= i < at[name] + width]
+    result: np.ndarray = phi[np.ix_(kept, kept)]
+    return result
+
+
+def _multipliers(given: np.ndarray) -> np.ndarray:
+    """As (steps, 4) for f, f~, h, h~."""
+    if given.shape[1] not in (2, 4):
+        raise fail("multipliers", "2 or 4 for each step", given.shape[1])
+    return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
+
+
+def _largest(phi: np.ndarray) -> float:
+    """Largest eigenvalue."""
+    return float(np.linalg.eigvalsh((phi + phi.T) / 2)[-1])
+
+
+def is_negative(phi: np.ndarray) -> bool:
+    """Whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
+
+    Scaling keeps definiteness and lets weights of very different sizes stand in one matrix.
+    """
+    diagonal = np.diagonal(phi)
+    if not np.all(diagonal < 0):
+        return False
+    scale = 1 / np.sqrt(-diagonal)
+    return _largest(phi * np.outer(scale, scale)) < -ROUNDING

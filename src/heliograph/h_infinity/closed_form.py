@@ -1,0 +1,136 @@
+"""H-infinity designs that need no solver: without measurements, and behind a channel whose gains are known."""
+
+from typing import Any
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliograph.h_infinity.design import HInfinityDesign
+from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.numerics.check import array, fail
+
+ACCURACY = 1e-10  # relative, of a level found by bisection
+SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
+SLACK = 1e-6  # relative strictness that a closed form gives away, so that its certificate has a margin
+
+
+def level_without_measurements(system: GrowthSystem) -> float:
+    """The smallest level that Theorem 1 proves for K = 0, the filter that ignores what it receives.
+
+    P+ = (I / lambda + [B; B][B; B]' / level^2)^-1 with the largest lambda for which
+    P - diag(0, M'M) - lambda diag(a^2 I, a~^2 I) stays positive; the channel plays no part. It is how low a level says
+    nothing about the measurements.
+
+    Raises:
+        ValueError: a system with a linear part A, or with a growth constant of zero.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with K = 0 (closed form not in the paper).
+    """
+    if np.any(system.transition):
+        raise fail("level without measurements", "a system whose dynamics are all in f", "one with a linear part A")
+    growth = np.stack([system.growth.state, system.growth.error], axis=1)
+    if np.any(growth == 0):
+        raise fail("level without measurements", "growth constants above zero", "a zero")
+    scale = np.repeat(growth, system.states, axis=1)
+    low, high = 0.0, 1.0
+    while not _survives(system, scale, high):
+        low, high = high, 2 * high
+    while high - low > ACCURACY * high:
+        middle = (low + high) / 2
+        low, high = (low, middle) if _survives(system, scale, middle) else (middle, high)
+    return high
+
+
+def _survives(system: GrowthSystem, scale: np.ndarray, level: float) -> bool:
+    n = system.states
+    weight = level**2 * system.initial_weight
+    for k in range(system.steps):
+        reduced = weight.copy()
+        reduced[n:, n:] -= system.wanted[k].T @ system.wanted[k]
+        multiplier = np.linalg.eigvalsh(reduced / np.outer(scale[k], scale[k]))[0]
+        if multiplier <= 0:
+            return False
+        both = np.concatenate([system.disturbance[k]] * 2)
+        weight = np.linalg.inv(np.eye(2 * n) / multiplier + both @ both.T / level**2)
+    return True
+
+
+def known_channel_design(system: GrowthSystem, level: float, multipliers: Any = None) -> HInfinityDesign:
+    """The design at a level for a channel whose gains are certain: a Riccati recursion.
+
+    With Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and the weighted input S = diag(Q, lambda_f~, lambda_h~,
+    level^2)^-1 of (e, f~, h~, v, rho), e+ = E eta - K U eta has K* = E S U' (U S U')^-1 and
+    P2+^-1 = E S E' - K* U S E', the smallest over all gains. `multipliers` (steps, 2) are those of f~ and h~; a system
+    that is all linear needs none, and then this is the H-infinity filter of textbooks.
+
+    Raises:
+        ValueError: a channel with random gains, multipliers of the wrong shape, a level that is not positive.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
+    """
+    if any(len(link.spreads()) for link in system.channel):
+        raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
+    if not level > 0:
+        raise fail("level", "a positive number", level)
+    given = np.zeros((system.steps, 2)) if multipliers is None else array("multipliers", multipliers, (system.steps, 2))
+    for growth, column, name in ((system.growth, 0, "f~"), (system.output_growth, 1, "h~")):
+        if not growth.absent and np.any(given[:, column] <= 0):
+            raise fail(f"multipliers of {name}", "positive ones, since it is not zero", given[:, column].min())
+    return _riccati(system, level, given)
+
+
+def _riccati(system: GrowthSystem, level: float, multipliers: np.ndarray) -> HInfinityDesign:
+    n, m, steps = system.states, system.received, system.steps
+    inner = level * (1 - SLACK)
+    start = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
+    input_size = float(np.max(np.linalg.norm(system.disturbance, 2, axis=(1, 2))))
+    state = SLACK * min(start, level**2 / (1 + (1 + 1 / SPARE) * input_size**2))
+    gains, weights = np.full((steps, n, m), np.nan), np.full((steps + 1, 2 * n, 2 * n), np.nan)
+    weights[0] = np.diag(np.repeat([state, start], n))
+    design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
+    for k in range(steps):
+        found = _best_gain(system, k, weights[k, n:, n:], inner, multipliers[k])
+        if found is None:
+            text = f"no gain exists at step {k} of {steps} with these multipliers"
+            return design._replace(status=text, failed_step=k)
+        gains[k], error = found
+        state, own = _state_weight(system, k, state)
+        weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
+        design.multipliers[k] = [own[0], multipliers[k, 0], own[1], multipliers[k, 1]]
+    return design._replace(feasible=True, status="optimal")
+
+
+def _best_gain(
+    system: GrowthSystem, k: int, weight: np.ndarray, level: float, multipliers: np.ndarray
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
+    A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
+    link, n, y = system.channel[k], system.states, system.output.shape[1]
+    bounds = system.growth.error[k], system.output_growth.error[k]
+    reduced = weight - M.T @ M - sum(c * b**2 for c, b in zip(multipliers, bounds, strict=True)) * np.eye(n)
+    if np.linalg.eigvalsh(reduced)[0] <= 0:
+        return None
+    gain, noise = link.mean[:, :y], link.mean[:, y:]
+    v, r = B.shape[1], noise.shape[1]
+    parts = [(A, gain @ C, np.linalg.inv(reduced))]
+    if not system.growth.absent:
+        parts.append((np.eye(n), np.zeros((len(gain), n)), np.eye(n) / multipliers[0]))
+    if not system.output_growth.absent:
+        parts.append((np.zeros((n, y)), gain, np.eye(y) / multipliers[1]))
+    parts.append((B, gain @ D, np.eye(v) / level**2))
+    parts.append((np.zeros((n, r)), noise, np.eye(r) / level**2))
+    forward, heard = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+    inverse = block_diag(*(part[2] for part in parts))
+    cross, spread = heard @ inverse @ forward.T, heard @ inverse @ heard.T
+    best = np.linalg.lstsq(spread, cross, rcond=None)[0].T
+    following = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
+    return best, (1 - SLACK) * (following + following.T) / 2
+
+
+def _state_weight(system: GrowthSystem, k: int, state: float) -> tuple[float, tuple[float, float]]:
+    """The next weight of the state itself, which no measurement can lower, and the multipliers of f and h.
+
+    |A x + f + B v|^2 <= (1 + d) (|A| + a)^2 |x|^2 + (1 + 1/d) |B|^2 |v|^2: any weight small enough will do.
+    """
+    size, a, b = np.linalg.norm(system.transition[k], 2), system.growth.state[k], system.output_growth.state[k]
+    following = state / ((1 + SPARE) ** 3 * max(float(size + a) ** 2, 1.0))
+    multiplier = following * (1 + SPARE) ** 2 * float(1 + size / a) if a > 0 else following * 10 / SPARE
+    return following, (multiplier, state * SPARE / (4 * (1 + float(b) ** 2)))

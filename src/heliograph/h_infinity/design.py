@@ -1,0 +1,257 @@
+"""H-infinity filter design: gains with a guaranteed level, step after step or over the whole horizon at once.
+
+The level gamma bounds, for the filter xhat+ = A xhat + f(xhat) + K (received - E[G] (C xhat + h(xhat))),
+sum_s E|M (x - xhat)|^2 < gamma^2 (sum_s |v|^2 + |rho|^2 + xi_0' W xi_0) with xi_0 = (x_0, x_0 - xhat_0), for all
+disturbances that are not zero. It is a guarantee as long as the growth constants are true (`check_growth`).
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.h_infinity.solver import (
+    MARGIN,
+    HorizonProblem,
+    Objective,
+    Solver,
+    StepProblem,
+    check_choice,
+    run_solver,
+)
+from heliograph.h_infinity.step import (
+    Layout,
+    StepMatrices,
+    Unknowns,
+    all_multipliers,
+    next_energy,
+    step_matrices,
+)
+from heliograph.numerics.check import array, fail
+
+SEARCH_ACCURACY = 1e-4  # relative, of a level found by bisection
+SEARCH_LIMIT = 1e6  # times the first guess; a smallest level beyond is reported as none
+SCREEN = 1e-9  # strictness left in a solution, relative to the level squared, below which a step counts as failed
+
+
+class HInfinityDesign(NamedTuple):
+    """Gains K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers that prove `level`.
+
+    Multipliers: (steps, 2) for (f, f~) and (h, h~), or (steps, 4) for f, f~, h, h~; zero for a function that is zero.
+
+    Where no gains were found, `feasible` is false, arrays are NaN from `failed_step` on, `status` says what happened,
+    and `smallest_level` is the smallest level found to work with the same choices (None: not searched, or none found).
+    """
+
+    level: float
+    gains: np.ndarray
+    weights: np.ndarray
+    multipliers: np.ndarray
+    feasible: bool
+    status: str
+    failed_step: int | None = None
+    smallest_level: float | None = None
+
+
+def recursive_design(
+    system: GrowthSystem,
+    level: float,
+    initial: Any = None,
+    objective: Objective = "trace",
+    solver: Solver = "clarabel",
+    separate: bool = False,
+    search: bool = True,
+) -> HInfinityDesign:
+    """Solve one linear matrix inequality after another at a given level.
+
+    Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved: `objective` is
+    "trace" (smallest tr L), "largest_eigenvalue" (of L), "log_determinant" (largest log det P) or "none" (whatever the
+    solver finds first: it often ends in a dead end). `initial` is P_0, or None for the largest allowed, level^2 W.
+    `separate` multipliers are less conservative. `search`: look for the smallest level if this one fails.
+
+    Raises:
+        ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape.
+        ModuleNotFoundError: cvxpy or the solver is not installed.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
+    """
+    _check_level(level)
+    check_choice("objective", objective, Objective)
+    check_choice("solver", solver, Solver)
+    start = None if initial is None else array("initial weight P_0", initial, (2 * system.states,) * 2)
+    recursion = _Recursion(system, objective, solver, separate)
+    design = recursion.run(level, start)
+    if design.feasible or not search:
+        return design
+    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, level)
+    return design._replace(smallest_level=smallest)
+
+
+def smallest_recursive_level(
+    system: GrowthSystem,
+    objective: Objective = "trace",
+    solver: Solver = "clarabel",
+    separate: bool = False,
+    initial: Any = None,
+) -> HInfinityDesign:
+    """The recursive design at the smallest level at which it succeeds, to 1e-4 relative (bisection).
+
+    It is larger than the level of `horizon_design`: a recursion cannot look ahead.
+
+    Raises:
+        ValueError: an unknown objective or solver, an initial weight of the wrong shape, or no level that works.
+        ModuleNotFoundError: cvxpy or the solver is not installed.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorem 2.
+    """
+    check_choice("objective", objective, Objective)
+    check_choice("solver", solver, Solver)
+    start = None if initial is None else array("initial weight P_0", initial, (2 * system.states,) * 2)
+    recursion = _Recursion(system, objective, solver, separate)
+    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, _scale(system))
+    if smallest is None:
+        raise fail("smallest level", f"one below {SEARCH_LIMIT:g} times the norm of M", "none that works")
+    return recursion.run(smallest, start)
+
+
+def horizon_design(
+    system: GrowthSystem,
+    separate: bool = False,
+    gains: Any = None,
+    initial: Any = None,
+    solver: Solver = "clarabel",
+) -> HInfinityDesign:
+    """The smallest level over the whole horizon, and gains that attain it: all steps as one convex problem.
+
+    With P and Y = P2 K as unknowns in place of L and K every step is linear, and so is the level squared. `gains`
+    (steps, n, m) given: the smallest level that can be proven for those. `initial` is P_0, or None to choose it too.
+    `separate`: one multiplier for each of f, f~, h, h~; never worse.
+
+    Raises:
+        ValueError: an unknown solver, gains or an initial weight of the wrong shape.
+        ModuleNotFoundError: cvxpy or the solver is not installed.
+    Source: H-infinity fusion over amplify-and-forward relays, Theorems 1 and 2, solved jointly (not in the paper).
+    """
+    check_choice("solver", solver, Solver)
+    n, m, scale = system.states, system.received, _scale(system)
+    steps = [s._replace(wanted=s.wanted / scale**2) for s in step_matrices(system, separate)]
+    given = [None] * len(steps) if gains is None else list(array("gains", gains, (len(steps), n, m)))
+    layouts = [Layout(n, m, len(s.growth), gain) for s, gain in zip(steps, given, strict=True)]
+    start = None if initial is None else array("initial weight P_0", initial, (2 * n, 2 * n)) / scale**2
+    problem = HorizonProblem(steps, layouts, system.initial_weight, start)
+    status = run_solver(problem.problem, solver)
+    values = problem.unknowns.value
+    if not status.startswith("optimal") or values is None:
+        return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
+    parts = [np.asarray(values[place]) for place in problem.places]
+    first = Layout(n, 0, 0).unpack(parts[1])
+    found = [layout.unpack(part) for layout, part in zip(layouts, parts[2:], strict=True)]
+    weights, square = np.array([_block(u) for u in [first, *found]]), float(parts[0][0])
+    for k, (step, unknowns) in enumerate(zip(steps, found, strict=True)):
+        fixed = step.wanted - square * step.energy
+        fixed[: 2 * n, : 2 * n] -= weights[k]
+        if not _holds(step, unknowns, fixed, SCREEN * square):
+            text = f"the solver's answer fails at step {k} ({status})"
+            return _empty(system, separate, float("nan"), text)._replace(failed_step=k)
+    weights, level = weights * scale**2, float(np.sqrt(square)) * scale
+    chosen = np.array([_gain(u) for u in found]) if gains is None else np.array(given)
+    multipliers = all_multipliers(system, np.array([u.multipliers for u in found]) * scale**2, separate)
+    return HInfinityDesign(level, chosen, weights, multipliers, True, status)
+
+
+class _Recursion:
+    """The recursion over the horizon; a problem is compiled once and again only where the system's data change."""
+
+    def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
+        self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
+        self.steps = step_matrices(system, separate)
+        self.layout = Layout(system.states, system.received, len(self.steps[0].growth))
+        self.compiled: tuple[StepMatrices, StepProblem] | None = None
+
+    def run(self, level: float, initial: np.ndarray | None) -> HInfinityDesign:
+        """Solve at one level, in units of the level squared."""
+        system, n = self.system, self.system.states
+        top = level**2 * system.initial_weight
+        present = (1 - MARGIN) * _diagonal_part(top, n) if initial is None else initial
+        design = _empty(system, self.separate, level, "")
+        if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
+            return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
+        design.weights[0] = present
+        for k, step in enumerate(self.steps):
+            fixed = step.wanted / level**2 - step.energy
+            fixed[: 2 * n, : 2 * n] -= design.weights[k] / level**2
+            status, found = self._problem(step).solve(fixed)
+            if found is None or not _holds(step, found, fixed, SCREEN):
+                text = f"no gain found at step {k} of {system.steps} ({status})"
+                return design._replace(status=text, failed_step=k)
+            design.gains[k], design.weights[k + 1] = _gain(found), _block(found) * level**2
+            design.multipliers[k] = all_multipliers(system, found.multipliers * level**2, self.separate)
+        return design._replace(feasible=True, status="optimal")
+
+    def _problem(self, step: StepMatrices) -> StepProblem:
+        if self.compiled is None or not all(map(np.array_equal, self.compiled[0], step)):
+            self.compiled = step, StepProblem(step, self.layout, self.objective, self.solver)
+        return self.compiled[1]
+
+
+def _holds(step: StepMatrices, found: Unknowns, fixed: np.ndarray, strictness: float) -> bool:
+    """Whether a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
+    gain = _gain(found)
+    exact = found._replace(product=found.error @ gain, spread=gain.T @ found.error @ gain)
+    positive = min(np.linalg.eigvalsh(found.state)[0], np.linalg.eigvalsh(found.error)[0]) > 0
+    return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
+
+
+def _gain(found: Unknowns) -> np.ndarray:
+    """K = P2^-1 Y."""
+    result: np.ndarray = np.linalg.solve(found.error, found.product)
+    return result
+
+
+def _block(found: Unknowns) -> np.ndarray:
+    zero = np.zeros_like(found.state)
+    return np.block([[found.state, zero], [zero, found.error]])
+
+
+def _diagonal_part(weight: np.ndarray, n: int) -> np.ndarray:
+    """The largest multiple of diag(W1, W2) below W."""
+    part = weight.copy()
+    part[:n, n:] = part[n:, :n] = 0.0
+    root = np.linalg.inv(np.linalg.cholesky(part))
+    return float(np.linalg.eigvalsh(root @ weight @ root.T)[0]) * part
+
+
+def _empty(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
+    n, steps = system.states, system.steps
+    shapes = (steps, n, system.received), (steps + 1, 2 * n, 2 * n), (steps, 4 if separate else 2)
+    gains, weights, multipliers = (np.full(shape, np.nan) for shape in shapes)
+    return HInfinityDesign(level, gains, weights, multipliers, False, status)
+
+
+def _scale(system: GrowthSystem) -> float:
+    """Norm of M, the unit of levels."""
+    largest = float(np.max(np.linalg.norm(system.wanted, 2, axis=(1, 2))))
+    if largest == 0:
+        raise fail("wanted matrix", "one that is not zero", "zero at every step")
+    return largest
+
+
+def _smallest(works: Any, guess: float) -> float | None:
+    """Smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
+    high = guess
+    while not works(high):
+        high *= 2.0
+        if high > SEARCH_LIMIT * guess:
+            return None
+    low = high / 2.0
+    while works(low):
+        high, low = low, low / 2.0
+        if low < guess / SEARCH_LIMIT:
+            return high
+    while high / low > 1 + SEARCH_ACCURACY:
+        middle = float(np.sqrt(high * low))
+        low, high = (low, middle) if works(middle) else (middle, high)
+    return high
+
+
+def _check_level(level: float) -> None:
+    if not np.isfinite(level) or level <= 0:
+        raise fail("level", "a positive number", level)

@@ -1,0 +1,146 @@
+"""A system known by growth bounds only, seen through a channel over a finite horizon: what H-infinity designs read."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, unstack
+from heliograph.numerics.check import array, check_count, fail
+from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
+
+
+class Growth(NamedTuple):
+    """Growth constants of a function over the horizon: |f(x)| <= state |x| and |f(x) - f(xhat)| <= error |x - xhat|.
+
+    Shapes: (steps,) each.
+    """
+
+    state: np.ndarray
+    error: np.ndarray
+
+    @property
+    def absent(self) -> bool:
+        """Whether the function is zero throughout."""
+        return not (np.any(self.state) or np.any(self.error))
+
+
+class GrowthSystem(NamedTuple):
+    """x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x, and received = G y + N rho, at steps s = 0 ... steps - 1.
+
+    f and h are known only by their growth, f(0) = h(0) = 0; v and rho are any sequences of finite energy; G and N are
+    random. `initial_weight` W of the stacked initial (x_0, e_0) makes the third disturbance.
+
+    Shapes: transition (steps, n, n), disturbance (steps, n, v), output (steps, y, n), feedthrough (steps, y, v),
+    wanted (steps, z, n), initial_weight (2n, 2n); channel: one for each step.
+    """
+
+    transition: np.ndarray
+    disturbance: np.ndarray
+    output: np.ndarray
+    feedthrough: np.ndarray
+    wanted: np.ndarray
+    growth: Growth
+    output_growth: Growth
+    channel: tuple[DisturbedGain, ...]
+    initial_weight: np.ndarray
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of the horizon."""
+        return len(self.channel)
+
+    @property
+    def states(self) -> int:
+        """Dimension n of the plant's state."""
+        return int(self.transition.shape[1])
+
+    @property
+    def received(self) -> int:
+        """Length of what the filter receives."""
+        return int(self.channel[0].mean.shape[0])
+
+
+def growth_system(
+    steps: int,
+    disturbance: Any,
+    feedthrough: Any,
+    wanted: Any,
+    channel: Channel,
+    growth: Any,
+    output_growth: Any = 0.0,
+    transition: Any = None,
+    output: Any = None,
+    initial_weight: Any = 1.0,
+) -> GrowthSystem:
+    """Describe x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel, for `steps` steps.
+
+    disturbance B (n, v), feedthrough D (y, v), wanted M (z, n), transition A (n, n), output C (y, n); any may be an
+    `OverTime` of one matrix per step; A and C are zero unless given. growth, output_growth: the constant of f and of h,
+    or a pair (of f itself, of its differences) where these differ; each a number, or `OverTime` of one per step. A
+    linear h is given by `output` and growth 0. `initial_weight`: W (2n, 2n) or a multiple of the identity.
+
+    Raises:
+        ValueError: shapes that do not fit, negative growth, a weight that is not positive definite, things that vary
+            over fewer steps than `steps`.
+    """
+    check_count("steps", steps)
+    B = _over(steps, "disturbance matrix", disturbance, (None, None))
+    n, v = B.shape[1:]
+    D = _over(steps, "feedthrough matrix", feedthrough, (None, v))
+    y = D.shape[1]
+    links = _links(steps, channel)
+    if links[0].inputs != y:
+        raise fail("channel", f"one that takes the sensor's {y} outputs", f"{links[0].inputs} inputs")
+    return GrowthSystem(
+        _over(steps, "transition matrix", np.zeros((n, n)) if transition is None else transition, (n, n)),
+        B,
+        _over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
+        D,
+        _over(steps, "wanted matrix", wanted, (None, n)),
+        _growth(steps, "growth", growth),
+        _growth(steps, "output growth", output_growth),
+        links,
+        _weight(initial_weight, n),
+    )
+
+
+def _over(steps: int, name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+    """One matrix for each step."""
+    if not isinstance(value, OverTime):
+        one: np.ndarray = array(name, value, shape)
+        return np.broadcast_to(one, (steps, *one.shape))
+    if value.steps < steps:
+        raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
+    many: np.ndarray = array(name, value.values, (None, *shape))
+    return many[:steps]
+
+
+def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+    if not isinstance(channel, OverTime):
+        return (disturbed_gain(channel),) * steps
+    if channel.steps < steps:
+        raise fail("channel over time", f"at least {steps} steps", channel.steps)
+    links = tuple(disturbed_gain(c) for c in unstack(channel)[:steps])
+    if len({(link.mean.shape, link.inputs) for link in links}) != 1:
+        raise fail("channel over time", "the same noise sources at each step", [link.disturbances for link in links])
+    return links
+
+
+def _growth(steps: int, name: str, value: Any) -> Growth:
+    pair = value if isinstance(value, tuple) else (value, value)
+    if len(pair) != 2:
+        raise fail(name, "a number, or a pair (of the function, of its differences)", value)
+    constants = [_over(steps, name, part, ()) for part in pair]
+    for part in constants:
+        if np.any(part < 0):
+            raise fail(name, "no negative constant", float(part.min()))
+    return Growth(*constants)
+
+
+def _weight(value: Any, n: int) -> np.ndarray:
+    weight = np.asarray(value, dtype=np.float64) * np.eye(2 * n) if np.ndim(value) == 0 else value
+    result: np.ndarray = array("initial weight", weight, (2 * n, 2 * n))
+    if not np.allclose(result, result.T, rtol=1e-12) or np.linalg.eigvalsh(result)[0] <= 0:
+        raise fail("initial weight", "a positive definite matrix", f"eigenvalues {np.linalg.eigvalsh(result)}")
+    return result

@@ -1,0 +1,161 @@
+"""The semidefinite programmes of H-infinity design, written for cvxpy; the only file that imports it."""
+
+import warnings
+from typing import Any, Literal, get_args
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from heliograph.h_infinity.step import (
+    Layout,
+    LinearForms,
+    StepMatrices,
+    Unknowns,
+    independent_parts,
+    linear_forms,
+    weight_form,
+)
+from heliograph.numerics.check import fail
+
+MARGIN = 1e-6  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
+Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
+Solver = Literal["clarabel", "scs"]
+SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
+SCS_ITERATIONS = 100_000
+
+
+def solvers() -> Any:
+    """cvxpy, or an error that says how to get it.
+
+    Raises:
+        ModuleNotFoundError: cvxpy is not installed.
+    """
+    try:
+        import cvxpy
+    except ModuleNotFoundError as error:
+        text = f'{error.name}: expected to be installed, got no such package: pip install "heliograph[lmi]"'
+        raise ModuleNotFoundError(text, name=error.name) from None
+    return cvxpy
+
+
+def check_choice(name: str, value: Any, choices: Any) -> None:
+    """Raise ValueError unless `value` is one of a Literal's choices."""
+    if value not in get_args(choices):
+        raise fail(name, f"one of {', '.join(get_args(choices))}", repr(value))
+
+
+def run_solver(problem: Any, solver: Solver) -> str:
+    """Solve, and return the solver's status; a solver that gives up or is not sure of its answer is a status too."""
+    cp = solvers()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Solution may be inaccurate")
+        try:
+            if solver == "scs":
+                accuracy = {"eps_abs": SCS_ACCURACY, "eps_rel": SCS_ACCURACY, "max_iters": SCS_ITERATIONS}
+                problem.solve(solver=cp.SCS, **accuracy)
+            else:
+                problem.solve(solver=cp.CLARABEL)
+        except cp.SolverError:
+            return "solver_error"
+    return str(problem.status)
+
+
+class StepProblem:
+    """One step's inequality, compiled once: find P+, gain and multipliers for a given P, at level 1.
+
+    Everything is divided by the level squared before it comes here, so that the level does not matter to the solver.
+    The objective picks one of the feasible P+ = L^-1: "trace" the smallest tr L, "largest_eigenvalue" that of L,
+    "log_determinant" the largest log det P+, "none" any.
+    """
+
+    def __init__(self, step: StepMatrices, layout: Layout, objective: Objective, solver: Solver):
+        cp = solvers()
+        self.layout, self.solver = layout, solver
+        self.unknowns = cp.Variable(layout.size)
+        self.fixed = cp.Parameter(step.energy.shape, symmetric=True)
+        forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
+        phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
+        constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
+        for part in independent_parts(step, forms):
+            constraints.append(phi[part][:, part] << -MARGIN * np.eye(len(part)))
+        for form in forms.positive:
+            k = int(np.sqrt(len(form)))
+            constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
+        weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
+        goal, more = _goal(cp, objective, [weight[:n, :n], weight[n:, n:]])
+        self.problem = cp.Problem(goal, constraints + more)
+
+    def solve(self, fixed: np.ndarray) -> tuple[str, Unknowns | None]:
+        """The status, and a solution if there is one; fixed = S - diag(P, 0) at level 1."""
+        self.fixed.value = fixed
+        status = run_solver(self.problem, self.solver)
+        if not status.startswith("optimal") or self.unknowns.value is None:
+            return status, None
+        return status, self.layout.unpack(np.asarray(self.unknowns.value))
+
+
+def _goal(cp: Any, objective: Objective, weights: list[Any]) -> tuple[Any, list[Any]]:
+    """The objective on L = P+^-1 and the constraints that express it."""
+    if objective == "none":
+        return cp.Minimize(0), []
+    if objective == "log_determinant":
+        return cp.Maximize(sum(cp.log_det(w) for w in weights)), []
+    eye = np.eye(weights[0].shape[0])
+    if objective == "largest_eigenvalue":
+        smallest = cp.Variable()
+        return cp.Maximize(smallest), [w >> smallest * eye for w in weights]
+    inverses = [cp.Variable(w.shape, symmetric=True) for w in weights]
+    above = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
+    return cp.Minimize(sum(cp.trace(inverse) for inverse in inverses)), above
+
+
+class HorizonProblem:
+    """All steps at once, with P_0 ... P_T+1, the gains, the multipliers and the level squared as unknowns: convex.
+
+    One vector holds them all, so that each inequality is one sparse matrix: cvxpy then has next to nothing to do.
+    """
+
+    def __init__(self, steps: list[StepMatrices], layouts: list[Layout], weight: np.ndarray, initial: Any = None):
+        cp = solvers()
+        self.layouts = layouts
+        start = Layout(layouts[0].states, 0, 0)
+        sizes = [1, start.size, *(layout.size for layout in layouts)]
+        self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
+        self.unknowns = cp.Variable(sum(sizes))
+        self.constraints: list[Any] = []
+        present, eye = weight_form(start), np.eye(weight.shape[0])
+        self._require({0: (1 - MARGIN) * weight.ravel()[:, None], 1: -present}, 0 * eye)
+        if initial is not None:
+            self.constraints.append(present @ self.unknowns[self.places[1]] == initial.ravel())
+        forms: LinearForms | None = None
+        for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
+            if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
+                forms = linear_forms(step, layout)
+            self._add_step(k, step, forms, present)
+            self.constraints.append(self.unknowns[self.places[k + 2]][layout.size - layout.multipliers :] >= 0)
+            present = forms.weight
+        self.problem = cp.Problem(cp.Minimize(self.unknowns[0]), self.constraints)
+
+    def _add_step(self, k: int, step: StepMatrices, forms: LinearForms, present: np.ndarray) -> None:
+        """-Phi >= MARGIN level^2, for each part of eta that stands alone."""
+        q, width = len(step.energy), int(np.sqrt(len(present)))
+        for part in independent_parts(step, forms):
+            entries = (part[:, None] * q + part).ravel()
+            energy = (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None]
+            before = np.zeros((q, q, present.shape[1]))
+            before[:width, :width] = present.reshape(width, width, -1)
+            blocks = {0: energy, k + 1: before.reshape(q * q, -1)[entries], k + 2: -forms.next[entries]}
+            self._require(blocks, -step.wanted[np.ix_(part, part)])
+        for form in forms.positive:
+            size = int(np.sqrt(len(form)))
+            self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 2: form}, np.zeros((size, size)))
+
+    def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
+        """The matrix sum_i blocks_i (unknowns in place i) + constant is positive semidefinite."""
+        found = [(block, *np.nonzero(block), self.places[place].start) for place, block in blocks.items()]
+        values = np.concatenate([block[rows, columns] for block, rows, columns, _ in found])
+        rows = np.concatenate([rows for _, rows, _, _ in found])
+        columns = np.concatenate([columns + start for _, _, columns, start in found])
+        form = csr_array((values, (rows, columns)), shape=(constant.size, self.unknowns.size))
+        matrix = solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
+        self.constraints.append(matrix >> 0)

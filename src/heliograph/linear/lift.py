@@ -1,0 +1,162 @@
+"""A linear model lifted to monomials: powers of the state and of the measurement as one linear system."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.linear.system import LinearSystem, Steps, check_horizon
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import OverTime, first, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, is_linear
+from heliograph.numerics.check import fail
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, exponents
+from heliograph.random_affine.noise import AbstractNoise, Gaussian
+from heliograph.random_affine.push import Tabulated, noise_vector, push, push_known, second_moments
+
+
+class Route(NamedTuple):
+    """One step of the model as two maps: the plant's, x -> x+, and from the state to what arrives, x+ -> z."""
+
+    plant: GainAndNoise
+    measurement: AbstractRandomAffine
+
+
+def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int) -> LinearSystem:
+    """The system of Y = monomials of x up to `degree`, measured by Z = monomials of z up to `degree`.
+
+    E[Y+ | Y] = A Y + a and E[Z | Y+] = C Y+ + c are exact, with A and C the moments of the plant and of the route,
+    Cov(w) = E[Y+ Y+'] - M E[Y Y'] M', Cov(v) = E[Z Z'] - K E[Y+ Y+'] K' (M, K with the constant). Both noises have
+    mean zero given the state's whole past, so the best linear filter of this system is the best filter of x that is
+    a polynomial of this degree in each z_k. Degree 1 is the best linear filter, 2 the quadratic one.
+
+    x is read off as the monomials of degree 1. Every monomial appears once (the half-vectorised square).
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a plant with inputs or with noise that depends on them, parts
+            that do not fit, a lift of more than the stated memory.
+    Source: quadratic filtering with dynamical bias, equations (11) to (13) and Lemmas 3 and 4, as repaired.
+    """
+    check_model(plant, sensor, channel)
+    start = first(plant)
+    n, m = len(start.states), int(first(channel).outputs)
+    refuse_lift(degree, n, m, horizon)
+    routes = model_routes(plant, sensor, channel, 2 * degree, horizon)
+    moments, parts, rounding = initial_moments(start, 2 * degree), [], []
+    before = second_moments(moments, n + 1, degree)
+    mean, spread = before[:-1, -1], before[:-1, :-1] - np.outer(before[:-1, -1], before[:-1, -1])
+    last: Route | None = None
+    for route in routes:
+        if last is None or not eqx.tree_equal(route.plant, last.plant):
+            moved = route.plant.moments(degree).matrix
+        if last is None or not eqx.tree_equal(route.measurement, last.measurement):
+            measured = route.measurement.moments(degree).matrix
+        last = route
+        moments = push(route.plant, 2 * degree, moments)
+        after = second_moments(moments, n + 1, degree)
+        heard = second_moments(push(route.measurement, 2 * degree, moments), m + 1, degree)
+        process, noise = after - moved @ before @ moved.T, heard - measured @ after @ measured.T
+        parts.append((*affine(moved), process[:-1, :-1], *affine(measured), noise[:-1, :-1]))
+        rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
+        before = after
+    return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), mean, spread, linear_rows(n, degree), rounding)
+
+
+def affine(homogeneous: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
+    return homogeneous[:-1, :-1], homogeneous[:-1, -1]
+
+
+def linear_rows(variables: int, degree: int, wanted: int | None = None) -> np.ndarray:
+    """Rows that read the first `wanted` variables off their monomials, (wanted, C(variables + degree, degree) - 1)."""
+    places = {powers: i for i, powers in enumerate(exponents(variables + 1, degree))}
+    rows = np.zeros((variables if wanted is None else wanted, len(places) - 1))
+    for i, row in enumerate(rows):
+        row[places[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
+    return rows
+
+
+def initial_moments(plant: LinearPlant, order: int) -> np.ndarray:
+    """E[mono_order(x_0)]."""
+    law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
+    shift = np.eye(len(plant.states) + 1)
+    shift[:-1, -1] = plant.initial_mean - law.mean
+    return push_known(shift, order, noise_vector(law, order))
+
+
+def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
+    """Raise ValueError unless plant and sensor are linear, fit the channel, and have noises with moments."""
+    start = first(plant)
+    if not is_linear(plant, sensor):
+        got = f"{type(start).__name__} and {type(first(sensor)).__name__}"
+        raise fail("polynomial filter", "a LinearPlant and a LinearSensor", got)
+    check_link(first(sensor), first(channel), len(start.states))
+    if start.inputs:
+        expected = "a plant without inputs (take the response to known inputs off the measurements first)"
+        raise fail("polynomial filter", expected, list(start.inputs))
+    if not isinstance(start.noise, AbstractNoise):
+        raise fail("polynomial filter", "process noise with a law", "a covariance that depends on inputs")
+
+
+def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: int, horizon: int) -> list[Route]:
+    """The maps of each step, with the noises' moments up to `order` computed once for what does not vary.
+
+    Raises:
+        ValueError: something varies over fewer steps than `horizon`.
+    """
+    plants = _maps(each_step(plant, horizon), order)
+    sensors = _maps(each_step(sensor, horizon), order)
+    channels = each_step(channel, horizon)
+    fixed = not isinstance(sensor, OverTime) and not isinstance(channel, OverTime)
+    one = Series([sensors[0], channels[0]])
+    measurements = [one if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
+    return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
+
+
+def _maps(items: list[Any], order: int) -> list[GainAndNoise]:
+    """A x + noise of each plant or sensor."""
+    result: list[GainAndNoise] = []
+    before, noise = None, Tabulated(items[0].noise, order)
+    for item in items:
+        if item is before:
+            result.append(result[-1])
+            continue
+        if not eqx.tree_equal(item.noise, noise.source):
+            noise = Tabulated(item.noise, order)
+        result.append(GainAndNoise(Constant(1.0), item.matrix, noise))
+        before = item
+    return result
+
+
+def each_step(item: Any, horizon: int) -> list[Any]:
+    """A plant, sensor or channel at each of `horizon` steps.
+
+    Raises:
+        ValueError: a horizon that is no positive whole number, or an item that varies over fewer steps than that.
+    """
+    check_horizon(horizon)
+    if not isinstance(item, OverTime):
+        return [item] * horizon
+    if item.steps < horizon:
+        raise fail("horizon", f"at most {item.steps} steps, which what varies over time covers", horizon)
+    return unstack(item)[:horizon]
+
+
+def refuse_lift(degree: int, states: int, outputs: int, horizon: int) -> None:
+    """Raise ValueError for a horizon or degree below 1 or a lifted system of more than MEMORY_LIMIT_ENTRIES numbers."""
+    check_horizon(horizon)
+    if int(degree) != degree or degree < 1:
+        raise fail("degree of the lift", "a positive whole number", degree)
+    n, m = count(states + 1, degree), count(outputs + 1, degree)
+    entries = horizon * (2 * n * n + n * m + m * m)
+    if entries > MEMORY_LIMIT_ENTRIES:
+        got = (
+            f"{entries:,} ({n - 1} monomials of {states} states and {m - 1} of {outputs} outputs, {horizon} steps); "
+            "use a lower degree, a shorter horizon, or fewer states or outputs"
+        )
+        raise fail(f"lift of degree {degree}", f"at most {MEMORY_LIMIT_ENTRIES:,} entries", got)

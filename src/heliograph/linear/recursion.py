@@ -1,0 +1,117 @@
+"""The linear minimum-mean-square-error filter of a linear system, and the true error of any schedule of gains."""
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.linear.schedule import Gains, Schedule
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import fail
+
+RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
+DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which the design warns
+
+
+class Corrected(NamedTuple):
+    """One step of the covariance recursion: gain (N, m), error covariance before and after the measurement (N, N)."""
+
+    gain: np.ndarray
+    predicted: np.ndarray
+    covariance: np.ndarray
+
+
+def covariance_step(spread: np.ndarray, s: Steps) -> Corrected:
+    """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-.
+
+    O may be singular (products of a measurement with few values repeat): then directions it does not have are skipped.
+    """
+    predicted = s.transition @ spread @ s.transition.T + s.process
+    cross = s.output @ predicted
+    gain = solve_innovation(cross @ s.output.T + s.noise, cross).T
+    after = predicted - gain @ cross
+    return Corrected(gain, predicted, (after + after.T) / 2)
+
+
+def solve_innovation(innovation: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """O^+ C for a positive semidefinite O, by its correlation matrix, so that units do not matter.
+
+    Shapes: (m, m), (m, N) -> (m, N).
+    """
+    deviation = np.sqrt(np.maximum(np.diag(innovation), 0.0))
+    scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
+    values, vectors = np.linalg.eigh(scale[:, None] * innovation * scale)
+    used = values > RANK_TOLERANCE * values[-1]
+    inverse = np.divide(1.0, values, out=np.zeros_like(values), where=used)
+    root = scale[:, None] * vectors
+    result: np.ndarray = (root * inverse) @ (root.T @ cross)
+    return result
+
+
+def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
+    """The best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
+
+    `claim` is what the covariance is worth: "exact" if the system's moments are the world's.
+
+    Warns where rounding in the system's own covariances reaches a visible part of the error's (unstable plants).
+
+    Raises:
+        ValueError: an unknown claim.
+    Source: Kalman (1960), with the second moments of random coefficients in the noises.
+    """
+    spread, want, parts = system.covariance, system.want, []
+    rounding, worst, when = np.zeros_like(spread), 0.0, 0
+    for k in range(system.horizon):
+        s = system.step(k)
+        gain, _, spread = covariance_step(spread, s)
+        keep = np.eye(len(spread)) - gain @ s.output
+        transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
+        expected = s.output @ s.transition, s.output @ s.drift + s.offset
+        estimate, claimed = (want @ transition, want @ gain, want @ offset), want @ spread @ want.T
+        parts.append((transition, gain, offset, *estimate, *expected, claimed))
+        # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
+        rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
+        error = np.diag(want @ rounding @ want.T)
+        share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
+        worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
+    if worst > DIGITS_TOLERANCE:
+        warnings.warn(
+            f"lmmse: rounding is {worst:.1g} of a claimed variance at step {when}: the state's own moments have "
+            "outgrown the error's (an unstable plant); use a shorter horizon or a lower degree",
+            stacklevel=2,
+        )
+    return Schedule(Gains(*map(np.array, zip(*parts, strict=True))), system.mean, claim)
+
+
+def true_covariance(system: LinearSystem, schedule: Schedule) -> np.ndarray:
+    """E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
+
+    Joint moments of (y, s) are propagated; nothing is assumed of the gains. Shapes: (time, q, q).
+
+    Raises:
+        ValueError: a system and a schedule of different lengths or measurements.
+    """
+    g, m = schedule.gains, system.steps.offset.shape[-1]
+    if schedule.horizon != system.horizon or g.gain.shape[-1] != m:
+        got = f"{schedule.horizon} steps of {g.gain.shape[-1]} measurements"
+        raise fail("schedule", f"{system.horizon} steps of {m} measurements", got)
+    mean, state = system.mean, schedule.start
+    yy, ss = system.covariance, np.zeros((len(state), len(state)))
+    ys = np.zeros((len(mean), len(state)))
+    result = []
+    for k in range(system.horizon):
+        s, now = system.step(k), Gains(*(field[k] for field in g))
+        mean = s.transition @ mean + s.drift
+        z = s.output @ mean + s.offset
+        yy, ys = s.transition @ yy @ s.transition.T + s.process, s.transition @ ys
+        zz, yz, sz = s.output @ yy @ s.output.T + s.noise, yy @ s.output.T, ys.T @ s.output.T
+        bias = system.want @ mean - now.output @ state - now.direct @ z - now.output_offset
+        joint = np.block([[yy, ys, yz], [ys.T, ss, sz], [yz.T, sz.T, zz]])
+        row = np.concatenate([system.want, -now.output, -now.direct], axis=1)
+        result.append(row @ joint @ row.T + np.outer(bias, bias))
+        state = now.transition @ state + now.gain @ z + now.offset
+        cross = now.transition @ sz @ now.gain.T
+        ss = now.transition @ ss @ now.transition.T + cross + cross.T + now.gain @ zz @ now.gain.T
+        ys = ys @ now.transition.T + yz @ now.gain.T
+    return np.array(result)

@@ -1,0 +1,88 @@
+"""A schedule of gains: a filter computed before any data, as arrays over time with the covariance it claims."""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.model.estimate import STRENGTH, Claim
+from heliograph.numerics.check import array, fail
+
+
+class Gains(NamedTuple):
+    """One row per step: s+ = F s + K z + c and xhat = L s + J z + d, with s the state before the step.
+
+    `expected` (and `expected_offset`) say what z the filter expects, G s + g: it stands in for what did not arrive.
+    Shapes: transition F (time, N, N), gain K (time, N, m), offset c (time, N), output L (time, q, N), direct J
+    (time, q, m), output_offset d (time, q), expected G (time, m, N), expected_offset g (time, m), covariance
+    (time, q, q).
+    """
+
+    transition: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+    output: np.ndarray
+    direct: np.ndarray
+    output_offset: np.ndarray
+    expected: np.ndarray
+    expected_offset: np.ndarray
+    covariance: np.ndarray
+
+
+class Schedule(eqx.Module):
+    """A linear filter over time from the state `start` (N,); `covariance` is claimed for complete data.
+
+    Raises:
+        ValueError: shapes that do not fit, numbers that are not finite, an unknown claim.
+    """
+
+    gains: Gains
+    start: np.ndarray
+    claim: Claim = eqx.field(static=True)
+
+    def __init__(self, gains: Gains, start: Any, claim: Claim):
+        self.start = array("start of the schedule", start, (None,))
+        time, n, m = np.shape(gains.gain)
+        q = np.shape(gains.output_offset)[-1]
+        shapes: tuple[tuple[int, ...], ...] = (
+            (time, n, n), (time, n, m), (time, n), (time, q, n), (time, q, m), (time, q), (time, m, n), (time, m),
+            (time, q, q),
+        )  # fmt: skip
+        checked = [array(f"schedule {f}", v, s) for f, v, s in zip(Gains._fields, gains, shapes, strict=True)]
+        self.gains = Gains(*checked)
+        if len(self.start) != n:
+            raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
+        if claim not in STRENGTH:
+            raise fail("claim", f"one of {list(STRENGTH)}", repr(claim))
+        self.claim = claim
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps."""
+        return len(self.gains.offset)
+
+    def save(self, path: str | Path) -> None:
+        """Write the arrays to a NumPy file (.npz), for another program or another day."""
+        with open(path, "wb") as file:
+            np.savez(file, start=self.start, claim=np.array(self.claim), **self.gains._asdict())
+
+
+def load_schedule(path: str | Path) -> Schedule:
+    """Read what `Schedule.save` wrote.
+
+    Raises:
+        ValueError: a file that holds no schedule.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            stored = {name: file[name] for name in file.files}
+    except (ValueError, EOFError, OSError) as error:
+        if isinstance(error, FileNotFoundError):
+            raise
+        raise fail(f"schedule {path}", "a file written by Schedule.save", str(error).splitlines()[0]) from None
+    missing = sorted({*Gains._fields, "start", "claim"} - set(stored))
+    if missing:
+        raise fail(f"schedule {path}", "all arrays of a schedule", f"none for {missing}")
+    claim: Any = str(stored["claim"])
+    return Schedule(Gains(*(stored[field] for field in Gains._fields)), stored["start"], claim)

@@ -1,0 +1,95 @@
+"""A linear system whose noises are white: what plant, relays and sensors become before gains are computed."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.numerics.check import array, covariance, fail
+
+
+class Steps(NamedTuple):
+    """What happens at each step, every array with a leading time axis.
+
+    y+ = A y + a + w, z = C y+ + c + v. Shapes: transition A (time, N, N), drift a (time, N), process Cov(w)
+    (time, N, N), output C (time, m, N), offset c (time, m), noise Cov(v) (time, m, m).
+    """
+
+    transition: np.ndarray
+    drift: np.ndarray
+    process: np.ndarray
+    output: np.ndarray
+    offset: np.ndarray
+    noise: np.ndarray
+
+
+class LinearSystem(eqx.Module):
+    """y+ = A y + a + w, z = C y+ + c + v, and what is to be known, x = W y.
+
+    w and v have mean zero given all earlier y and are uncorrelated with each other. Random coefficients fit: take A and
+    C as their means, and as Cov(w), Cov(v) what is left over, E[(H - EH) y y' (H - EH)'] plus noise. A measurement
+    that shares the step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
+
+    `rounding` (time, N) is an absolute rounding error of the diagonal of `process`, where it came out of a subtraction.
+
+    Shapes: mean (N,), covariance (N, N) of y before the first step, want W (q, N).
+
+    Raises:
+        ValueError: shapes that do not fit, or a start that has no covariance.
+    """
+
+    steps: Steps
+    mean: np.ndarray
+    covariance: np.ndarray
+    want: np.ndarray
+    rounding: np.ndarray
+
+    def __init__(self, steps: Steps, mean: Any, covariance_: Any, want: Any, rounding: Any = None):
+        time, n = np.shape(steps.drift)
+        m = np.shape(steps.offset)[-1]
+        one_step: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
+        named = zip(Steps._fields, steps, one_step, strict=True)
+        checked = [array(f"system {name}", value, (time, *shape)) for name, value, shape in named]
+        self.steps = Steps(*checked)
+        self.mean = array("mean of the start", mean, (n,))
+        self.covariance = covariance("covariance of the start", covariance_, n)
+        self.want = array("what is to be known", want, (None, n))
+        self.rounding = np.zeros((time, n)) if rounding is None else array("rounding", rounding, (time, n))
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps."""
+        return len(self.steps.drift)
+
+    def step(self, k: int) -> Steps:
+        """The matrices of one step, without time axis."""
+        return Steps(*(field[k] for field in self.steps))
+
+
+class StateMoments(NamedTuple):
+    """Mean (time + 1, N) and covariance (time + 1, N, N) of y itself; entry 0 is the start."""
+
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def state_moments(system: LinearSystem) -> StateMoments:
+    """Moments of y before any data: X+ = A X A' + Cov(w). No best filter's error exceeds them, P_k <= X_k.
+
+    Raises: nothing; a LinearSystem is checked when it is made.
+    """
+    mean, spread = system.mean, system.covariance
+    means, spreads = [mean], [spread]
+    for k in range(system.horizon):
+        s = system.step(k)
+        mean = s.transition @ mean + s.drift
+        spread = s.transition @ spread @ s.transition.T + s.process
+        means.append(mean)
+        spreads.append(spread)
+    return StateMoments(np.array(means), np.array(spreads))
+
+
+def check_horizon(horizon: int) -> None:
+    """Raise ValueError unless `horizon` is a positive whole number."""
+    if int(horizon) != horizon or horizon < 1:
+        raise fail("horizon", "a positive whole number", horizon)

@@ -1,0 +1,131 @@
+"""Channels between a sensor and a filter, each one random affine map: hops, relays, dropouts, direct links."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.model.over_time import OverTime, over_time, unstack
+from heliograph.model.sensor import AbstractSensor, check_sensor
+from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.random_affine.atoms import GainAndNoise, known
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.noise import as_noise
+
+Channel = AbstractRandomAffine | OverTime  # an OverTime holds one channel per step
+
+
+def hop(gain: Any, noise: Any, power: float = 1.0, amplification: float = 1.0, dimension: int = 1) -> GainAndNoise:
+    """One radio link: z = amplification sqrt(power) g y + n, the same gain for all components of y.
+
+    `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or a variance for each component, when
+    `dimension` says how many there are. A relay's hop has its amplification factor; a sensor's has 1.
+
+    Raises:
+        ValueError: a negative power, a noise that is no covariance, numbers that are not finite.
+    Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
+    """
+    law = gain if isinstance(gain, AbstractLaw) else Constant(gain)
+    if not isinstance(noise, int | float):
+        dimension = noise.dimension if hasattr(noise, "dimension") else len(np.atleast_1d(noise))
+    factor = scalar("amplification", amplification) * np.sqrt(scalar("hop power", power, 0.0))
+    return GainAndNoise(law, factor * np.eye(dimension), as_noise("hop noise", noise, dimension))
+
+
+def perfect(dimension: int = 1) -> GainAndNoise:
+    """The channel that delivers y as it is: z = y.
+
+    Raises:
+        ValueError: a dimension that is not a whole number of components.
+    """
+    return known(np.eye(check_count("dimension", dimension)))
+
+
+def silent(outputs: int = 1, inputs: int | None = None, noise: Any = 0.0) -> GainAndNoise:
+    """A channel through which nothing comes but noise: z = n.
+
+    Raises:
+        ValueError: a noise that is no covariance or of another dimension.
+    """
+    matrix = np.zeros((outputs, outputs if inputs is None else inputs))
+    return GainAndNoise(Constant(1.0), matrix, as_noise("noise of a silent channel", noise, outputs))
+
+
+def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> Series:
+    """A chain of hops through relays that amplify what they hear, noise included: z = H_N ... H_2 H_1 y.
+
+    Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n.
+
+    Raises:
+        ValueError: no hop, or hops whose dimensions do not fit.
+    Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
+    """
+    return Series(hops)
+
+
+def dropout(channel: AbstractRandomAffine, arrival: Any, radius: Any = 0.0) -> Mixture:
+    """A channel whose packet is lost with probability 1 - arrival; the receiver then reads zero and is not told.
+
+    Where the receiver knows of the loss, it is an `erasure`.
+
+    Raises:
+        ValueError: an arrival probability outside [0, 1].
+    """
+    p = scalar("arrival probability", arrival, 0.0, 1.0)
+    return Mixture([channel, silent(channel.outputs, channel.inputs)], [p, 1 - p], radius)
+
+
+def erasure(channel: AbstractRandomAffine, arrival: Any) -> Erasure:
+    """A channel whose packet is lost with probability 1 - arrival; the receiver knows, and reads NaN.
+
+    Filters skip what is NaN, so give a filter the channel inside, without the erasure. A relay forwards NaN as NaN.
+
+    Raises:
+        ValueError: an arrival probability outside [0, 1]; later, when asked for moments.
+    """
+    return Erasure(channel, arrival)
+
+
+def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine) -> Stack:
+    """The relayed signal and the direct one, both received: z = (z_relay, z_direct), independent given y.
+
+    Raises:
+        ValueError: channels that take different numbers of inputs.
+    """
+    return Stack([relayed, direct])
+
+
+def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
+    """Each channel carries its own part of y: the first its first components, and so on.
+
+    Raises:
+        ValueError: no channels.
+    """
+    if not channels:
+        raise fail("parallel channels", "at least one", "none")
+    parts, start, total = [], 0, sum(c.inputs for c in channels)
+    for c in channels:
+        parts.append(Series([known(np.eye(total)[start : start + c.inputs]), c]))
+        start += c.inputs
+    return Stack(parts)
+
+
+def mean_gain(channel: Channel) -> Channel:
+    """The channel that most people would design for: every gain taken as its mean, with the noise as it is.
+
+    Raises:
+        ValueError: a gain law that does not know its mean.
+    """
+    if isinstance(channel, OverTime):
+        return over_time([c.mean_gain() for c in unstack(channel)])
+    return channel.mean_gain()
+
+
+def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: int) -> None:
+    """Raise ValueError unless sensor and channel fit each other and the state."""
+    check_sensor(sensor, states)
+    if channel.inputs != len(sensor.outputs):
+        raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{channel.inputs} inputs")

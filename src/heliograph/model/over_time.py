@@ -1,0 +1,116 @@
+"""The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Int
+
+from heliograph.numerics.check import fail
+
+T = TypeVar("T")
+
+
+class OverTime(eqx.Module):
+    """Values whose leading axis is time; an unmarked array never varies, whatever its shape.
+
+    `values` is an array (time, ...) or any model object stacked over time; build the latter with `over_time`.
+    """
+
+    values: Any
+
+    def __init__(self, values: Any):
+        self.values = jax.tree.map(_as_array, values)
+        steps = {leaf.shape[0] if leaf.ndim else None for leaf in _arrays(self.values)}
+        if len(steps) != 1 or None in steps:
+            raise fail("OverTime", "arrays that share one leading time axis", f"lengths {sorted(map(str, steps))}")
+
+    @property
+    def steps(self) -> int:
+        """Number of time steps covered."""
+        return int(_arrays(self.values)[0].shape[0])
+
+
+def _as_array(leaf: Any) -> Any:
+    return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
+
+
+def _arrays(tree: Any) -> list[Any]:
+    return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
+
+
+def stack(items: Sequence[T]) -> T:
+    """Stack model objects of one structure into one object whose arrays have a new leading axis.
+
+    Raises:
+        ValueError: the objects differ in structure, in array shapes, or in anything that is not an array.
+    """
+    if not all(alike(item, items[0]) for item in items):
+        raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
+    rest = eqx.filter(items[0], eqx.is_array, inverse=True)
+    arrays = jax.tree.map(_stack_leaves, *(eqx.filter(item, eqx.is_array) for item in items))
+    result: T = eqx.combine(arrays, rest)
+    return result
+
+
+def alike(a: Any, b: Any) -> bool:
+    """Whether two model objects differ in nothing but the values of their arrays."""
+
+    def shape(leaf: Any) -> Any:
+        return leaf.shape if eqx.is_array(leaf) else leaf
+
+    return bool(eqx.tree_equal(jax.tree.map(shape, a), jax.tree.map(shape, b)))
+
+
+def _stack_leaves(*leaves: Any) -> Any:
+    if any(isinstance(leaf, jax.Array) for leaf in leaves):
+        return jnp.stack(leaves)
+    return np.stack(leaves)
+
+
+def over_time(items: Sequence[Any]) -> OverTime:
+    """One model object per time step (a channel, a plant, ...) as a single object that varies in time.
+
+    Raises:
+        ValueError: no items, or items that differ in structure.
+    """
+    if not items:
+        raise fail("over_time", "at least one item", "none")
+    return OverTime(stack(items))
+
+
+def at(tree: Any, k: int | Int[Array, ""]) -> Any:
+    """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values."""
+
+    def read(leaf: Any) -> Any:
+        if not isinstance(leaf, OverTime):
+            return leaf
+        values, rest = eqx.partition(leaf.values, eqx.is_array)
+        return eqx.combine(jax.tree.map(lambda v: jnp.asarray(v)[k], values), rest)
+
+    return jax.tree.map(read, tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+
+
+def steps_covered(tree: Any) -> int | None:
+    """Smallest number of steps that the time-varying parts of `tree` cover; None if nothing varies."""
+    leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+    steps = [leaf.steps for leaf in leaves if isinstance(leaf, OverTime)]
+    return min(steps) if steps else None
+
+
+def unstack(stacked: OverTime) -> list[Any]:
+    """The objects of each step, as they were given to `over_time`."""
+    return [_item(stacked, i) for i in range(stacked.steps)]
+
+
+def _item(stacked: OverTime, i: int) -> Any:
+    arrays, rest = eqx.partition(stacked.values, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda v: v[i], arrays), rest)
+
+
+def first(item: Any) -> Any:
+    """A plant, sensor or channel at its first step."""
+    return _item(item, 0) if isinstance(item, OverTime) else item

@@ -1,0 +1,249 @@
+"""A plant observed by a sensor, relays that filter and forward, and a receiver: who hears whom, slot by slot."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, first, steps_covered, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.numerics.check import fail
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.second_order import second_moment_tensor
+
+SENSOR, RECEIVER = "sensor", "receiver"
+
+Links = Mapping[str, Channel]  # by sender
+Slot = Mapping[str, Links]  # by listener
+
+
+class RelayNetwork(eqx.Module):
+    """Relays with memory between a sensor and a receiver.
+
+    At step k the sensor sends y_k = C_k x_k + v_k and relay r sends C_k s_r, with s_r its estimate at k - 1: what it
+    hears at k, it can only forward later. Slot k (used in turn, from the first) says who listens to whom:
+    `slots[k][listener][sender]` is the link, a random affine map; a listener hears the sum of its links. Senders are
+    "sensor" and the relays, listeners the relays and "receiver". A relay that listens and is heard in one slot is full
+    duplex; its link to itself is self-interference.
+
+    Links are independent of each other and over time. A link that is an OverTime is read at the step, not at the slot.
+
+    Raises:
+        ValueError: no slots; a schedule in which nobody transmits to the receiver, or a relay that hears nobody but
+            itself; unknown names; links that do not fit; a plant or sensor that is not linear, a plant with inputs.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    slots: tuple[dict[str, dict[str, Channel]], ...]
+    relays: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, plant: AnyPlant, sensor: AnySensor, relays: Sequence[str], slots: Sequence[Slot]):
+        self.plant, self.sensor, self.relays = plant, sensor, tuple(relays)
+        self.slots = tuple({listener: dict(links) for listener, links in slot.items() if links} for slot in slots)
+        _check_linear(first(plant), first(sensor))
+        if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
+            raise fail("relays", f"distinct names other than {SENSOR!r} and {RECEIVER!r}", list(self.relays))
+        if not self.slots:
+            raise fail("slots", "at least one", "none")
+        for number, slot in enumerate(self.slots):
+            for listener, links in slot.items():
+                _check_listener(self, number, listener, links)
+        for name in self.filters:
+            _check_reached(self, name)
+
+    @property
+    def filters(self) -> tuple[str, ...]:
+        """Names of the filters: the relays, and the receiver last."""
+        return (*self.relays, RECEIVER)
+
+    @property
+    def received(self) -> tuple[int, ...]:
+        """Length of what each filter hears, in the order of `filters`."""
+        return tuple(
+            next(first(link).outputs for slot in self.slots for link in slot.get(name, {}).values())
+            for name in self.filters
+        )
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Names of the plant's states."""
+        names: tuple[str, ...] = first(self.plant).states
+        return names
+
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (n,) and covariance (n, n) of x_0."""
+        plant = _first_step(self.plant)
+        return np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
+
+    def check_horizon(self, horizon: int) -> None:
+        """Raise ValueError unless `horizon` is positive and within what varies over time."""
+        covered = steps_covered(self)
+        if int(horizon) != horizon or horizon < 1:
+            raise fail("horizon", "a positive whole number", horizon)
+        if covered is not None and horizon > covered:
+            raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
+
+    def steps(self, horizon: int) -> "Steps":
+        """Matrices and moments of each step, the first leading from x_0 to x_1.
+
+        Raises:
+            ValueError: a horizon beyond what varies over time; links with uncertain probabilities.
+        """
+        self.check_horizon(horizon)
+        varies = steps_covered(self.slots) is not None
+        period = horizon if varies else min(len(self.slots), horizon)
+        tables = [_slot_moments(self, self.slots[k % len(self.slots)], k) for k in range(period)]
+        gain, offset, spread, live, talks = (
+            np.stack(parts)[np.arange(horizon) % period] for parts in zip(*tables, strict=True)
+        )
+        transition = _tile(self.plant, horizon, lambda p: p.matrix, 2)
+        drift = _tile(self.plant, horizon, lambda p: p.noise.mean, 1)
+        means = [self.initial()[0]]
+        for a, b in zip(transition[:-1], drift[:-1], strict=True):
+            means.append(a @ means[-1] + b)
+        return Steps(
+            transition=transition,
+            process=_tile(self.plant, horizon, lambda p: p.noise.covariance, 2),
+            drift=drift,
+            sensing=_tile(self.sensor, horizon, lambda s: s.matrix, 2),
+            sensor_noise=_tile(self.sensor, horizon, lambda s: s.noise.covariance, 2),
+            sensor_offset=_tile(self.sensor, horizon, lambda s: s.noise.mean, 1),
+            state_mean=np.array(means),
+            gain=gain,
+            offset=offset,
+            spread=spread,
+            live=live,
+            talks=talks,
+            received=self.received,
+        )
+
+
+class Steps(eqx.Module):
+    """What the second moments of a relay network need, for each step (leading axis).
+
+    R numbers are heard by the F filters together, T = (1 + relays) m are sent: y, then what each relay sends. With
+    sent made homogeneous by a 1, W = E (sent, 1)(sent, 1)', what is heard has mean gain sent + offset and conditional
+    covariance spread_ij : W (noise included), and `live` rows hear something at all. `state_mean` is E x before it.
+
+    Shapes: transition, process (time, n, n), drift, state_mean (time, n), sensing (time, m, n), sensor_noise
+    (time, m, m), sensor_offset (time, m), gain (time, R, T), offset, live (time, R), spread
+    (time, R, R, T + 1, T + 1), talks (time, 1 + relays).
+    """
+
+    transition: np.ndarray
+    process: np.ndarray
+    drift: np.ndarray
+    sensing: np.ndarray
+    sensor_noise: np.ndarray
+    sensor_offset: np.ndarray
+    state_mean: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+    spread: np.ndarray
+    live: np.ndarray
+    talks: np.ndarray
+    received: tuple[int, ...] = eqx.field(static=True)
+
+    @property
+    def owner(self) -> np.ndarray:
+        """Index of the filter that hears each of the R numbers."""
+        return np.repeat(np.arange(len(self.received)), self.received)
+
+
+def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """E G (p, m), E n (p,) and Cov(z_i, z_j | y) = S_ij : (y, 1)(y, 1)' as S (p, p, m + 1, m + 1) of one link.
+
+    Raises:
+        ValueError: probabilities that are uncertain.
+    """
+    try:
+        known = link.corner_count() == 1
+    except ValueError:  # too many corners to list
+        known = False
+    if not known:
+        raise fail("link", "known probabilities", "uncertain ones")
+    moments = link.moments(2)
+    mean = moments.mean[:-1]
+    product = np.einsum("ia,jb->ijab", mean, mean)
+    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    return mean[:, :-1], mean[:, -1], raw - (product + product.swapaxes(2, 3)) / 2
+
+
+def link_at(link: Channel, k: int) -> AbstractRandomAffine:
+    """The link at step k."""
+    result: AbstractRandomAffine = unstack(link)[k] if isinstance(link, OverTime) else link
+    return result
+
+
+def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
+    """Gain, offset, spread, live rows and talking senders of one slot, as `Steps` has them."""
+    m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
+    rows, columns = sum(network.received), len(senders) * m
+    starts = dict(zip(network.filters, np.cumsum((0, *network.received[:-1])), strict=True))
+    gain, offset, live = np.zeros((rows, columns)), np.zeros(rows), np.zeros(rows)
+    spread, talks = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
+    for listener, links in slot.items():
+        for sender, link in links.items():
+            own_gain, own_offset, own_spread = link_moments(link_at(link, k))
+            heard = starts[listener] + np.arange(len(own_offset))
+            sent = m * senders.index(sender) + np.arange(m)
+            gain[np.ix_(heard, sent)] = own_gain
+            offset[heard] += own_offset
+            with_one = np.append(sent, columns)
+            spread[np.ix_(heard, heard, with_one, with_one)] += own_spread  # independent links: variances add
+            live[heard], talks[senders.index(sender)] = 1.0, 1.0
+    return gain, offset, spread, live, talks
+
+
+def _tile(item: Any, horizon: int, read: Callable[[Any], Any], dimensions: int) -> np.ndarray:
+    """One array of a plant or sensor for each step."""
+    value = np.asarray(read(item.values if isinstance(item, OverTime) else item), dtype=np.float64)
+    if value.ndim == dimensions + 1:
+        return value[:horizon]
+    return np.broadcast_to(value, (horizon, *value.shape))
+
+
+def _first_step(item: Any) -> Any:
+    return unstack(item)[0] if isinstance(item, OverTime) else item
+
+
+def _check_linear(plant: Any, sensor: Any) -> None:
+    if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
+        got = f"{type(plant).__name__} and {type(sensor).__name__}"
+        raise fail("relay network", "a LinearPlant and a LinearSensor", got)
+    if plant.inputs:
+        raise fail("relay network's plant", "no inputs", list(plant.inputs))
+    if sensor.matrix.shape[-1] != len(plant.states):
+        raise fail("sensor matrix", f"{len(plant.states)} columns", f"shape {sensor.matrix.shape[-2:]}")
+
+
+def _check_listener(network: RelayNetwork, number: int, listener: str, links: Links) -> None:
+    where = f"slot {number}, {listener!r}"
+    if listener not in network.filters:
+        raise fail(f"listener in slot {number}", f"one of {list(network.filters)}", repr(listener))
+    for sender, link in links.items():
+        if sender not in (SENSOR, *network.relays):
+            raise fail(f"{where}: sender", f"one of {[SENSOR, *network.relays]}", repr(sender))
+        if not isinstance(first(link), AbstractRandomAffine):
+            raise fail(f"{where}: link from {sender!r}", "a random affine map", type(first(link)).__name__)
+        takes, length = first(link).inputs, len(first(network.sensor).outputs)
+        if takes != length:
+            raise fail(f"{where}: link from {sender!r}", f"one that takes {length} numbers", f"one that takes {takes}")
+    sizes = {
+        first(link).outputs for slot in network.slots for link in slot.get(listener, {}).values()
+    }  # one filter, one length of what it hears
+    if len(sizes) > 1:
+        raise fail(f"links to {listener!r}", "one number of outputs", sorted(sizes))
+
+
+def _check_reached(network: RelayNetwork, name: str) -> None:
+    heard = {sender for slot in network.slots for sender in slot.get(name, {})}
+    if name == RECEIVER and not heard:
+        raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")
+    if not heard - {name}:
+        got = "itself only" if heard else "nobody"
+        raise fail(f"relay {name!r}", "to hear the sensor or another relay in some slot", got)

@@ -1,0 +1,97 @@
+"""Sensors: y = h(x) + v."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.over_time import OverTime, first
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.numerics.check import array, fail, names
+from heliograph.random_affine.noise import AbstractNoise, as_noise
+
+
+class AbstractSensor(eqx.Module):
+    """A sensor y = h(x) + v with v independent over time and of everything else."""
+
+    noise: eqx.AbstractVar[AbstractNoise]
+    outputs: eqx.AbstractVar[tuple[str, ...]]
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """h(x): shapes (n,) -> (len(outputs),)."""
+        raise NotImplementedError
+
+
+class Sensor(AbstractSensor):
+    """A nonlinear sensor: `measure(x)` written with jax.numpy; `noise` a covariance, a variance or a noise law.
+
+    Say how many outputs there are by naming them, by a covariance matrix, or by a noise law; a single variance and no
+    names mean one output.
+
+    Raises:
+        ValueError: names, noise and function that disagree about the number of outputs.
+    """
+
+    function: Callable[[Any], Any]
+    noise: AbstractNoise
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, measure: Callable[[Any], Any], noise: Any, outputs: Sequence[str] | None = None):
+        self.function = measure
+        if outputs is not None:
+            dimension = len(outputs)
+        elif isinstance(noise, AbstractNoise):
+            dimension = noise.dimension
+        else:
+            dimension = len(np.atleast_1d(noise))
+        self.noise = as_noise("sensor noise", noise, dimension)
+        self.outputs = names("sensor outputs", outputs, dimension, "y")
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """h(x)."""
+        return jnp.asarray(self.function(x))
+
+
+class LinearSensor(AbstractSensor):
+    """A linear sensor y = C x + v.
+
+    Shapes: matrix (m, n).
+
+    Raises:
+        ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite.
+    """
+
+    matrix: np.ndarray
+    noise: AbstractNoise
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __init__(self, matrix: Any, noise: Any, outputs: Sequence[str] | None = None):
+        self.matrix = array("sensor matrix", matrix, (None, None))
+        self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
+        self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """C x."""
+        return jnp.asarray(self.matrix) @ x
+
+
+AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
+
+
+def check_sensor(sensor: AbstractSensor, states: int) -> None:
+    """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
+    try:
+        with jax.enable_x64(True):
+            got = jax.eval_shape(sensor.measure, np.zeros(states)).shape
+    except TypeError as error:
+        raise fail("sensor", f"to measure a state of length {states}", str(error).splitlines()[0]) from None
+    if got != (len(sensor.outputs),):
+        raise fail("sensor", f"{len(sensor.outputs)} outputs {list(sensor.outputs)}", f"shape {got}")
+
+
+def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
+    """Whether both are linear, so that means and covariances propagate without approximation."""
+    return isinstance(first(plant), LinearPlant) and isinstance(first(sensor), LinearSensor)

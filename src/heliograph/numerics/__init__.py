@@ -1,0 +1,1 @@
+"""Arithmetic and checks that know nothing of estimation."""

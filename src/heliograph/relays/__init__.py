@@ -1,0 +1,1 @@
+"""Relays that filter and forward: second moments, gains, power, receivers."""

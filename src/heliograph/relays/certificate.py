@@ -1,0 +1,252 @@
+"""Which published bounds on a relay network's errors apply to a design, and whether they hold; checked on their own."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_at, link_moments
+from heliograph.relays.check import Recomputed, recompute
+from heliograph.relays.design import GainsByFilter
+
+GREEDY = 1e-8  # correlation of error and innovation below which a gain minimises its own next error
+ROUNDING = 1e-9  # relative to the trace of the larger matrix, in comparisons of covariances from raw moments
+
+
+class Assumption(NamedTuple):
+    """What a bound asks for, the number found, and whether it is met."""
+
+    text: str
+    found: str
+    met: bool
+
+
+class Bound(NamedTuple):
+    """One bound: what it says, where from, what it assumes, its value at k = 0 .. steps, and whether the errors obey.
+
+    `holds` is None where no value can be formed.
+    """
+
+    name: str
+    source: str
+    assumptions: tuple[Assumption, ...]
+    values: np.ndarray | None
+    holds: bool | None
+
+    @property
+    def applies(self) -> bool:
+        """Whether every assumption is met."""
+        return all(a.met for a in self.assumptions)
+
+    @property
+    def failing(self) -> tuple[str, ...]:
+        """The assumptions that are not met, each with what was found."""
+        return tuple(f"{a.text}: {a.found}" for a in self.assumptions if not a.met)
+
+
+class RelayCertificate(NamedTuple):
+    """Bounds on a design's errors, by name; `recomputed` are the errors they were compared with."""
+
+    bounds: dict[str, Bound]
+    constants: dict[str, float]
+    recomputed: Recomputed
+
+
+def certify_relays(network: RelayNetwork, gains: GainsByFilter) -> RelayCertificate:
+    """Compare the errors under any gains {filter: (steps, n, received)} with every bound that is known.
+
+    The errors are recomputed by `recompute`, which knows nothing of how the gains were made. "state covariance" is the
+    bound that holds whenever gains are greedy: no error covariance exceeds that of the state itself, which is bounded
+    for all time if the plant's spectral radius is below 1. The published bounds are in corrected form: the lower bounds
+    with s = phi / (2 mu^2) in place of the printed phi / mu^2 and with the lower process noise, constants as
+    max(p0, w / (1 - tau)) and min(p0, w / (1 - alpha)).
+
+    Raises:
+        ValueError: a filter without gains.
+    Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 3 and 4, Lemmas 8 and 9.
+    """
+    found = recompute(network, gains)
+    horizon = len(found.state) - 1
+    steps = network.steps(horizon)
+    c = _constants(network, steps)
+    relays = np.array([np.linalg.eigvalsh(found.covariance[name]) for name in network.relays])
+    receiver = np.linalg.eigvalsh(found.covariance[RECEIVER])
+    greedy = _greedy(found)
+    upper = _recursion(c["p0_upper"], np.full(horizon, c["tau_upper"]), c["w_upper"])
+    bounds = [
+        _state_bound(steps, found, greedy),
+        _above("Theorem 3, upper", "(33)", (greedy,), upper, relays),
+        _relay_lower(c, upper, relays, greedy),
+        _above("Theorem 4, upper", "(54)", (greedy,), upper, receiver),
+        _receiver_lower(c, upper, receiver, greedy),
+        *_uniform(c, relays, receiver, greedy, horizon),
+    ]
+    return RelayCertificate({bound.name: bound for bound in bounds}, c, found)
+
+
+def _greedy(found: Recomputed) -> Assumption:
+    largest = max(float(np.max(value)) for value in found.correlation.values())
+    text = "every gain minimises its filter's own next error (error and innovation uncorrelated)"
+    return Assumption(text, f"correlation {largest:.2g}", largest <= GREEDY)
+
+
+def _state_bound(steps: Steps, found: Recomputed, greedy: Assumption) -> Bound:
+    """E e_f e_f' <= cov x_k; the values are the largest eigenvalues of cov x_k."""
+    radius = max(float(np.max(np.abs(np.linalg.eigvals(a)))) for a in steps.transition)
+    still = bool(np.all(steps.transition == steps.transition[0]))
+    stable = Assumption("a constant plant with spectral radius below 1", f"{radius:.6g}", still and radius < 1)
+    size = np.trace(found.state, axis1=1, axis2=2)
+    gap = min(
+        float(np.min(np.linalg.eigvalsh(found.state - error)[:, 0] / size)) for error in found.covariance.values()
+    )
+    values = np.linalg.eigvalsh(found.state)[:, -1]
+    return Bound("state covariance", "E e e' <= cov x", (greedy, stable), values, gap >= -ROUNDING)
+
+
+def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
+    """The scalars of Assumption 1; NaN where the network is not of the published kind."""
+
+    def extremes(matrices: Any) -> tuple[float, float]:
+        values = np.linalg.eigvalsh(np.asarray(matrices))
+        return float(values.min()), float(values.max())
+
+    def gram(a: np.ndarray) -> np.ndarray:
+        product: np.ndarray = a @ np.swapaxes(a, 1, 2)
+        return product
+
+    tau, f, w = extremes(gram(steps.transition)), extremes(gram(steps.sensing)), extremes(steps.process)
+    p0, v = extremes(network.initial()[1][None]), extremes(steps.sensor_noise)
+    mu, phi, g, o = _link_constants(network, len(steps.live))
+    rounding = 1e-14 * w[1]  # of an eigenvalue of a singular matrix
+    return {
+        "tau_lower": tau[0], "tau_upper": tau[1], "f_lower": f[0], "f_upper": f[1],
+        "w_lower": w[0] if w[0] > rounding else 0.0, "w_upper": w[1], "v_lower": max(v[0], 0.0),
+        "p0_lower": p0[0], "p0_upper": p0[1], "mu_lower": mu[0], "mu_upper": mu[1], "phi_lower": phi[0],
+        "phi_upper": phi[1], "g_lower": g, "o_lower": o,
+    }  # fmt: skip
+
+
+def _link_constants(
+    network: RelayNetwork, horizon: int
+) -> tuple[tuple[float, float], tuple[float, float], float, float]:
+    """Ranges of |mean| and variance of the scalar link gains; least noise at a relay and at the receiver."""
+    nothing = (float("nan"), float("nan")), (float("nan"), float("nan")), float("nan"), float("nan")
+    means: list[float] = []
+    variances: list[float] = []
+    noises: dict[bool, list[float]] = {True: [], False: []}
+    for k in range(horizon):
+        for listener, links in network.slots[k % len(network.slots)].items():
+            senders, noise = set(links), np.zeros(())
+            published = senders < {SENSOR, *network.relays} and len(senders - {SENSOR}) == 1 and listener not in senders
+            if not published or (SENSOR in senders) != (listener != RECEIVER):
+                return nothing
+            for link in links.values():
+                gain, offset, spread = link_moments(link_at(link, k))
+                m = len(offset)
+                mean, variance = gain[0, 0], spread[0, 0, 0, 0]
+                shape = np.einsum("ia,jb->ijab", np.eye(m), np.eye(m))
+                square = spread.shape == (m, m, m + 1, m + 1)
+                if not square or np.any(offset) or not np.allclose(gain, mean * np.eye(m)):
+                    return nothing
+                if not np.allclose(spread[..., :-1, :-1], variance * (shape + shape.swapaxes(2, 3)) / 2):
+                    return nothing
+                means.append(float(abs(mean)))
+                variances.append(float(variance))
+                noise = noise + spread[..., -1, -1]
+            noises[listener == RECEIVER].append(float(np.linalg.eigvalsh(np.atleast_2d(noise))[0]))
+    if not noises[True] or not noises[False]:
+        return nothing
+    return (min(means), max(means)), (min(variances), max(variances)), min(noises[False]), min(noises[True])
+
+
+def _structure(c: dict[str, float]) -> Assumption:
+    text = "each relay hears the sensor and one other relay, the receiver one relay, over scalar gains"
+    return Assumption(text, "otherwise" if np.isnan(c["mu_upper"]) else "so", not np.isnan(c["mu_upper"]))
+
+
+def _positive(c: dict[str, float]) -> tuple[Assumption, ...]:
+    """Assumption 1's lower bounds that a circuit can miss."""
+    wanted = {"w_lower": "process noise in every direction", "tau_lower": "an invertible plant matrix",
+              "p0_lower": "an initial covariance in every direction"}  # fmt: skip
+    return tuple(Assumption(text, f"smallest eigenvalue {c[name]:.3g}", c[name] > 0) for name, text in wanted.items())
+
+
+def _recursion(start: float, factors: np.ndarray, constant: float) -> np.ndarray:
+    """b_k = a_(k-1) b_(k-1) + c."""
+    values = [start]
+    for factor in factors:
+        values.append(factor * values[-1] + constant)
+    return np.array(values)
+
+
+def _above(name: str, source: str, assumptions: Any, values: np.ndarray, eigenvalues: np.ndarray) -> Bound:
+    holds = bool(np.all(eigenvalues[..., -1] <= values * (1 + ROUNDING)))
+    return Bound(name, source, tuple(assumptions), values, holds)
+
+
+def _below(name: str, source: str, assumptions: Any, values: np.ndarray, eigenvalues: np.ndarray) -> Bound:
+    slack = ROUNDING * eigenvalues[..., -1]
+    holds = bool(np.all(eigenvalues[..., 0] >= values - slack))
+    return Bound(name, source, tuple(assumptions), values, holds)
+
+
+def _lower_condition(c: dict[str, float], upper: Any) -> tuple[Any, Any, Any, float]:
+    """n - c m / s and n + c m of the lower bound, the printed n - c m mu^2 / phi, and the part of w that is left."""
+    mu, phi = c["mu_upper"], c["phi_lower"]
+    s = phi / (2 * mu**2)
+    n = (c["mu_lower"] ** 2 + phi) * (c["f_lower"] * c["w_lower"] + c["v_lower"]) + c["g_lower"]
+    weight = 2 * mu**2 * c["f_upper"] * (2 * c["tau_upper"] + 3) * upper
+    left = (phi - s * mu**2) / (phi + mu**2)
+    return n - weight / s if s else n - np.inf * weight, n + weight, n - weight * (mu**2 / phi if phi else np.inf), left
+
+
+def _relay_lower(c: dict[str, float], upper: np.ndarray, relays: np.ndarray, greedy: Assumption) -> Bound:
+    """m_k = rho_(k-1) m_(k-1) + left w, rho = tau (n - c m / s) / (n + c m), where n - c m / s > 0."""
+    structure = _structure(c)
+    if not structure.met:
+        return Bound("Theorem 3, lower", "(34)", (structure, greedy), None, None)
+    above, below, printed, left = _lower_condition(c, upper[:-1])
+    found = f"{above[0]:.4g} at k = 1 (printed form {printed[0]:.4g}), least {above.min():.4g}"
+    condition = Assumption("n - c mbar / s > 0 at every k", found, bool(np.all(above > 0)))
+    assumptions = structure, greedy, *_positive(c), condition
+    if not condition.met:
+        return Bound("Theorem 3, lower", "(34)", assumptions, None, None)
+    values = _recursion(c["p0_lower"], c["tau_lower"] * above / below, left * c["w_lower"])
+    return _below("Theorem 3, lower", "(34)", assumptions, values, relays)
+
+
+def _receiver_lower(c: dict[str, float], upper: np.ndarray, receiver: np.ndarray, greedy: Assumption) -> Bound:
+    """p_k = alpha_(k-1) p_(k-1) + w, alpha = tau o / (o + 4 mu^2 f mbar)."""
+    structure = _structure(c)
+    if not structure.met:
+        return Bound("Theorem 4, lower", "(52)", (structure, greedy), None, None)
+    alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * c["mu_upper"] ** 2 * c["f_upper"] * upper[:-1])
+    values = _recursion(c["p0_lower"], alpha, c["w_lower"])
+    return _below("Theorem 4, lower", "(52)", (structure, greedy, *_positive(c)), values, receiver)
+
+
+def _uniform(
+    c: dict[str, float], relays: np.ndarray, receiver: np.ndarray, greedy: Assumption, horizon: int
+) -> list[Bound]:
+    """Bounds for all time, which need tau < 1: max(p0, w / (1 - tau)) and min(p0, w / (1 - alpha))."""
+    tau, structure = c["tau_upper"], _structure(c)
+    contracting = Assumption("largest eigenvalue of A A' below 1", f"{tau:.6g}", tau < 1)
+    names = ("Lemma 8, upper", relays), ("Lemma 9, upper", receiver)
+    lower_names = ("Lemma 8, lower", relays), ("Lemma 9, lower", receiver)
+    needs = contracting, greedy, structure
+    if not contracting.met or not structure.met:
+        return [Bound(name, "(49) and (64)", needs, None, None) for name, _ in (*names, *lower_names)]
+    top = max(c["p0_upper"], c["w_upper"] / (1 - tau))
+    above, below, _, left = _lower_condition(c, top)
+    rho = c["tau_lower"] * above / below
+    alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * c["mu_upper"] ** 2 * c["f_upper"] * top)
+    condition = Assumption("n - c mbar / s > 0", f"{above:.4g}", bool(above > 0))
+    low = {
+        "Lemma 8, lower": (min(c["p0_lower"], left * c["w_lower"] / (1 - rho)), (condition,)),
+        "Lemma 9, lower": (min(c["p0_lower"], c["w_lower"] / (1 - alpha)), ()),
+    }
+    result = [_above(name, "(49)", needs, np.full(horizon + 1, top), eigenvalues) for name, eigenvalues in names]
+    for name, eigenvalues in lower_names:
+        value, extra = low[name]
+        assumptions = *needs, *_positive(c), *extra
+        result.append(_below(name, "(49) and (64)", assumptions, np.full(horizon + 1, value), eigenvalues))
+    return result

@@ -1,0 +1,147 @@
+"""What a design of a relay network gives: gains, exact error covariances, power; and its filters as schedules."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.linear.schedule import Gains, Schedule
+from heliograph.model.relays import RelayNetwork, Steps
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.relays.second_moments import Propagated, initial_moments, propagate
+
+GainsByFilter = Mapping[str, Any]
+
+
+class RelayDesign(eqx.Module):
+    """Gains of every filter for each step, computed before any data, and what they give.
+
+    covariance[filter] (steps + 1, n, n): E (x - s)(x - s)' at k = 0 .. steps, exact. power[relay] (steps,): mean
+    square E |C s|^2 of what it sends, zero where nobody listens. moments (steps + 1, d, d): covariance of
+    (x, e_1 .. e_F), the receiver's error last. For a periodic design `steps` is the period and entry 0 equals the last.
+
+    Shapes: gains[filter] (steps, n, received), zero where the filter hears nothing.
+    """
+
+    gains: dict[str, np.ndarray]
+    covariance: dict[str, np.ndarray]
+    power: dict[str, np.ndarray]
+    moments: np.ndarray
+
+    def trace(self, name: str) -> np.ndarray:
+        """Trace of one filter's error covariance at k = 0 .. steps."""
+        result: np.ndarray = np.trace(self.covariance[name], axis1=1, axis2=2)
+        return result
+
+    def total_power(self) -> np.ndarray:
+        """Power that the relays send together at each step, (steps,)."""
+        total: np.ndarray = np.sum([np.zeros(len(self.moments) - 1), *self.power.values()], axis=0)
+        return total
+
+
+def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
+    """Error covariances and power of any gains, {filter: (steps, n, received)}.
+
+    Raises:
+        ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
+    """
+    joined = join_gains(network, gains)
+    steps = network.steps(len(joined))
+    return as_design(network, _propagate(steps, start_moments(network), joined))
+
+
+_propagate = compiled(propagate)
+
+
+def start_moments(network: RelayNetwork) -> np.ndarray:
+    """Covariance of (x_0, e_1 .. e_F)."""
+    return initial_moments(network.initial()[1], len(network.filters))
+
+
+def join_gains(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
+    """Gains by filter as one block matrix for each step, (steps, F n, R)."""
+    if set(gains) != set(network.filters):
+        raise fail("gains", f"those of {list(network.filters)}", list(gains))
+    n, length = len(network.states), len(np.asarray(gains[network.filters[0]]))
+    joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
+    for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
+        value = array(f"gains of {name!r}", gains[name], (length, n, heard))
+        joined[:, f * n : (f + 1) * n, start : start + heard] = value
+        start += heard
+    return joined
+
+
+def split_gains(network: RelayNetwork, joined: np.ndarray) -> dict[str, np.ndarray]:
+    """Gains by filter from block matrices (steps, F n, R)."""
+    n, ends = len(network.states), np.cumsum(network.received)
+    return {
+        name: np.asarray(joined)[:, f * n : (f + 1) * n, end - heard : end]
+        for f, (name, heard, end) in enumerate(zip(network.filters, network.received, ends, strict=True))
+    }
+
+
+def as_design(network: RelayNetwork, result: Propagated) -> RelayDesign:
+    """Name the parts of a propagation.
+
+    Raises:
+        ValueError: moments that are not finite: an innovation moment is singular, or gains diverge.
+    """
+    moments, n = np.asarray(result.moments), len(network.states)
+    if not np.all(np.isfinite(moments)):
+        step = int(np.argmax(~np.isfinite(moments).all(axis=(1, 2))))
+        raise fail("design", "finite second moments", f"some that are not after step {step} (is a link noiseless?)")
+    blocks = {name: slice((1 + f) * n, (2 + f) * n) for f, name in enumerate(network.filters)}
+    return RelayDesign(
+        gains=split_gains(network, np.asarray(result.gains)),
+        covariance={name: moments[:, rows, rows] for name, rows in blocks.items()},
+        power={name: np.asarray(result.power)[:, 1 + r] for r, name in enumerate(network.relays)},
+        moments=moments,
+    )
+
+
+def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Schedule]:
+    """Every filter of a design as a schedule of gains, to save, to simulate or to run: s+ = A s + K (z - B s - b).
+
+    B s + b is what the filter would hear in the mean if its own estimate were everybody's. Claim: "exact" for complete
+    data from the network it was designed for.
+
+    Raises:
+        ValueError: a design of another network.
+    """
+    if set(design.gains) != set(network.filters):
+        raise fail("design", f"filters {list(network.filters)}", list(design.gains))
+    steps = network.steps(len(design.moments) - 1)
+    rows, constants = expected_maps(steps)
+    ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
+    result = {}
+    for name, heard in zip(network.filters, network.received, strict=True):
+        mine = slice(ends[name] - heard, ends[name])
+        gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]
+        transition = steps.transition - gain @ expected
+        offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
+        moved = transition, gain, offset
+        arrays = Gains(*moved, *moved, expected, constant, design.covariance[name][1:])
+        result[name] = Schedule(arrays, network.initial()[0], "exact")
+    return result
+
+
+def expected_maps(steps: Steps) -> tuple[np.ndarray, np.ndarray]:
+    """What each row expects to hear, B s + b, from the estimate s of its filter: (time, R, n) and (time, R)."""
+    relays = len(steps.received) - 1
+    predicted = [steps.sensing @ steps.transition, *[steps.sensing] * relays]
+    constant = np.einsum("kmn,kn->km", steps.sensing, steps.drift) + steps.sensor_offset
+    m = steps.sensing.shape[1]
+    return (
+        steps.gain @ np.concatenate(predicted, axis=1),
+        np.einsum("krm,km->kr", steps.gain[:, :, :m], constant) + steps.offset,
+    )
+
+
+def receiver_weight(weights: np.ndarray, filters: int, n: int) -> np.ndarray:
+    """Matrices C_k with <C_k, moments_k> = weights_k tr P_k, (steps, d, d)."""
+    d = (1 + filters) * n
+    result = np.zeros((len(weights), d, d))
+    result[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)
+    return result

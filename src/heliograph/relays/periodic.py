@@ -1,0 +1,202 @@
+"""The periodic steady state of a relay network: slots in turn, for ever."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.over_time import steps_covered
+from heliograph.model.relays import RelayNetwork, Steps
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compiled
+from heliograph.relays.design import GainsByFilter, RelayDesign, as_design, join_gains, start_moments
+from heliograph.relays.receiver import relay_gains, relay_side
+from heliograph.relays.second_moments import Propagated, propagate, propagate_own
+
+CONVERGED = 1e-13  # relative change of the moments over a period
+PERIODS = 100_000
+HELD = 1e-9  # the same for a covariance that only gives gains: their error enters it squared
+TINY = float(np.finfo(np.float64).tiny)
+INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
+
+
+def periodic_steps(network: RelayNetwork) -> Steps:
+    """One period, at the stationary mean of the state.
+
+    Raises:
+        ValueError: parts that vary beyond the slots, or a plant whose mean does not settle.
+    """
+    if steps_covered(network) is not None:
+        raise fail("steady state", "a network that varies with its slots only", "parts that are OverTime")
+    steps = network.steps(len(network.slots))
+    radius = float(np.max(np.abs(np.linalg.eigvals(steps.transition[0]))))
+    if radius >= 1:
+        raise fail("steady state", "a plant with spectral radius below 1", f"{radius:.6g}")
+    mean = np.linalg.solve(np.eye(len(network.states)) - steps.transition[0], steps.drift[0])
+    result: Steps = eqx.tree_at(lambda s: s.state_mean, steps, np.broadcast_to(mean, steps.state_mean.shape))
+    return result
+
+
+def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
+    """Where `own_error_design` settles: gains and moments over one period, from the first slot on.
+
+    Raises:
+        ValueError: what `periodic_steps` refuses, or moments that do not settle.
+    """
+    result, change = _settle_own(periodic_steps(network), start_moments(network))
+    if not change <= CONVERGED:
+        raise fail("steady state", "moments that settle", f"a change of {float(change):.2g} after {PERIODS} periods")
+    return as_design(network, result)
+
+
+def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
+    """The steady state under given gains, one entry per slot: {filter: (slots, n, received)}.
+
+    The moments over a period are an affine map of those before; its fixed point is found by one linear solve.
+
+    Raises:
+        ValueError: gains of the wrong shape, or gains under which the second moments diverge.
+    """
+    joined, steps = _period(network, join_gains(network, gains)), periodic_steps(network)
+    result = _steady(steps, joined)
+    radius = float(_growth(steps, joined))
+    if not radius < 1:
+        raise fail("periodic gains", "second moments that settle", f"growth by {radius:.4g} per period")
+    return as_design(network, result)
+
+
+def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
+    """Steady error covariance of the best linear receiver behind given relays, at the end of each slot.
+
+    Shapes: gains[relay] (slots, n, received), result (slots, n, n).
+
+    Raises:
+        ValueError: gains of the wrong shape, or gains under which the second moments diverge.
+    """
+    joined, steps = _period(network, relay_gains(network, gains)), periodic_steps(network)
+    radius = float(_growth(steps, joined))
+    if not radius < 1:
+        raise fail("periodic gains", "second moments that settle", f"growth by {radius:.4g} per period")
+    n = len(network.states)
+    return np.asarray(_steady_behind(steps, joined))[:, :n, :n]
+
+
+def _period(network: RelayNetwork, gains: np.ndarray) -> np.ndarray:
+    if len(gains) != len(network.slots):
+        raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
+    return gains
+
+
+def fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> jax.Array:
+    """M = step(M) for an affine map of symmetric (d, d) matrices, solved over the d (d + 1) / 2 entries."""
+    linear, constant, (i, j) = _entries(step, d)
+    entries = jnp.linalg.solve(jnp.eye(len(i)) - linear, constant)
+    return jnp.zeros((d, d)).at[i, j].set(entries).at[j, i].set(entries)
+
+
+def _entries(step: Callable[[jax.Array], jax.Array], d: int) -> tuple[jax.Array, jax.Array, Any]:
+    """The affine map on the upper triangle: linear part, constant, and the triangle's indices."""
+    i, j = np.triu_indices(d)
+    basis = np.zeros((len(i), d, d))
+    basis[np.arange(len(i)), i, j] = basis[np.arange(len(i)), j, i] = 1.0
+    constant = step(jnp.zeros((d, d)))
+    images = jax.vmap(lambda b: step(b) - constant)(jnp.asarray(basis))
+    return images[:, i, j].T, constant[i, j], (i, j)
+
+
+def steady(steps: Steps, gains: Any) -> Propagated:
+    """Moments over a period that ends as it begins; differentiable in the gains. Meaningful if `is_covariance`."""
+    d = gains.shape[1] + steps.transition.shape[-1]
+    return propagate(steps, fixed_point(lambda m: propagate(steps, m, gains).moments[-1], d), gains)
+
+
+def is_covariance(moments: jax.Array) -> jax.Array:
+    """Whether all of (..., d, d) are positive semidefinite to rounding: the fixed point is then the limit."""
+    fixed = jax.lax.stop_gradient(moments)
+    smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
+    return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
+
+
+def steady_behind(steps: Steps, gains: Any) -> jax.Array:
+    """Steady error covariances (slots, d', d') of the best linear estimate of (x, e_relays) from the receiver's data.
+
+    The receiver's gains are held while differentiating: they minimise the error, so their change has no first-order
+    effect, and the fixed point with given gains is affine.
+    """
+    moments = steady(steps, gains).moments[:-1]
+    a, c, white = jax.vmap(relay_side)(steps, moments, gains)
+    d = a.shape[-1]
+
+    def predict(spread: jax.Array, item: Any) -> jax.Array:
+        both = jnp.concatenate([item[0], item[1]])
+        moved: jax.Array = both @ spread @ both.T + item[2]
+        return moved
+
+    def best(spread: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+        z = predict(spread, item)
+        gain = jnp.linalg.solve(z[d:, d:], z[d:, :d]).T
+        after = z[:d, :d] - gain @ z[d:, :d]
+        return (after + after.T) / 2, gain
+
+    held = jax.lax.stop_gradient((a, c, white))
+    settled = _settle(lambda e: jax.lax.scan(best, e, held)[0], jax.lax.stop_gradient(moments[0][:d, :d]), HELD)[0]
+    best_gains = jax.lax.stop_gradient(jax.lax.scan(best, settled, held)[1])
+
+    def given(spread: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+        part, gain = item
+        close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
+        after = close @ predict(spread, part) @ close.T
+        return after, after
+
+    def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return jax.lax.scan(given, spread, ((a, c, white), best_gains))
+
+    return jnp.asarray(period(fixed_point(lambda e: period(e)[0], d))[1])
+
+
+_steady = compiled(steady)
+_steady_behind = compiled(steady_behind)
+
+
+@compiled
+def _growth(steps: Steps, gains: Any) -> jax.Array:
+    """Spectral radius of the linear part of one period of the second moments, by repeated squaring."""
+    d = gains.shape[1] + steps.transition.shape[-1]
+    linear, _, _ = _entries(lambda m: propagate(steps, m, gains).moments[-1], d)
+
+    def double(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        power, log_scale = carry
+        size = jnp.maximum(jnp.linalg.norm(power), TINY)
+        return (power / size) @ (power / size), 2 * (log_scale + jnp.log(size))
+
+    doublings = 30
+    power, log_scale = jax.lax.fori_loop(0, doublings, double, (linear, jnp.zeros(())))
+    return jnp.exp((log_scale + jnp.log(jnp.linalg.norm(power))) / 2.0**doublings)
+
+
+@compiled
+def _settle_own(steps: Steps, start: Any) -> tuple[Propagated, jax.Array]:
+    """Repeat the period until its moments change by less than CONVERGED."""
+
+    moments, change = _settle(lambda m: propagate_own(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
+    return propagate_own(steps, moments), change
+
+
+def _settle(
+    period: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: float
+) -> tuple[jax.Array, jax.Array]:
+    """Repeat until the relative change is below `tolerance`; returns the last value and its change."""
+
+    def again(carry: Any) -> Any:
+        value, _, count = carry
+        after = period(value)
+        return after, jnp.max(jnp.abs(after - value)) / jnp.max(jnp.abs(after)), count + 1
+
+    def going(carry: Any) -> Any:
+        return (carry[1] > tolerance) & (carry[2] < PERIODS)
+
+    value, change, _ = jax.lax.while_loop(going, again, (start, jnp.asarray(jnp.inf), 0))
+    return value, change

@@ -1,0 +1,157 @@
+"""Gains tuned for the periodic steady state by descent through its fixed point; power may be bounded."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.relays.descent import bfgs
+from heliograph.relays.design import GainsByFilter, RelayDesign, join_gains, split_gains
+from heliograph.relays.periodic import (
+    is_covariance,
+    periodic_given_design,
+    periodic_own_error_design,
+    periodic_steps,
+    steady,
+    steady_behind,
+)
+from heliograph.relays.receiver import relay_gains
+from heliograph.relays.second_moments import gain_mask
+
+POWER_TOLERANCE = 1e-6  # relative excess over a limit that counts as met
+MARGIN = 1e-5  # the search aims this much below a limit, so that what is left of the multipliers' error does not matter
+ROUNDS = 10  # of the multipliers
+STIFFNESS = 1000.0  # of the augmented Lagrangian, against a cost that is a logarithm
+
+
+def periodic_receiver_error_design(
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: Any = None
+) -> RelayDesign:
+    """Gains of relays and receiver that together make the steady sum over the slots of tr P small.
+
+    Descent through the fixed point of the second moments, from `start` {filter: (slots, n, received)}, by default the
+    steady `own_error_design`. The result is a local minimum. `power_limit`, a number or (slots,), bounds the power that
+    all relays send in each slot.
+
+    Raises:
+        ValueError: what `periodic_steps` refuses, a start of the wrong shape or under which the moments diverge, a
+            limit that no gains were found to meet.
+    """
+    own = periodic_own_error_design(network)
+    gains = join_gains(network, own.gains if start is None else start)
+    return periodic_given_design(network, split_gains(network, _tune(network, gains, _receiver_cost, power_limit)))
+
+
+def periodic_relays_for_best_receiver(
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: Any = None
+) -> dict[str, np.ndarray]:
+    """Relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
+
+    As `periodic_receiver_error_design`, but the receiver is `periodic_behind_relays`. Returns {relay: (slots, n,
+    received)}.
+
+    Raises:
+        ValueError: as for `periodic_receiver_error_design`; no relays.
+    """
+    gains = relay_gains(network, periodic_own_error_design(network).gains if start is None else start)
+    tuned = split_gains(network, _tune(network, gains, _behind_cost, power_limit))
+    return {name: gain for name, gain in tuned.items() if name != RECEIVER}
+
+
+def _tune(network: RelayNetwork, start: np.ndarray, cost: Callable[..., Any], power_limit: Any) -> np.ndarray:
+    """Descend over the free entries of the gains, each filter's in units of its largest."""
+    steps = periodic_steps(network)
+    if len(start) != len(network.slots):
+        raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(start))
+    used = gain_mask(steps) & (steps.live[:, None, :] > 0)
+    if cost is _behind_cost:
+        used[:, :, -network.received[-1] :] = False
+    where = np.nonzero(used)
+    unit = _units(network, start)[where]
+    slots = len(network.slots)
+    limit = np.full(slots, np.inf) if power_limit is None else np.broadcast_to(
+        array("power limit", power_limit, (slots,) if np.ndim(power_limit) else ()), (slots,))  # fmt: skip
+    multipliers, x = np.zeros(slots), np.zeros(len(unit))
+    if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
+        raise fail("start of the search", "gains under which second moments settle", "some under which they diverge")
+    for _ in range(ROUNDS if power_limit is not None else 1):
+
+        def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
+            value, gradient, _ = cost(x, steps, start, where, unit, limit * (1 - MARGIN), multipliers)
+            return float(value), gradient
+
+        x = bfgs(function, x)
+        power = cost(x, steps, start, where, unit, limit, multipliers)[2]
+        if _settled(power / (limit * (1 - MARGIN)) - 1, multipliers):
+            break
+        multipliers = np.maximum(0.0, multipliers + STIFFNESS * (power / (limit * (1 - MARGIN)) - 1))
+    if np.any(power > limit * (1 + POWER_TOLERANCE)):
+        raise fail("power limit", "one that some gains meet", f"an excess of {np.max(power / limit) - 1:.2g}")
+    tuned: np.ndarray = start.copy()
+    tuned[where] += x * unit
+    return tuned
+
+
+def _settled(excess: np.ndarray, multipliers: np.ndarray) -> bool:
+    """Whether no slot is above its limit, and those with a multiplier are at it."""
+    return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
+
+
+def _units(network: RelayNetwork, gains: np.ndarray) -> np.ndarray:
+    """The largest entry of each filter's gain in each slot, at every entry of that gain."""
+    largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
+    floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
+    return join_gains(
+        network,
+        {
+            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), heard))
+            for (name, value), heard in zip(largest.items(), network.received, strict=True)
+        },
+    )
+
+
+def _penalised(traces: jax.Array, sound: jax.Array, power: jax.Array, limit: jax.Array, multipliers: jax.Array) -> Any:
+    """log sum of traces plus sum_k max(0, lambda_k + c g_k)^2 / 2c, g the relative excess; infinite where unsound."""
+    total = jnp.sum(traces)
+    sound = sound & (total > 0)
+    shortage = jnp.maximum(0.0, multipliers + STIFFNESS * (power / limit - 1))
+    penalty = jnp.sum(shortage**2) / (2 * STIFFNESS)
+    return jnp.where(sound, jnp.log(jnp.where(sound, total, 1.0)) + penalty, jnp.inf)
+
+
+def _value(
+    traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]],
+) -> Callable[..., tuple[jax.Array, jax.Array, jax.Array]]:
+    """Value, gradient and power of a cost given by its traces, soundness and power."""
+
+    def value(x: Any, steps: Steps, base: Any, where: Any, unit: Any, limit: Any, multipliers: Any) -> Any:
+        def inner(x: jax.Array) -> tuple[jax.Array, jax.Array]:
+            trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
+            return _penalised(trace, sound, power, limit, multipliers), power
+
+        (result, power), gradient = jax.value_and_grad(inner, has_aux=True)(x)
+        return result, gradient, power
+
+    return compiled(value)
+
+
+def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    result, n = steady(steps, gains), steps.transition.shape[-1]
+    last = result.moments[1:, -n:, -n:]
+    return jnp.trace(last, axis1=1, axis2=2), is_covariance(result.moments), result.power[:, 1:].sum(axis=1)
+
+
+def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    result, n = steady(steps, gains), steps.transition.shape[-1]
+    spread = steady_behind(steps, gains)
+    sound = is_covariance(result.moments[:, :-n, :-n]) & is_covariance(spread)
+    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, result.power[:, 1:].sum(axis=1)
+
+
+_receiver_cost = _value(_receiver_traces)
+_behind_cost = _value(_behind_traces)

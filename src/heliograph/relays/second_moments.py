@@ -1,0 +1,147 @@
+"""Exact second moments of a relay network: one linear system with random coefficients.
+
+With e_f = x - s_f for each filter f, eta = (x, e_1, ..., e_F) and what is sent (y, C s_1, ..., C s_relays), one step is
+  s_f+ = A s_f + K_f i_f,   i_f = heard_f - E[heard_f if every estimate were s_f],   heard = G sent + n,  (G, n) random.
+Every i_f is a known linear map of eta and noises plus (G - E G) sent + n - E n, which is uncorrelated with all of them.
+So the moments of (eta+ before corrections, i) follow exactly, and every gain acts on them as a known matrix.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.relays import Steps
+from heliograph.numerics.linalg import psd_solve, symmetrize
+
+
+class Sent(NamedTuple):
+    """W = E (sent, 1)(sent, 1)' (T + 1, T + 1) and each sender's power E |signal|^2 (senders,), zero if silent."""
+
+    second: jax.Array
+    power: jax.Array
+
+
+class LinearMaps(NamedTuple):
+    """Rows over (x, e_1 .. e_F, w, v): eta+ before corrections (d, .), innovations (R, .), sent signals (T, .)."""
+
+    moved: jax.Array
+    innovation: jax.Array
+    sent: jax.Array
+
+
+def initial_moments(covariance: np.ndarray, filters: int) -> np.ndarray:
+    """Covariance of (x, e_1 .. e_F) where every filter starts at the mean: each e_f is x - E x."""
+    result: np.ndarray = np.kron(np.ones((1 + filters, 1 + filters)), covariance)
+    return result
+
+
+def linear_maps(p: Steps) -> LinearMaps:
+    """The known part of one step."""
+    (m, n), filters = p.sensing.shape, len(p.received)
+    d = (1 + filters) * n
+    unit = jnp.eye(d + n + m)
+    state, w, v = unit[:d].reshape(1 + filters, n, -1), unit[d : d + n], unit[d + n :]
+    moved = jnp.einsum("ab,fbc->fac", p.transition, state) + w
+    estimates = state[0] - state[1:]  # s_f = x - e_f
+    relayed = jnp.einsum("mn,fnc->fmc", p.sensing, estimates[:-1])
+    sent = jnp.concatenate([(p.sensing @ moved[0] + v)[None], relayed]).reshape(-1, d + n + m)
+    own_sends = [p.sensing @ p.transition, *[p.sensing] * (filters - 1)]  # as if each estimate were everybody's
+    believed = jnp.stack([jnp.asarray(c) for c in own_sends])
+    expects = jnp.asarray(p.gain) @ believed.reshape(
+        -1, n
+    )  # what each row expects to hear, as a map of its filter's estimate
+    own = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
+    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - own, sent)
+
+
+def sent_mean(p: Steps) -> jax.Array:
+    """E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
+    y = p.sensing @ (p.transition @ p.state_mean + p.drift) + p.sensor_offset
+    relayed = p.sensing @ p.state_mean
+    return jnp.concatenate([y, *[relayed] * (len(p.received) - 1), jnp.ones(1)])
+
+
+def step_moments(p: Steps, moments: jax.Array) -> tuple[jax.Array, Sent]:
+    """Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
+
+    Shapes: moments (d, d), Z (d + R, d + R) with d = (1 + F) n.
+    """
+    maps, mean = linear_maps(p), sent_mean(p)
+    sources = jax.scipy.linalg.block_diag(moments, p.process, p.sensor_noise)
+    second = jnp.outer(mean, mean).at[:-1, :-1].add(maps.sent @ sources @ maps.sent.T)
+    known = jnp.concatenate([maps.moved, maps.innovation])
+    d = maps.moved.shape[0]
+    z = (known @ sources @ known.T).at[d:, d:].add(jnp.einsum("ijab,ab->ij", p.spread, second))
+    m = p.sensing.shape[0]
+    power = jnp.diagonal(second)[:-1].reshape(-1, m).sum(axis=1) * p.talks
+    return z, Sent(second, power)
+
+
+def correct(z: jax.Array, gain: jax.Array) -> jax.Array:
+    """Covariance of eta+ = eta+ before corrections - (0; K) innovations; gain K of shape (F n, R)."""
+    rows, heard = gain.shape
+    d = z.shape[0] - heard
+    full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, heard)), -gain])], axis=1)
+    return symmetrize(full @ z @ full.T)
+
+
+def gain_mask(p: Steps) -> np.ndarray:
+    """Where a gain (F n, R) may differ from zero: each filter uses what it hears itself."""
+    n = p.transition.shape[-1]
+    result: np.ndarray = np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner
+    return result
+
+
+def own_gain(z: jax.Array, p: Steps) -> jax.Array:
+    """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
+
+    Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
+    """
+    n, heard = p.transition.shape[-1], sum(p.received)
+    d = z.shape[0] - heard
+    gain, start = jnp.zeros((d - n, heard)), 0
+    for f, length in enumerate(p.received):
+        rows = slice(start, start + length)
+        inner = z[d:, d:][rows, rows] + jnp.diag(1.0 - p.live[rows])  # a filter that hears nothing: solve with 1
+        cross = z[(1 + f) * n : (2 + f) * n, d:][:, rows] * p.live[rows]
+        gain = gain.at[f * n : (f + 1) * n, rows].set(psd_solve(inner, cross.T).T)
+        start += length
+    return gain
+
+
+class Propagated(NamedTuple):
+    """gains (time, F n, R), covariance of eta (time + 1, d, d), power of each sender (time, 1 + relays)."""
+
+    gains: jax.Array
+    moments: jax.Array
+    power: jax.Array
+
+
+def propagate_own(steps: Steps, start: Any) -> Propagated:
+    """Each filter minimises its own next error; start is the covariance of eta at 0."""
+
+    def one(moments: jax.Array, p: Steps) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        z, sent = step_moments(p, moments)
+        gain = own_gain(z, p)
+        after = correct(z, gain)
+        return after, (gain, after, sent.power)
+
+    start = jnp.asarray(start)
+    _, (gains, moments, power) = jax.lax.scan(one, start, steps)
+    return Propagated(gains, jnp.concatenate([start[None], moments]), power)
+
+
+def propagate(steps: Steps, start: Any, gains: Any) -> Propagated:
+    """Given gains, (time, F n, R); entries of rows that hear nothing are not used."""
+
+    def one(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        p, gain = item
+        z, sent = step_moments(p, moments)
+        after = correct(z, gain * p.live)
+        return after, (after, sent.power)
+
+    start, gains = jnp.asarray(start), jnp.asarray(gains)
+    _, (moments, power) = jax.lax.scan(one, start, (steps, gains))
+    return Propagated(gains, jnp.concatenate([start[None], moments]), power)

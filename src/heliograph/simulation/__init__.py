@@ -1,0 +1,1 @@
+"""Networks run: simulated, filtered, recorded, and judged by statistics."""

@@ -1,0 +1,95 @@
+"""Blocks of runs dealt to lanes that work side by side: threads on a processor, one vectorised axis on other devices.
+
+Block j goes to lane j mod LANES whatever the number of cores, and each lane sums its blocks in order, so that neither
+chunks nor cores change a bit of a result. Several devices share the lanes by JAX's own sharding.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from heliograph.numerics.float64 import to_numpy
+
+BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
+LANES = 8  # of a processor: at most this many cores are used
+WIDE_LANES = 256  # of other devices, which want thousands of runs at once
+
+Advance = Callable[[np.ndarray, Any], tuple[Any, Any]]  # blocks of runs and a carry -> carry, what is kept
+
+
+class Lanes:
+    """The carries of all lanes, and how to advance them over the blocks of a chunk.
+
+    `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
+    """
+
+    def __init__(self, alone: Advance, together: Advance, start: Any, first_run: int):
+        self.alone, self.together, self.first_run = alone, together, first_run
+        devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
+        self.wide = devices > 1 or not processor
+        self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
+        self.carries: Any = [start] * self.count
+        self.pool: ThreadPoolExecutor | None = None
+
+    def blocks_of(self, runs: int) -> int:
+        """Blocks of a chunk that holds this many runs at least: fewer than there are lanes, or a multiple of them."""
+        blocks = -(-runs // BLOCK)
+        if blocks < self.count and not self.wide:
+            return blocks
+        return self.count * -(-blocks // self.count)
+
+    def advance(self, start: int, blocks: int) -> Any:
+        """Simulate `blocks` blocks from number `start` on; returns what is kept of them, run by run, on the host."""
+        numbers = np.arange(start, start + blocks)
+        runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
+        lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
+        kept = self._vectorised(runs, lanes) if self.wide else self._threads(runs, lanes)
+        used = np.concatenate(lanes)
+        return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *kept)
+
+    def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[Any]:
+        def go(lane: int) -> Any:
+            with jax.enable_x64(True):
+                self.carries[lane], kept = self.alone(runs[lanes[lane]], self.carries[lane])
+                return to_numpy(kept)
+
+        if self.pool is None:
+            self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
+        return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
+
+    def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[Any]:
+        shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
+        if isinstance(self.carries, list):
+            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *self.carries)
+            self.carries = jax.device_put(stacked, shared)
+        dealt = jax.device_put(np.stack([runs[mine] for mine in lanes]), shared)
+        self.carries, kept = self.together(dealt, self.carries)
+        on_host = to_numpy(kept)
+        return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
+
+    def total(self) -> Any:
+        """The lanes' carries added up, in their order."""
+        if self.pool is not None:
+            self.pool.shutdown()
+        if isinstance(self.carries, list):
+            return jax.tree.map(lambda *leaves: _sum([np.asarray(leaf) for leaf in leaves]), *self.carries)
+        return jax.tree.map(lambda leaf: _sum(list(np.asarray(leaf))), self.carries)
+
+
+def _sum(leaves: list[np.ndarray]) -> np.ndarray:
+    total = leaves[0]
+    for leaf in leaves[1:]:
+        total = total + leaf
+    return total
+
+
+def _in_order(kept: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
+    result = np.empty_like(kept)
+    result[used] = kept
+    return result.reshape(-1, *kept.shape[2:])

@@ -1,0 +1,65 @@
+"""A computation on one run, done for many: side by side in blocks that stay in the cache, on all cores."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.float64 import to_numpy
+
+WIDTH = 256  # runs side by side
+
+
+def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) -> Any:
+    """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
+
+    The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
+    and its shapes, so define it once. NumPy arrays come back. `width` runs are computed side by side, and each core
+    takes its share of the runs.
+
+    Raises:
+        ValueError: no arrays, or arrays with different numbers of runs.
+    """
+    check_count("width", width)
+    values = [np.asarray(a) for a in arrays]
+    if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not len(a) for a in values):
+        raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
+    runs, cores = len(values[0]), os.cpu_count() or 1
+    width = min(width, runs)
+    share = -(-runs // (width * cores))  # blocks of each core
+    width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
+
+    def work(core: int) -> Any:
+        first, last = core * share * width, min((core + 1) * share * width, runs)
+        parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
+        with jax.enable_x64(True):
+            found = to_numpy(_blocks(function, parts))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], found)
+
+    with ThreadPoolExecutor(cores) as pool:
+        found = list(pool.map(work, range(-(-runs // (share * width)))))
+        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), found[0])
+
+        def place(core: int) -> None:  # copied by all cores too: large results take their time
+            into, part = jax.tree.leaves(whole), jax.tree.leaves(found[core])
+            for target, leaf in zip(into, part, strict=True):
+                target[core * share * width :][: len(leaf)] = leaf
+
+        list(pool.map(place, range(len(found))))
+    return whole
+
+
+def _filled(part: np.ndarray, count: int) -> np.ndarray:
+    """As many runs as the program wants; the last one again where there are fewer."""
+    missing = count - len(part)
+    return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
+
+
+@eqx.filter_jit
+def _blocks(function: Callable[..., Any], parts: list[Any]) -> Any:
+    return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

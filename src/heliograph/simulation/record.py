@@ -1,0 +1,150 @@
+"""What a run leaves behind: trajectories with their claims, or running statistics of the errors."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import FUSED, Network
+
+
+@dataclass(frozen=True)
+class Uplink:
+    """What a fusion's quantizers did to the estimates of `nodes`, by component.
+
+    saturated, whether a component was out of reach, and symbols, how many were sent for it: (run, time, node, n) in a
+    record; in statistics their means over the runs, (time, node, n).
+    """
+
+    nodes: tuple[str, ...]
+    saturated: np.ndarray
+    symbols: np.ndarray
+
+    def saturated_share(self) -> dict[str, float]:
+        """Share of the samples (runs, steps and components) that were out of reach, by node."""
+        return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
+
+    def symbols_per_value(self) -> float:
+        """Mean number of symbols that one component of one estimate took."""
+        return float(self.symbols.mean())
+
+
+@dataclass(frozen=True)
+class Record:
+    """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
+
+    truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
+    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
+    """
+
+    time: np.ndarray
+    states: tuple[str, ...]
+    truth: np.ndarray | None
+    measurements: dict[str, np.ndarray]
+    estimates: dict[str, dict[str, Estimate]]
+    uplinks: dict[str, Uplink] = field(default_factory=dict)
+
+    def errors(self, node: str, name: str) -> np.ndarray:
+        """x - xhat of one filter of one node.
+
+        Raises:
+            ValueError: a recording has no truth.
+        """
+        if self.truth is None:
+            raise fail("errors", "a record with the true state", "a recording without it")
+        result: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
+        return result
+
+    def failures(self) -> list[str]:
+        """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
+
+        The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
+        for each uplink that saturated.
+        """
+        lines = []
+        for node, filters in self.estimates.items():
+            for name, estimate in filters.items():
+                bad = ~is_sound(estimate)
+                if np.any(bad):
+                    by_time = bad.reshape(-1, bad.shape[-1])
+                    step = int(np.argmax(by_time.any(axis=0)))
+                    runs = int(by_time.any(axis=1).sum())
+                    what = "mean" if estimate.claim == "none" else "covariance"
+                    lines.append(f"{node}/{name}: no valid {what} from step {step} in {runs} of {len(by_time)} runs")
+        for name, uplink in self.uplinks.items():
+            for i, node in enumerate(uplink.nodes):
+                saturated = uplink.saturated[..., i, :]
+                if np.any(saturated):
+                    counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
+                    lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
+        return lines
+
+
+def is_sound(estimate: Estimate) -> np.ndarray:
+    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+    if estimate.claim == "none":
+        return finite
+    bound = np.asarray(estimate.covariance)
+    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
+    safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
+    values = np.linalg.eigvalsh((safe + np.swapaxes(safe, -1, -2)) / 2)
+    result: np.ndarray = finite & (values[..., 0] >= -1e-12 * np.abs(values[..., -1]))  # rounding of an eigenvalue
+    return result
+
+
+class AbstractReducer(eqx.Module):
+    """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected."""
+
+    def initial(self, shapes: Any) -> Any:
+        """The carry before the first block; `shapes` are those of a block's trajectories."""
+        raise NotImplementedError
+
+    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
+        """Next carry and collected part of a block, inside the compiled scan; runs that are not valid are padding."""
+        raise NotImplementedError
+
+    def finish(self, carry: Any, collected: Any, network: Network) -> Any:
+        """Make the result; collected parts are joined along the run axis, without padding."""
+        raise NotImplementedError
+
+
+class Trajectories(AbstractReducer):
+    """Keep everything; memory grows with the number of runs."""
+
+    def initial(self, shapes: Any) -> Any:
+        """Nothing is summed."""
+        return ()
+
+    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
+        """Collect the block."""
+        return carry, batch
+
+    def finish(self, carry: Any, collected: Any, network: Network) -> Record:
+        """Make the record; its time is the step, starting at 1."""
+        time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
+        return trajectories_record(network, collected, time)
+
+
+def trajectories_record(network: Network, batch: Any, time: np.ndarray) -> Record:
+    """Record from the scan's output; nodes in the network's order."""
+    measurements = {name: np.asarray(batch["measurements"][name]) for name in network.nodes}
+    found = batch["estimates"]
+    estimates = {node: {name: found[node][name] for name in claims} for node, claims in network.claims().items()}
+    return Record(
+        time, network.states, batch["truth"], measurements, estimates, uplinks_of(network, batch.get("uplinks", {}))
+    )
+
+
+def uplinks_of(network: Network, found: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
+    """Links by the fusion's name, from arrays whose last axes are (node, n)."""
+    result = {}
+    for name, fusion in network.fused.items() if found else ():
+        if isinstance(fusion, Fusion) and name in found:
+            result[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **found[name])
+    return result

@@ -1,0 +1,246 @@
+"""Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from heliograph.model.estimate import Claim, Estimate, weakest
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.linalg import psd_solve
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.record import AbstractReducer, Record, Uplink, uplinks_of
+
+BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
+
+
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
+
+    count (batch,), outer = sum e e' and covariance = sum of claimed covariances (batch, time, n, n),
+    nees = sum e' B^-1 e (batch, time), claim as the filter states it; uplink of a fusion that has quantizers. Where no
+    covariance is claimed, what is made of bounds is NaN.
+    """
+
+    count: np.ndarray
+    outer: np.ndarray
+    covariance: np.ndarray
+    nees: np.ndarray
+    claim: Claim
+    uplink: Uplink | None = None
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.count.sum())
+
+    def actual(self) -> np.ndarray:
+        """E[e e'] over the runs, (time, n, n)."""
+        result: np.ndarray = self.outer.sum(axis=0) / self.runs
+        return result
+
+    def claimed(self) -> np.ndarray:
+        """Mean claimed covariance, (time, n, n)."""
+        result: np.ndarray = self.covariance.sum(axis=0) / self.runs
+        return result
+
+    def mean_trace(self) -> float:
+        """Mean over time of the trace of the claimed covariance."""
+        return float(np.trace(self.claimed(), axis1=-2, axis2=-1).mean())
+
+    def rmse(self) -> tuple[float, float]:
+        """Root of the mean over runs and steps of the squared error summed over the state, and its standard error.
+
+        The error of a root: se(mse) / (2 rmse), with se(mse) from the batch means.
+        """
+        squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
+        mse, error = _batch_mean(squared, self.count)
+        root = float(np.sqrt(mse))
+        return root, error / (2 * root) if root else 0.0
+
+    def rmse_over_time(self) -> np.ndarray:
+        """Root mean squared error at each step, (time,)."""
+        result: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
+        return result
+
+    def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
+        """Mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
+
+        The interval is from the batch means, so correlation over time within a run does no harm.
+        """
+        n = self.outer.shape[-1]
+        mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
+        width = float(stats.t.ppf((1 + confidence) / 2, max(int(np.count_nonzero(self.count)) - 1, 1))) * error
+        return mean, mean - width, mean + width
+
+    def worst_direction(self) -> "WorstDirection":
+        """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, judged on runs that did not choose d.
+
+        The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
+        ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
+        not finite.
+
+        Raises:
+            ValueError: fewer than 4 runs.
+        """
+        if self.runs < 4:
+            raise fail("worst direction", "at least 4 runs", self.runs)
+        broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
+        if np.any(broken):
+            nowhere = np.full(self.outer.shape[-1], np.nan)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), nowhere)
+        halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
+        return max(halves, key=lambda w: w.ratio)
+
+    def _ratio_on(self, held_out: np.ndarray) -> "WorstDirection":
+        chosen = ~held_out & (self.count > 0)
+        actual, claimed = self.outer[chosen].sum(axis=0), self.covariance[chosen].sum(axis=0)
+        values, directions = _generalised_eigen(actual, claimed)
+        step = int(np.argmax(values[:, -1]))
+        d = directions[step, :, -1]
+        judged = held_out & (self.count > 0)
+        error = np.einsum("i,bij,j->b", d, self.outer[judged, step], d)
+        bound = np.einsum("i,bij,j->b", d, self.covariance[judged, step], d)
+        ratio = float(error.sum() / bound.sum())
+        # Linearised error of a ratio of means: residuals error - ratio bound have mean zero over the batches.
+        weights = self.count[judged]
+        _, residual_error = _batch_mean(error - ratio * bound, weights)
+        scale = bound.sum() / weights.sum()
+        standard_error = float(residual_error / scale)
+        return WorstDirection(ratio, standard_error, step, d / np.linalg.norm(d))
+
+
+def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
+    """Statistics of several nodes together, their steps joined: means run over nodes as over steps.
+
+    Runs stay the unit of independence, so errors that nodes share are counted as shared.
+
+    Raises:
+        ValueError: nothing to pool, or statistics of different runs.
+    """
+    parts = list(statistics)
+    if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
+        raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
+    joined: dict[str, Any] = {
+        name: np.concatenate([getattr(s, name) for s in parts], axis=1) for name in ("outer", "covariance", "nees")
+    }
+    return ErrorStatistics(parts[0].count, **joined, claim=weakest([s.claim for s in parts]))
+
+
+@dataclass(frozen=True)
+class WorstDirection:
+    """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""
+
+    ratio: float
+    standard_error: float
+    step: int
+    direction: np.ndarray
+
+    @property
+    def z(self) -> float:
+        """Excess of the ratio over 1 in standard errors."""
+        return (self.ratio - 1) / self.standard_error if self.standard_error else 0.0
+
+
+def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+    """Mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
+    used = count > 0
+    sums, count = sums[used], count[used]
+    mean = float(sums.sum() / count.sum())
+    groups = len(count)
+    if groups < 2:
+        return mean, float("nan")
+    scatter = np.sum((sums - mean * count) ** 2) * groups / (groups - 1)
+    return mean, float(np.sqrt(scatter) / count.sum())
+
+
+def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive definite B."""
+    values, vectors = np.linalg.eigh(b)
+    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))[..., None, :]
+    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ a @ root)
+    return inner, root @ rotated
+
+
+class Statistics(AbstractReducer):
+    """Keep running error statistics of every filter of every node; memory does not grow with the number of runs."""
+
+    def initial(self, shapes: Any) -> Any:
+        """Zero sums."""
+        used = np.zeros(shapes["truth"].shape[0], dtype=bool)
+        sums = eqx.filter_eval_shape(self._block_sums, shapes, np.asarray(0), used)
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), sums)
+
+    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
+        """Add the sums over the block's valid runs, dealt to batches."""
+        return jax.tree.map(jnp.add, carry, self._block_sums(batch, runs[0], valid)), ()
+
+    def _block_sums(self, batch: Any, first: jax.Array, used: jax.Array) -> Any:
+        errors = jax.tree.map(
+            lambda estimate: _sums(batch["truth"], estimate, first, used),
+            batch["estimates"],
+            is_leaf=lambda leaf: isinstance(leaf, Estimate),
+        )
+        counted = used.astype(float)
+        return errors, jax.tree.map(lambda leaf: jnp.tensordot(counted, leaf, axes=1), batch.get("uplinks", {}))
+
+    def finish(self, carry: Any, collected: Any, network: Network) -> dict[str, dict[str, ErrorStatistics]]:
+        """Statistics by node and filter."""
+        sums, sent = carry
+        result = {
+            node: {name: ErrorStatistics(**sums[node][name], claim=claim) for name, claim in claims.items()}
+            for node, claims in network.claims().items()
+        }
+        for name, uplink in uplinks_of(network, sent).items():
+            fused = result[FUSED][name]
+            means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
+            result[FUSED][name] = replace(fused, uplink=means)
+        return result
+
+
+def _sums(truth: jax.Array, estimate: Estimate, first: Any, used: jax.Array) -> dict[str, jax.Array]:
+    """Sums over runs first, first + 1, ..., as far as they are used, by batch."""
+    rows = used[:, None, None]  # the others may hold anything
+    error = jnp.where(rows, truth - estimate.mean, 0.0)
+    bound = jnp.where(rows[..., None], estimate.covariance, jnp.eye(error.shape[-1]))
+
+    def squared_distance(b: jax.Array, e: jax.Array) -> jax.Array:
+        return e @ psd_solve(b, e[:, None])[:, 0]
+
+    return {
+        "count": _dealt(used.astype(float), first),
+        "outer": _dealt(error[..., :, None] * error[..., None, :], first),
+        "covariance": _dealt(jnp.where(rows[..., None], bound, 0.0), first),
+        "nees": _dealt(jax.vmap(jax.vmap(squared_distance))(bound, error), first),
+    }
+
+
+def _dealt(values: jax.Array, first: Any) -> jax.Array:
+    """Sums by batch (BATCHES, ...) of values (runs, ...) of consecutive runs: run r goes to batch r mod BATCHES."""
+    missing = jnp.zeros((-len(values) % BATCHES, *values.shape[1:]), values.dtype)
+    rounds = jnp.concatenate([values, missing]).reshape(-1, BATCHES, *values.shape[1:])
+    return jnp.roll(rounds.sum(axis=0), first % BATCHES, axis=0)
+
+
+def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
+    """Statistics of one filter of one node from kept trajectories.
+
+    Raises:
+        ValueError: a record without truth, or without a run axis.
+    """
+    if record.truth is None or record.truth.ndim != 3:
+        raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
+    estimate = record.estimates[node][name]
+    with jax.enable_x64(True):
+        used = jnp.ones(len(record.truth), dtype=bool)
+        sums = to_numpy(_sums(jnp.asarray(record.truth), estimate, 0, used))
+    sent = record.uplinks.get(name) if node == FUSED else None
+    uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
+    return ErrorStatistics(**sums, claim=estimate.claim, uplink=uplink)

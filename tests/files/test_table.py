@@ -1,0 +1,160 @@
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from heliograph.files.table import check_output, check_output_folder, read_table, write_table
+
+COLUMNS = {
+    "time": np.array([0.0, 0.1, 1e-300]),
+    "a": np.array([1 / 3, np.nan, -1.7976931348623157e308]),
+}
+
+
+def text_file(folder: Path, text: str, name: str = "data.csv") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def refused(call, *fragments: str) -> None:
+    with pytest.raises(ValueError) as caught:
+        call()
+    message = str(caught.value)
+    assert "\n" not in message
+    assert ": expected " in message and ", got " in message
+    for fragment in fragments:
+        assert fragment in message
+
+
+@pytest.mark.parametrize("name", ["table.csv", "table.parquet", "TABLE.CSV"])
+def test_numbers_survive_a_file_bit_by_bit(tmp_path, name):
+    write_table(COLUMNS, tmp_path / name)
+    read = read_table(tmp_path / name)
+    assert list(read) == list(COLUMNS)
+    for column, values in COLUMNS.items():
+        np.testing.assert_array_equal(read[column], values)
+
+
+def test_csv_as_people_write_it(tmp_path):
+    path = text_file(tmp_path, "\ufefftime, a\r\n0 , 1\r\n\r\n1,\r\n2,nan\r\n")
+    read = read_table(path)
+    np.testing.assert_array_equal(read["time"], [0, 1, 2])
+    np.testing.assert_array_equal(read["a"], [1, np.nan, np.nan])
+
+
+def test_parquet_of_integers_and_nulls(tmp_path):
+    table = pa.table({"time": pa.array([0, 1], pa.int32()), "a": pa.array([None, 7]), "b": pa.nulls(2)})
+    pq.write_table(table, tmp_path / "t.parquet")
+    read = read_table(tmp_path / "t.parquet")
+    np.testing.assert_array_equal(read["time"], [0, 1])
+    np.testing.assert_array_equal(read["a"], [np.nan, 7])
+    np.testing.assert_array_equal(read["b"], [np.nan, np.nan])
+    assert all(column.dtype == np.float64 for column in read.values())
+
+
+def test_truth_values_are_one_and_zero_in_csv(tmp_path):
+    write_table({"valid": np.array([True, False])}, tmp_path / "t.csv")
+    assert (tmp_path / "t.csv").read_text().split() == ["valid", "1", "0"]
+
+
+@pytest.mark.parametrize(
+    ("text", "fragments"),
+    [
+        ("", ["data.csv", "an empty file"]),
+        ("time,a\n", ["data.csv", "at least one row", "none"]),
+        ("\n\n", ["data.csv", "at least one row"]),
+        ("time,a,a\n0,1,2\n", ["header", "distinct columns", "'a'"]),
+        ("time,a\n0,1\n1,abc\n", ["row 2, column 'a'", "a number", "'abc'"]),
+        ("time,a\n0,1\n1\n", ["row 2", "2 cells", "got 1"]),
+        ('time,a\n0,"1\n', ["data.csv", "a CSV file", "unexpected end of data"]),
+    ],
+)
+def test_csv_that_is_no_table_of_numbers(tmp_path, text, fragments):
+    path = text_file(tmp_path, text)
+    refused(lambda: read_table(path), *fragments)
+
+
+def test_bytes_that_are_no_utf8(tmp_path):
+    (tmp_path / "data.csv").write_bytes(b"time,a\n0,\xff\n")
+    refused(lambda: read_table(tmp_path / "data.csv"), "data.csv", "UTF-8")
+
+
+def test_parquet_that_is_no_table_of_numbers(tmp_path):
+    path = text_file(tmp_path, "time,a\n0,1\n", "data.parquet")
+    refused(lambda: read_table(path), "data.parquet", "a Parquet file")
+    pq.write_table(pa.table({"time": ["noon"]}), path)
+    refused(lambda: read_table(path), "row 1, column 'time'", "numbers", "string ['noon']")
+    pq.write_table(pa.table([[1.0], [2.0]], names=["a", "a"]), path)
+    refused(lambda: read_table(path), "distinct columns", "'a'")
+    pq.write_table(pa.table({"time": pa.array([], pa.float64())}), path)
+    refused(lambda: read_table(path), "at least one row", "none")
+
+
+def test_files_that_are_not_there(tmp_path):
+    refused(lambda: read_table(tmp_path / "no.csv"), "no.csv", "a file", "nothing of that name")
+    (tmp_path / "folder.csv").mkdir()
+    refused(lambda: read_table(tmp_path / "folder.csv"), "a folder")
+    refused(lambda: read_table(tmp_path / "data.xlsx"), ".csv or .parquet", "'.xlsx'")
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError("disk full")])
+@pytest.mark.parametrize("name", ["out.csv", "out.parquet"])
+def test_interrupted_writing_leaves_what_was_there(tmp_path, monkeypatch, name, error):
+    (tmp_path / name).write_text("before")
+
+    def stop(*_):
+        assert len(list(tmp_path.iterdir())) == 2  # written in full beside the old file
+        raise error
+
+    monkeypatch.setattr(os, "replace", stop)
+    with pytest.raises(type(error) if isinstance(error, OSError) else error):
+        write_table(COLUMNS, tmp_path / name)
+    assert [p.name for p in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "before"
+
+
+def test_error_between_rows_leaves_nothing(tmp_path):
+    ragged = {"time": np.arange(100_000.0), "a": np.arange(99_999.0)}
+    with pytest.raises(ValueError, match="shorter"):
+        write_table(ragged, tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    write_table(COLUMNS, tmp_path / "out.csv")
+    (tmp_path / "plain").touch()
+    assert (tmp_path / "out.csv").stat().st_mode == (tmp_path / "plain").stat().st_mode
+
+
+def test_places_that_cannot_be_written(tmp_path):
+    (tmp_path / "file").touch()
+    refused(lambda: check_output(tmp_path / "file" / "out.csv"), "output folder", "file", "a folder")
+    refused(lambda: check_output(tmp_path / "no" / "out.csv"), "existing folder", "nothing of that name")
+    (tmp_path / "out.csv").mkdir()
+    refused(lambda: check_output(tmp_path / "out.csv"), "output file", "a folder")
+    refused(lambda: check_output_folder(tmp_path / "file"), "output folder", "a file")
+    refused(lambda: check_output_folder(tmp_path / "file" / "new"), "output folder", "on its path")
+    check_output_folder(tmp_path / "new" / "newer")
+    assert not (tmp_path / "new").exists()
+    check_output(tmp_path / "fine.parquet")
+    assert not (tmp_path / "fine.parquet").exists()
+
+
+def test_a_folder_without_permission(tmp_path, monkeypatch):
+    def deny(**_):  # the system's own refusal does not bind a superuser
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", deny)
+    refused(lambda: check_output(tmp_path / "out.csv"), str(tmp_path), "can be written", "Permission denied")
+
+
+def test_estimates_are_readable_by_others(tmp_path):
+    write_table(COLUMNS, tmp_path / "out.csv")
+    with (tmp_path / "out.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert float(rows[0]["a"]) == 1 / 3

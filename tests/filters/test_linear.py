@@ -1,0 +1,126 @@
+"""The claims of linear filters, by Monte Carlo: exact within its interval, upper never exceeded."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.random_affine import GainAndNoise, Series
+
+PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
+SENSOR = hg.LinearSensor([[1.0, 0.0], [0.5, 1.0]], 0.02)
+SKEWED = hg.FiniteSupport([[0.9, 0.0], [-0.1, 0.1], [-0.1, -0.05]], [0.1, 0.3, 0.6])
+FADING = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), SKEWED), hg.hop(hg.bernoulli(0.85), 0.01, dimension=2)])
+P, R = np.array([0.2, 0.3, 0.5]), 0.1
+LAW = hg.Discrete([0.2, 0.8, 1.3], P, R)
+Z_LIMIT = 4.0  # one number in 30,000 beyond it by chance; seeds are fixed and a few dozen numbers are compared
+
+
+def statistics(channel, filters, runs=4000, horizon=12):
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channel, filters)})
+    return hg.monte_carlo(network, horizon, runs, 5, keep=hg.Statistics())["node"]
+
+
+def test_exact_claims_match_the_actual_covariance():
+    found = statistics(FADING, {"linear": hg.linear_filter(PLANT, SENSOR, FADING), "open": hg.open_loop_filter(PLANT)})
+    for name, s in found.items():
+        assert s.claim == "exact", name
+        actual, claimed = s.actual(), s.claimed()
+        batch = s.outer / s.count[:, None, None, None]
+        error = batch.std(axis=0, ddof=1) / np.sqrt(len(batch))
+        assert np.max(np.abs(actual - claimed) / error) < Z_LIMIT, name
+        _, low, high = s.nees_per_dimension(0.9999)
+        assert low < 1 < high, name
+
+
+def test_the_linear_filter_beats_the_others_behind_fading():
+    found = statistics(
+        FADING,
+        {
+            "linear": hg.linear_filter(PLANT, SENSOR, FADING),
+            "mean_gain": hg.mean_gain_filter(PLANT, SENSOR, FADING),
+            "open": hg.open_loop_filter(PLANT),
+        },
+    )
+    assert found["linear"].rmse()[0] < 0.9 * found["open"].rmse()[0]
+    assert found["linear"].rmse()[0] < 0.9 * found["mean_gain"].rmse()[0]
+    assert found["mean_gain"].nees_per_dimension()[0] > 2  # it does not know
+
+
+@pytest.mark.parametrize("corner", range(len(LAW.extremes())))
+def test_upper_claims_hold_under_every_extreme_law(corner):
+    believed = hg.hop(LAW, 0.05, dimension=2)
+    world = GainAndNoise(LAW.extremes()[corner], np.eye(2), 0.05)
+    item = hg.linear_filter(PLANT, SENSOR, believed)
+    s = statistics(Series([world]), {"linear": item}, runs=2000)["linear"]
+    assert s.claim == "upper"
+    assert s.worst_direction().z < Z_LIMIT
+
+
+def test_a_false_claim_is_found():
+    """The mean-gain filter's covariance is exceeded many times over: the check can fail."""
+    s = statistics(FADING, {"mean_gain": hg.mean_gain_filter(PLANT, SENSOR, FADING)}, runs=500)["mean_gain"]
+    assert s.worst_direction().z > 5 and s.worst_direction().ratio > 2
+
+
+def test_time_varying_parts_are_read_at_their_step():
+    horizon = 5
+    channels = hg.over_time([hg.hop(0.2 + 0.3 * k, 0.05, dimension=2) for k in range(horizon)])
+    plants = hg.over_time(
+        [hg.LinearPlant(PLANT.matrix * (1 - 0.1 * k), 0.05, [1.0, -0.5], 0.4) for k in range(horizon)]
+    )
+    item = hg.linear_filter(plants, SENSOR, channels)
+    state, z = item.init(), np.ones(2)
+    mean, cov = np.array([1.0, -0.5]), 0.4 * np.eye(2)
+    for k in range(horizon):
+        state, estimate = item.step(state, z, (), k)
+        a, g = PLANT.matrix * (1 - 0.1 * k), (0.2 + 0.3 * k) * SENSOR.matrix
+        mean, cov = a @ mean, a @ cov @ a.T + 0.05 * np.eye(2)
+        noise = ((0.2 + 0.3 * k) ** 2 * 0.02 + 0.05) * np.eye(2)
+        gain = cov @ g.T @ np.linalg.inv(g @ cov @ g.T + noise)
+        mean, cov = mean + gain @ (z - g @ mean), cov - gain @ g @ cov
+        np.testing.assert_allclose(estimate.mean, mean, rtol=1e-10)
+        np.testing.assert_allclose(estimate.covariance, cov, rtol=0, atol=1e-12)
+
+
+def test_a_horizon_beyond_what_varies_is_refused():
+    channels = hg.over_time([hg.hop(1.0, 0.1, dimension=2)] * 3)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channels, {"f": hg.linear_filter(PLANT, SENSOR, channels)})})
+    with pytest.raises(ValueError, match=r"horizon: expected at most 3 steps, .* got 4"):
+        hg.monte_carlo(network, 4, 2, 0)
+
+
+def test_the_exact_claim_is_the_mean_squared_error_by_enumeration():
+    """E of (x, e)(x, e)' propagated over every gain outcome, with the filter's own gains, equals the claim to 1e-12."""
+    gamma, xi, qm, qn = hg.Discrete([0.2, 0.8, 1.3], P), hg.Discrete([0.5, 1.0], [0.4, 0.6]), 0.1, 0.05
+    channel = hg.amplify_and_forward([hg.hop(gamma, qm, dimension=2), hg.hop(xi, qn, dimension=2)])
+    item = hg.linear_filter(PLANT, SENSOR, channel)
+    a, c, mu = PLANT.matrix, SENSOR.matrix, gamma.moment(1) * xi.moment(1)
+    outcomes = [
+        (p * q, g * x, x) for p, g in zip(P, gamma.values, strict=True) for q, x in zip(*_atoms(xi), strict=True)
+    ]
+    cov = PLANT.initial_covariance
+    joint = np.block([[cov + np.outer(PLANT.initial_mean, PLANT.initial_mean), cov], [cov, cov]])
+    state = item.init()
+    for k in range(6):
+        before = state
+        state, estimate = item.step(before, np.zeros(2), (), k)
+        moved = np.kron(np.eye(2), a)
+        joint = moved @ joint @ moved.T + 0.05 * np.kron(np.ones((2, 2)), np.eye(2))
+        gain = _gain(item, before, k)
+        total = np.zeros((4, 4))
+        for p, g, x in outcomes:  # e+ = e - K (g y + x m + n - mu C xhat), y = C x + v, C xhat = C x - C e
+            step = np.block([[np.eye(2), np.zeros((2, 2))], [-(g - mu) * gain @ c, np.eye(2) - mu * gain @ c]])
+            noise = gain @ ((g**2 * 0.02 + x**2 * qm + qn) * np.eye(2)) @ gain.T
+            total += p * (step @ joint @ step.T + np.block([[np.zeros((2, 4))], [np.zeros((2, 2)), noise]]))
+        joint = total
+        np.testing.assert_allclose(estimate.covariance, joint[2:, 2:], atol=1e-12)
+
+
+def _atoms(law):
+    return law.probabilities, law.values
+
+
+def _gain(item, state, k):
+    """The filter's gain, read off its response to unit measurements."""
+    zero = item.step(state, np.zeros(2), (), k)[1].mean
+    return np.stack([item.step(state, unit, (), k)[1].mean - zero for unit in np.eye(2)], axis=1)

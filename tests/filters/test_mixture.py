@@ -1,0 +1,89 @@
+"""The filter that knows the laws: where it is exact, and where it must refuse."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import heliograph as hg
+from heliograph.filters.mixture import atoms_of
+from tests.oracles import quadratic_bias as oracle
+from tests.relay_bias import model
+
+TWO = hg.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+
+
+def one_step(plant, sensor, channel, z, **options):
+    item = hg.mixture_filter(plant, sensor, channel, **options)
+    return item.step(item.init(), np.atleast_1d(z))[1]
+
+
+def test_gaussian_laws_give_the_linear_filter():
+    plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], 0.3, [1.0, 0.0], np.eye(2))
+    sensor, channel = hg.LinearSensor([[1.0, 0.5]], 0.2), hg.hop(0.8, 0.1)
+    mixed, linear = hg.mixture_filter(plant, sensor, channel), hg.linear_filter(plant, sensor, channel)
+    a, b = mixed.init(), linear.init()
+    for k, z in enumerate((0.3, -1.0, 2.0)):
+        a, left = mixed.step(a, [z], (), k)
+        b, right = linear.step(b, [z], (), k)
+        np.testing.assert_allclose(left.mean, right.mean, rtol=1e-12)
+        np.testing.assert_allclose(left.covariance, right.covariance, rtol=1e-12)
+
+
+def test_first_step_is_bayes_rule_on_a_grid():
+    """Gaussian prior, gain and noise of two values each: posterior mean and variance by quadrature."""
+    plant = hg.LinearPlant([[1.0]], 0.5, [0.3], 0.5)
+    gain, noise = hg.Discrete([0.5, 1.5], [0.4, 0.6]), hg.Gaussian([[0.2]])
+    channel, sensor = hg.hop(gain, noise), hg.LinearSensor([[1.0]], TWO)
+    x = np.linspace(-12, 12, 200_001)
+    z = 0.7
+    density = stats.norm.pdf(x, 0.3, 1.0) * sum(
+        p * q * stats.norm.pdf(z, g * (x + v), np.sqrt(0.2))
+        for p, g in zip(gain.probabilities, gain.values, strict=True)
+        for q, v in zip(TWO.probabilities, TWO.atoms[:, 0], strict=True)
+    )
+    density /= density.sum()
+    mean = density @ x
+    found = one_step(plant, sensor, channel, z)
+    assert found.mean[0] == pytest.approx(mean, rel=1e-9)
+    assert found.covariance[0, 0] == pytest.approx(density @ (x - mean) ** 2, rel=1e-9)
+
+
+def test_atoms_have_the_channels_moments():
+    s = model(oracle.paper_example(), 1)
+    stacked = hg.Stack([s.channel, hg.dropout(hg.hop(0.9, TWO), 0.7)])
+    atoms = atoms_of(stacked)
+    assert sum(a.weight for a in atoms) == pytest.approx(1.0, abs=1e-14)
+    x = np.array([0.8])
+    z = np.array([a.gain @ x + a.offset for a in atoms])
+    mean = np.array([a.weight for a in atoms]) @ z
+    np.testing.assert_allclose(mean, (stacked.moments(1).matrix @ [0.8, 1.0])[:2], rtol=1e-12)
+    assert len(atoms_of(s.channel)) == 36  # 3 powers x 2 atoms at each of two hops; the sensor's noise doubles it
+
+
+def test_a_missing_measurement_is_a_prediction():
+    plant = hg.LinearPlant([[0.5]], 1.0, [2.0], 3.0)
+    found = one_step(plant, hg.LinearSensor([[1.0]], TWO), hg.perfect(), np.nan)
+    assert found.mean[0] == pytest.approx(1.0) and found.covariance[0, 0] == pytest.approx(0.25 * 3 + 1.0)
+
+
+def test_on_the_example_it_is_far_better_than_any_polynomial():
+    s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
+    cubic = hg.lmmse(hg.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
+    network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.mixture_filter(*s)})})
+    found = hg.monte_carlo(network, 30, 192, 0, keep=hg.Statistics())["node"]["mixture"]
+    assert found.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
+
+
+def test_what_has_no_atoms_is_refused():
+    plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], TWO)
+    with pytest.raises(ValueError, match="gains of finitely many values, got Rayleigh"):
+        hg.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
+    with pytest.raises(ValueError, match="resolution above 0"):
+        hg.mixture_filter(plant, sensor, hg.hop(hg.bernoulli(0.5), TWO))
+    hg.mixture_filter(plant, sensor, hg.hop(hg.bernoulli(0.5), TWO), resolution=0.01)
+    many = hg.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
+    with pytest.raises(ValueError, match="at most 4,096 combinations of atoms, got 10,000"):
+        hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, many), hg.hop(1.0, many)]))
+    moments = hg.NoiseMoments([0.0, 1.0, 0.5, 2.0])
+    with pytest.raises(ValueError, match="finite support or Gaussian, got NoiseMoments"):
+        hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())

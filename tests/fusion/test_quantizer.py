@@ -1,0 +1,215 @@
+import jax
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import heliograph as hg
+from heliograph.fusion.quantizer import Symbols, widen
+from heliograph.testing import check_quantizer
+
+ESCAPE = hg.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
+QUANTIZERS = {
+    "uniform": hg.UniformQuantizer(8, 3.0),
+    "uniform by component": hg.UniformQuantizer(5, [1.0, 2.0], [0.5, 2.0]),
+    "zoom": hg.ZoomQuantizer(41, 3.0, 0.6, 0.15),
+    "escape": ESCAPE,
+    "escape by component": hg.EscapeQuantizer(3, [1e-2, 10.0], [0.3, 0.9], 0.0, [1e-3, 1.0]),
+}
+ROUNDING = 1e-15  # a few operations on numbers of the size of the amplitude
+
+
+@pytest.mark.parametrize("name", QUANTIZERS)
+def test_contract(name):
+    check_quantizer(QUANTIZERS[name])
+
+
+def printed(x, d, p):
+    """Equation (11) case by case."""
+    if x < -d:
+        return -d
+    if x >= d:
+        return d
+    for n in range(1, p + 1):
+        if -d + 2 * (n - 1) * d / p <= x < -d + 2 * n * d / p:
+            return -d + (2 * n - 1) * d / p
+    raise AssertionError("no segment")
+
+
+@settings(max_examples=100)
+@given(x=st.floats(-5, 5), levels=st.integers(2, 12), amplitude=st.floats(0.1, 4), scale=st.floats(0.2, 3))
+def test_uniform_is_the_printed_one(x, levels, amplitude, scale):
+    sent = hg.UniformQuantizer(levels, amplitude, scale).step((), [x])[1]
+    boundary = (x / scale / amplitude + 1) * levels / 2
+    if abs(boundary - round(boundary)) > 1e-9:  # on a boundary rounding decides
+        assert sent.value[0] == pytest.approx(scale * printed(x / scale, amplitude, levels), abs=20 * ROUNDING)
+    assert sent.saturated[0] == (abs(x / scale) > amplitude)
+    if not sent.saturated[0]:
+        assert sent.error[0] == scale * amplitude / levels
+        assert abs(sent.value[0] - x) <= sent.error[0] + 100 * ROUNDING
+
+
+def test_the_bound_is_attained():
+    sent = hg.UniformQuantizer(4, 2.0).step((), [0.0, 1.0, -2.0])[1]
+    np.testing.assert_array_equal(np.abs(sent.value - [0.0, 1.0, -2.0]), sent.error)
+
+
+def test_many_levels_clip():
+    x = np.linspace(-5, 5, 101)
+    sent = hg.UniformQuantizer(10**9, 3.0).step((), x)[1]
+    np.testing.assert_allclose(sent.value, np.clip(x, -3, 3), rtol=0, atol=3e-9 + 3 * ROUNDING)  # d / p
+
+
+def test_zoom_follows_the_square_of_what_it_is_given():
+    zoom, d = hg.ZoomQuantizer(40, 3.0, 0.6, 0.1), 3.0
+    state = zoom.init(1)
+    for x in (1.0, -1.5, 0.5):
+        np.testing.assert_allclose(state, d, rtol=1e-14)
+        state, sent = zoom.step(state, [x])
+        np.testing.assert_allclose(sent.error, d / 40, rtol=1e-14)
+        d = 0.6 * d + 0.1 * x**2
+
+
+@pytest.mark.parametrize(("x", "saturates"), [(3.9, True), (4.1, False)])
+def test_zoom_saturates_for_small_constants(x, saturates):
+    """d tends to growth x^2 / (1 - decay), which is below |x| for |x| < (1 - decay) / growth = 4."""
+    zoom = hg.ZoomQuantizer(40, 10.0, 0.6, 0.1)
+    state = zoom.init(1)
+    for _ in range(60):
+        state, sent = zoom.step(state, [x])
+    assert sent.saturated[0] == saturates and np.isnan(sent.error[0]) == saturates
+
+
+@settings(max_examples=30)
+@given(
+    values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=12),
+    levels=st.sampled_from([3, 9, 41]),
+    growth=st.sampled_from([0.0, 0.6]),
+)
+def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, growth):
+    quantizer = hg.EscapeQuantizer(levels, 1.0, 0.6, growth, 1e-3)
+    here, there, stepped = quantizer.init(1), quantizer.init(1), quantizer.init(1)
+    for x in values:
+        symbols = quantizer.encode(here, [x])
+        over_the_link = Symbols(*([int(s[0])] for s in symbols))  # whole numbers, nothing else
+        there, received = quantizer.decode(there, over_the_link)
+        here, sent = quantizer.decode(here, symbols)
+        stepped, known = quantizer.step(stepped, [x])
+        for mine, other in ((here, sent), (stepped, known)):
+            assert np.array_equal(mine, there)  # the same operations one after another: the same bits
+            assert np.array_equal(other.value, received.value) and np.array_equal(other.error, received.error)
+        assert 0 <= over_the_link.segment[0] < levels and not received.saturated[0]
+        assert abs(received.value[0] - x) <= received.error[0] * (1 + 1e-12)
+        assert here[0] >= 1e-3
+
+
+def test_an_amplitude_off_by_rounding_does_not_lose_the_receiver():
+    """Where the receiver was compiled otherwise: it takes no decision by its amplitude, so rounding stays rounding."""
+    rng = np.random.default_rng(0)
+    here, there = ESCAPE.init(1), ESCAPE.init(1) * (1 + 1e-15)
+    for x in rng.normal(size=200) * 10 ** rng.uniform(-2, 2, 200):
+        symbols = ESCAPE.encode(here, [x])
+        (here, sent), (there, received) = ESCAPE.decode(here, symbols), ESCAPE.decode(there, symbols)
+        np.testing.assert_allclose(received.value, sent.value, rtol=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("x", "symbols"), [(0.0, 1), (0.3, 1), (1.0, 1), (1.001, 2), (-2.0, 2), (2.1, 3), (1024.0, 11)]
+)
+def test_an_escape_doubles_the_amplitude(x, symbols):
+    sent = ESCAPE.step(ESCAPE.init(1), [x])[1]
+    assert sent.symbols[0] == symbols
+    assert sent.error[0] == 2.0 ** (symbols - 1) / 9
+    assert x != 0 or sent.value[0] == 0
+
+
+@pytest.mark.parametrize("name", ["uniform", "zoom", "escape"])
+def test_what_is_no_number_arrives_as_such_and_does_no_harm(name):
+    quantizer = QUANTIZERS[name]
+    start = quantizer.init(2)
+    after, sent = quantizer.step(start, [np.nan, 0.5])
+    assert np.isnan(sent.value[0]) and np.isnan(sent.error[0]) and not sent.saturated[0]
+    assert np.isfinite(sent.value[1]) and np.isfinite(sent.error[1])
+    assert all(
+        leaf[0] == before[0] for leaf, before in zip(jax.tree.leaves(after), jax.tree.leaves(start), strict=True)
+    )
+    beyond = quantizer.step(start, [np.inf, -1.7e308])[1]
+    assert np.isnan(beyond.error[0])
+
+
+def dominates(bound, p, d, directions):
+    """sup over e, mu of E[(a'(e - mu))^2] = (sqrt(a'Pa) + sum |a_j| D_j)^2, since e and mu may be of one sign."""
+    worst = (np.sqrt(np.einsum("ki,ij,kj->k", directions, p, directions)) + np.abs(directions) @ d) ** 2
+    return worst <= np.einsum("ki,ij,kj->k", directions, bound, directions) * (1 + 1e-12)
+
+
+@settings(max_examples=40)
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 4))
+def test_the_widened_bound_dominates_every_correlation(seed, n):
+    rng = np.random.default_rng(seed)
+    root, d = rng.normal(size=(n, n)), rng.exponential(size=n)
+    p = root @ root.T
+    with jax.enable_x64(True):
+        bound = np.asarray(widen(p, d))
+    assert np.all(dominates(bound, p, d, rng.normal(size=(200, n))))
+    assert np.trace(bound) == pytest.approx((np.sqrt(np.trace(p)) + d.sum()) ** 2, rel=1e-12)  # the best t
+    if n == 1:
+        assert bound[0, 0] == pytest.approx((np.sqrt(p[0, 0]) + d[0]) ** 2, rel=1e-12)  # attained
+
+
+def test_widening_at_its_limits():
+    p, d = np.array([[2.0, 0.3], [0.3, 1.0]]), np.array([0.1, 0.2])
+    with jax.enable_x64(True):
+        np.testing.assert_array_equal(widen(p, 0 * d), p)
+        np.testing.assert_allclose(widen(0 * p, d), 0.3 * np.diag(d), rtol=1e-15)
+        assert np.all(np.isnan(np.diag(widen(p, np.array([0.1, np.nan])))))
+
+
+def test_an_amplitude_that_follows_the_data_can_understate():
+    """Why such quantizers claim "nominal": errors are rare and large, and the quantizer is coarse just then.
+
+    e = K with probability q, else 0, and mu = -D with D = K and 0: E[(e - mu)^2] = 4 q K^2, and for every fixed D the
+    bound holds. Yet the mean of the bounds (sqrt(q) K + D)^2 is (q (1 + sqrt q)^2 + (1 - q) q) K^2.
+    """
+    q, k = 0.01, 1.0
+    with jax.enable_x64(True):
+        bounds = [float(widen(np.array([[q * k**2]]), np.array([d]))[0, 0]) for d in (k, 0.0)]
+    assert q * bounds[0] + (1 - q) * bounds[1] < 0.6 * 4 * q * k**2
+    assert hg.UniformQuantizer(8, 1.0).claim("exact") == "upper"
+    assert {hg.ZoomQuantizer(8, 1.0, 0.5, 0.1).claim("exact"), ESCAPE.claim("upper")} == {"nominal"}
+    assert {item.claim("none") for item in QUANTIZERS.values()} == {"none"}
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: hg.UniformQuantizer(1, 1.0), "levels: expected at least 2, got 1"),
+        (lambda: hg.UniformQuantizer(2.5, 1.0), "levels: expected a positive whole number"),
+        (lambda: hg.UniformQuantizer(8, 0.0), "amplitude: expected positive numbers, got 0.0"),
+        (lambda: hg.UniformQuantizer(8, [1.0, np.inf]), "amplitude: expected finite numbers"),
+        (lambda: hg.UniformQuantizer(8, [[1.0], [2.0, 3.0]]), "amplitude: expected an array of numbers"),
+        (lambda: hg.UniformQuantizer(8, 1.0, -1.0), "scale: expected positive numbers"),
+        (lambda: hg.UniformQuantizer(8, "wide"), "amplitude: expected an array of numbers"),
+        (lambda: hg.ZoomQuantizer(8, 1.0, 1.0, 0.1), "decay: expected numbers between 0 and 1, got 1.0"),
+        (lambda: hg.ZoomQuantizer(8, 1.0, 0.5, -0.1), "growth: expected no negative number"),
+        (lambda: hg.EscapeQuantizer(8, 1.0, 0.5, 0.1, 1e-3), "levels: expected an odd number, so that zero is a level"),
+        (lambda: hg.EscapeQuantizer(9, 1.0, 0.5, 0.1, 0.0), "smallest amplitude: expected positive numbers"),
+        (lambda: hg.UniformQuantizer(8, [1.0, 2.0]).check(3), r"quantizer: expected numbers or shape \(3,\)"),
+    ],
+)
+def test_bad_quantizers(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+class _Optimist(hg.UniformQuantizer):
+    """A quantizer that states half its error."""
+
+    def step(self, state, value):
+        state, sent = super().step(state, value)
+        return state, sent._replace(error=sent.error / 2)
+
+
+def test_the_check_finds_a_bound_that_does_not_hold():
+    with pytest.raises(AssertionError, match="error: expected a bound, exceeded by"):
+        check_quantizer(_Optimist(8, 3.0))

@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.model.over_time import at, stack, steps_covered, unstack
+
+
+def test_an_unmarked_array_never_varies():
+    assert np.array_equal(at(np.eye(3), 1), np.eye(3))
+    assert steps_covered(np.eye(3)) is None
+
+
+def test_a_marked_array_is_read_at_its_step():
+    values = np.arange(6.0).reshape(3, 2)
+    assert np.array_equal(at({"a": hg.OverTime(values)}, 2)["a"], values[2])
+    assert steps_covered({"a": hg.OverTime(values)}) == 3
+
+
+def test_objects_over_time_come_back_as_given():
+    channels = [hg.hop(hg.Rayleigh(s), 0.1) for s in (0.5, 1.0, 2.0)]
+    moved = hg.over_time(channels)
+    assert [float(c.gain.scale) for c in unstack(moved)] == [0.5, 1.0, 2.0]
+    assert float(at(moved, 1).gain.scale) == 1.0
+
+
+@pytest.mark.parametrize("other", [hg.hop(hg.Nakagami(1.0), 0.1), hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2)])
+def test_objects_of_another_structure_or_shape_do_not_stack(other):
+    with pytest.raises(ValueError, match="one structure"):
+        stack([hg.hop(hg.Rayleigh(1.0), 0.1), other])
+
+
+def test_nothing_over_time_is_refused():
+    with pytest.raises(ValueError, match="at least one item"):
+        hg.over_time([])
+    with pytest.raises(ValueError, match="leading time axis"):
+        hg.OverTime(np.float64(3.0))

@@ -1,0 +1,43 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from heliograph.numerics.linalg import UNROLL_LIMIT, cholesky, psd_solve
+
+
+def psd(seed, n, rank=None):
+    a = np.random.default_rng(seed).normal(size=(n, rank or n))
+    return a @ a.T
+
+
+@pytest.mark.parametrize("n", [1, 3, UNROLL_LIMIT, UNROLL_LIMIT + 3])
+def test_factor_is_the_librarys(n):
+    a = psd(n, n)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(cholesky(jnp.asarray(a)), np.linalg.cholesky(a), atol=1e-11 * np.abs(a).max())
+
+
+@given(seed=st.integers(0, 500), n=st.sampled_from([2, 4, 10]), rank=st.integers(1, 2))
+def test_singular_matrices_have_a_factor(seed, n, rank):
+    a = psd(seed, n, 1)
+    a[:rank] = 0.0
+    a[:, :rank] = 0.0
+    with jax.enable_x64(True):
+        factor = np.asarray(cholesky(jnp.asarray(a)))
+    np.testing.assert_allclose(factor @ factor.T, a, atol=1e-10 * max(np.abs(a).max(), 1e-300))
+
+
+def test_zero_has_the_zero_factor_and_indefinite_has_none():
+    with jax.enable_x64(True):
+        assert not np.any(cholesky(jnp.zeros((3, 3))))
+        assert np.any(np.isnan(cholesky(jnp.asarray([[1.0, 2.0], [2.0, 1.0]]))))
+
+
+@pytest.mark.parametrize("n", [1, 4, UNROLL_LIMIT + 2])
+def test_solve(n):
+    a, b = psd(n, n) + np.eye(n), np.random.default_rng(0).normal(size=(n, 3))
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(psd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-9)

@@ -1,0 +1,79 @@
+"""Kernels on batches: numbers of the library, whatever axes are mapped, and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph import linalg, small_matrix
+from heliograph.numerics.small_matrix import UNROLL_LIMIT, runs_last
+
+RUNS, NODES = 5, 3
+ROUNDING = 1e-12  # of a few hundred operations on well conditioned matrices
+
+
+def psd(*shape):
+    a = np.random.default_rng(1).normal(size=shape)
+    return a @ np.swapaxes(a, -1, -2) + np.eye(shape[-1])
+
+
+def nested(function, *args):
+    """Over nodes within runs, in double precision."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.jit(jax.vmap(jax.vmap(function)))(*args))
+
+
+@pytest.mark.parametrize("n", [1, 4, UNROLL_LIMIT + 2])
+def test_nested_maps_give_what_the_library_gives(n):
+    a, b = psd(RUNS, NODES, n, n), np.random.default_rng(2).normal(size=(RUNS, NODES, n, 2))
+    np.testing.assert_allclose(nested(linalg.cholesky, a), np.linalg.cholesky(a), atol=ROUNDING * np.abs(a).max())
+    np.testing.assert_allclose(nested(linalg.psd_solve, a, b), np.linalg.solve(a, b), atol=1e3 * ROUNDING)
+
+
+@pytest.mark.parametrize("inner", [3, 2 * UNROLL_LIMIT + 1])
+def test_a_product_broadcasts_what_is_not_mapped(inner):
+    times = runs_last(small_matrix.times)
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(size=(2, inner)), rng.normal(size=(RUNS, NODES, inner, 4))
+    found = nested(lambda b: times(a, b), b)
+    np.testing.assert_allclose(found, a @ b, atol=ROUNDING * inner)
+    with jax.enable_x64(True):
+        over_nodes = jax.vmap(lambda b: jax.vmap(lambda row: times(row[None], b)[0])(jnp.asarray(a)))(b[:, 0])
+    np.testing.assert_allclose(over_nodes, a @ b[:, 0], atol=ROUNDING * inner)
+
+
+def test_both_kinds_of_derivatives_pass_through():
+    a, b = psd(3, 3), np.ones((3, 1))
+
+    def trace(a):
+        return linalg.psd_solve(a, jnp.asarray(b)).sum()
+
+    x = np.linalg.solve(a, b)
+    with jax.enable_x64(True):
+        forward, backward = jax.jacfwd(trace)(jnp.asarray(a)), jax.grad(trace)(jnp.asarray(a))
+    # d 1' A^-1 1 = -x' dA x; the factor reads the lower half only, so compare what a symmetric dA sees.
+    for found in (forward, backward):
+        np.testing.assert_allclose(found + found.T, -2 * x @ x.T, atol=1e3 * ROUNDING)
+
+
+def test_a_run_without_a_factor_leaves_the_others_alone():
+    a = np.stack([-np.eye(2), np.full((2, 2), np.nan), np.full((2, 2), np.inf), 4 * np.eye(2)])
+    with jax.enable_x64(True):
+        factors = np.asarray(jax.vmap(linalg.cholesky)(jnp.asarray(a)))
+    assert np.isnan(factors[:3]).any(axis=(1, 2)).all()
+    np.testing.assert_array_equal(factors[3], 2 * np.eye(2))
+
+
+def test_single_precision_stays_single():
+    assert jax.vmap(linalg.cholesky)(jnp.eye(2, dtype=np.float32)[None]).dtype == np.float32
+
+
+def test_further_axes_are_carried_along():
+    a, b = psd(RUNS, 3, 3), psd(RUNS, 3, 3)
+    last = np.moveaxis(a, 0, -1), np.moveaxis(b, 0, -1)
+    with jax.enable_x64(True):
+        a_last, b_last = map(jnp.asarray, last)
+        np.testing.assert_allclose(small_matrix.inner(a_last, b_last), np.einsum("rij,rij->r", a, b), rtol=ROUNDING)
+        np.testing.assert_allclose(small_matrix.trace(a_last), np.trace(a, axis1=1, axis2=2), rtol=ROUNDING)
+        found = np.moveaxis(np.asarray(small_matrix.congruence(a_last, b_last)), -1, 0)
+    np.testing.assert_allclose(found, a @ b @ np.swapaxes(a, 1, 2), atol=ROUNDING * np.abs(found).max())

@@ -1,0 +1,278 @@
+import jax
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.testing import check_filter
+
+PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1, [0.0, 1.0], 0.3, input_matrix=[[1.0], [0.5]])
+CHANNEL = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.7), 0.1), hg.hop(hg.bernoulli(0.8), 0.05)])
+HORIZON, RUNS = 7, 70  # more than one block of runs, and not a multiple of it
+INPUTS = np.linspace(-1, 1, HORIZON)[:, None]
+
+
+def node(row, channel=CHANNEL):
+    sensor = hg.LinearSensor([row], 0.05)
+    filters = {
+        "relay_aware": hg.cubature_filter(PLANT, sensor, channel),
+        "linear": hg.linear_filter(PLANT, sensor, channel),
+    }
+    return hg.Node(sensor, channel, filters)
+
+
+NETWORK = hg.Network(PLANT, {"b": node([1.0, 0.0]), "a": node([0.5, 1.0]), "direct": node([0.0, 1.0], hg.perfect())})
+
+
+@pytest.fixture(scope="module")
+def record():
+    return hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS)
+
+
+def leaves(record):
+    return [record.truth, *record.measurements.values(), *jax.tree.leaves(record.estimates)]
+
+
+def test_shapes_and_order(record):
+    assert record.truth.shape == (RUNS, HORIZON, 2)
+    assert list(record.measurements) == ["b", "a", "direct"] and record.measurements["a"].shape == (RUNS, HORIZON, 1)
+    assert list(record.estimates["b"]) == ["relay_aware", "linear"]
+    assert all(isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 for leaf in leaves(record))
+    assert record.failures() == []
+
+
+def test_chunks_change_no_bit(record):
+    other = hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
+    assert all(np.array_equal(a, b) for a, b in zip(leaves(record), leaves(other), strict=True))
+
+
+def test_chunks_change_no_bit_of_the_statistics():
+    some = [hg.monte_carlo(NETWORK, 3, 140, 11, hg.Statistics(), INPUTS[:3], chunk) for chunk in (64, 256)]
+    for name in ("outer", "covariance", "nees", "count"):
+        assert np.array_equal(*(getattr(s["a"]["linear"], name) for s in some)), name
+
+
+def test_fewer_runs_are_the_first_of_more_runs(record):
+    few = hg.monte_carlo(NETWORK, HORIZON, 5, 11, inputs=INPUTS)
+    assert np.array_equal(few.truth, record.truth[:5])
+    assert np.array_equal(few.measurements["b"], record.measurements["b"][:5])
+
+
+def test_another_node_changes_no_draw(record):
+    more = hg.Network(PLANT, {"new": node([1.0, 1.0]), **NETWORK.nodes})
+    other = hg.monte_carlo(more, HORIZON, RUNS, 11, inputs=INPUTS)
+    assert np.array_equal(other.truth, record.truth)
+    for name in NETWORK.nodes:
+        assert np.array_equal(other.measurements[name], record.measurements[name])
+
+
+def test_run_equals_step_by_step(record):
+    measurements = {name: z[3].copy() for name, z in record.measurements.items()}
+    measurements["a"][2] = np.nan
+    result = hg.run(NETWORK, measurements, INPUTS)
+    for name, part in NETWORK.nodes.items():
+        for label, item in part.filters.items():
+            stream = hg.Stream(item)
+            for k in range(HORIZON):
+                estimate = stream.push(measurements[name][k], INPUTS[k])
+                together = result.estimates[name][label]
+                # The same arithmetic in another compilation: equal to rounding.
+                np.testing.assert_allclose(estimate.mean, together.mean[k], rtol=0, atol=1e-12)
+                np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
+
+
+def test_the_true_channel_makes_the_data_and_the_filter_believes_another():
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
+    item = hg.linear_filter(PLANT, sensor, CHANNEL)
+    worlds = [hg.Network(PLANT, {"n": hg.Node(sensor, c, {"f": item})}) for c in (CHANNEL, hg.silent())]
+    rmse = [
+        hg.monte_carlo(w, HORIZON, 500, 1, hg.Statistics(), INPUTS)["n"]["f"].rmse()[0] for w in worlds
+    ]  # fmt: skip
+    assert rmse[0] < rmse[1]
+
+
+def test_a_lost_covariance_is_reported_with_its_step():
+    plant = hg.Plant(lambda x, u: x**3, 1e-3, [5.0], 1.0)  # leaves the range of numbers after a few steps
+    sensor = hg.LinearSensor([[1.0]], 1.0)
+    network = hg.Network(
+        plant, {"n": hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(plant, sensor, hg.perfect())})}
+    )
+    record = hg.run(network, {"n": np.full((12, 1), np.nan)})
+    (line,) = record.failures()
+    assert line.startswith("n/f: no valid covariance from step ")
+    step = int(line.split("step ")[1].split()[0])
+    assert 0 < step < 12 and np.all(np.isfinite(record.estimates["n"]["f"].mean[: step - 1]))
+
+
+LINEAR = {
+    name: hg.Node(item.sensor, item.channel, {"linear": item.filters["linear"]}) for name, item in NETWORK.nodes.items()
+}
+STATIC = {
+    "b": hg.UniformQuantizer(32, 0.8),  # saturates now and then
+    "a": hg.UniformQuantizer(16, 12.0),
+    "direct": hg.UniformQuantizer(64, 10.0),
+}
+LINKED = hg.Network(
+    PLANT,
+    LINEAR,
+    {
+        "plain": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5])),
+        "static": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
+        "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
+        "zoom": hg.Fusion("linear", hg.EqualIntersection(), hg.ZoomQuantizer(40, [3.0, 2.0], 0.6, 0.1)),
+    },
+)
+
+
+@pytest.fixture(scope="module")
+def linked():
+    return hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS)
+
+
+def sent_step_by_step(fusion, record, run):
+    """What each node's quantizer delivers of its filter's means in one run, by a plain loop."""
+    delivered = []
+    for name in NETWORK.nodes:
+        quantizer = fusion.quantizer[name] if isinstance(fusion.quantizer, dict) else fusion.quantizer
+        state = quantizer.init(2)
+        for k in range(HORIZON):
+            state, sent = quantizer.step(state, record.estimates[name][fusion.filter].mean[run, k])
+            delivered.append(sent)
+    return [
+        np.stack([getattr(s, part) for s in delivered]).reshape(3, HORIZON, 2).swapaxes(0, 1)
+        for part in ("value", "error", "saturated", "symbols")
+    ]
+
+
+@pytest.mark.parametrize("name", ["static", "escape", "zoom"])
+def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
+    fusion, uplink = LINKED.fused[name], linked.uplinks[name]
+    for run in (0, 5):
+        value, error, saturated, symbols = sent_step_by_step(fusion, linked, run)
+        np.testing.assert_array_equal(uplink.saturated[run], saturated)
+        np.testing.assert_array_equal(uplink.symbols[run], symbols)
+        k = int(np.flatnonzero(~saturated.any(axis=(1, 2)))[-1])
+        local = []
+        for i, node in enumerate(NETWORK.nodes):
+            p, d = linked.estimates[node][fusion.filter].covariance[run, k], error[k, i]
+            s, r = d.sum(), np.sqrt(np.trace(p))
+            local.append(hg.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
+        outside, inside = hg.fuse(fusion.rule, local), linked.estimates["fused"][name]
+        # The same arithmetic in another compilation; searched weights agree to the root of rounding.
+        np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(inside.covariance[run, k], outside.covariance, rtol=0, atol=1e-7)
+
+
+def test_links_change_nothing_else(linked, record):
+    assert np.array_equal(linked.truth, record.truth) and record.uplinks == {}
+    assert list(linked.uplinks) == ["static", "escape", "zoom"]
+    for node in NETWORK.nodes:
+        np.testing.assert_allclose(linked.estimates[node]["linear"].mean, record.estimates[node]["linear"].mean)
+
+
+def test_saturation_is_reported_and_nothing_is_claimed_there(linked):
+    uplink, fused = linked.uplinks["static"], linked.estimates["fused"]["static"]
+    assert uplink.nodes == ("b", "a", "direct") and uplink.saturated.shape == (RUNS, HORIZON, 3, 2)
+    count = int(uplink.saturated[:, :, 0].sum())
+    assert count > 0 and not uplink.saturated[:, :, 1:].any()
+    lines = [line for line in linked.failures() if line.startswith("fused/static")]
+    assert lines[1] == f"fused/static: the quantizer of node b saturated in {count} of {RUNS * HORIZON * 2} samples"
+    assert lines[0].startswith("fused/static: no valid covariance from step ")
+    anywhere = uplink.saturated.any(axis=(-1, -2))
+    assert np.array_equal(np.isnan(fused.covariance).all(axis=(-1, -2)), anywhere)
+    assert np.array_equal(np.isnan(fused.covariance).any(axis=(-1, -2)), anywhere) and np.all(np.isfinite(fused.mean))
+    assert uplink.saturated_share()["b"] == count / (RUNS * HORIZON * 2) and uplink.symbols_per_value() == 1
+    assert not any("fused/escape" in line for line in linked.failures())
+    assert 1 < linked.uplinks["escape"].symbols_per_value() < 5
+
+
+def test_statistics_count_what_the_record_shows(linked):
+    some = [hg.monte_carlo(LINKED, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk)["fused"] for chunk in (64, 256)]
+    for name in linked.uplinks:
+        a, b = (s[name].uplink for s in some)
+        assert np.array_equal(a.saturated, b.saturated) and np.array_equal(a.symbols, b.symbols)
+    found = some[0]
+    assert found["plain"].uplink is None
+    for name in linked.uplinks:
+        kept, counted = hg.error_statistics(linked, "fused", name).uplink, found[name].uplink
+        assert kept.nodes == counted.nodes
+        np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
+        np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
+
+
+def test_chunks_change_no_bit_of_links(linked):
+    other = hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
+    pairs = zip(leaves(linked), leaves(other), strict=True)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    for name, uplink in linked.uplinks.items():
+        assert np.array_equal(uplink.saturated, other.uplinks[name].saturated)
+
+
+def test_a_recording_goes_through_the_same_links(linked):
+    result = hg.run(LINKED, {name: z[3] for name, z in linked.measurements.items()}, INPUTS)
+    for name, uplink in linked.uplinks.items():
+        assert np.array_equal(result.uplinks[name].symbols, uplink.symbols[3])
+        np.testing.assert_allclose(
+            result.estimates["fused"][name].mean, linked.estimates["fused"][name].mean[3], rtol=0, atol=1e-9
+        )
+
+
+def test_quantizers_over_time_and_the_claim_of_a_static_one():
+    """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
+    each = hg.over_time([hg.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
+    network = hg.Network(PLANT, LINEAR, {"ci": hg.Fusion("linear", hg.CovarianceIntersection(), each)})
+    found = hg.monte_carlo(network, 5, 2000, 3, hg.Statistics(), INPUTS[:5])["fused"]["ci"]
+    assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
+    trace = np.trace(found.claimed(), axis1=1, axis2=2)
+    assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
+    with pytest.raises(ValueError, match="at most 5 steps"):
+        hg.monte_carlo(network, HORIZON, 2, 3, inputs=INPUTS)
+
+
+class Silent(hg.AbstractFilter):
+    """Gives the initial mean and claims nothing."""
+
+    claim: str = "none"
+
+    def init(self):
+        return np.zeros(2)
+
+    def step(self, state, z, u=(), k=0):
+        return state, hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
+
+
+def test_a_filter_that_claims_no_covariance_harms_no_other():
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
+    filters = {"silent": Silent(), "linear": hg.linear_filter(PLANT, sensor, CHANNEL)}
+    nodes = {name: hg.Node(sensor, CHANNEL, filters) for name in ("p", "q")}
+    network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.WeightedFusion([0.5, 0.5]))})
+    check_filter(Silent(), 1)
+    assert hg.monte_carlo(network, 4, 8, 0, inputs=INPUTS[:4]).failures() == []
+    found = hg.monte_carlo(network, 4, 200, 0, hg.Statistics(), INPUTS[:4])
+    silent, linear = found["p"]["silent"], found["p"]["linear"]
+    assert silent.claim == found["fused"]["mean"].claim == "none"
+    assert silent.rmse()[0] > linear.rmse()[0] and linear.nees_per_dimension()[0] == pytest.approx(1, abs=0.3)
+    assert np.isnan(silent.nees_per_dimension()[0]) and np.isnan(silent.mean_trace())
+    assert np.isnan(silent.worst_direction().ratio) and np.isnan(silent.worst_direction().z)
+    assert hg.pool([silent, linear]).claim == "none"
+    with pytest.raises(ValueError, match="got the claim 'none'"):
+        hg.Network(PLANT, nodes, {"ci": hg.Fusion("silent", hg.CovarianceIntersection())})
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: hg.monte_carlo(NETWORK, 0, 1, 0, inputs=INPUTS), "horizon: expected a positive whole number, got 0"),
+        (lambda: hg.monte_carlo(NETWORK, HORIZON, 1, 0), r"inputs: expected an array \(7, 1\) of \['u0'\], got none"),
+        (lambda: hg.monte_carlo(NETWORK, HORIZON, 1, 0, inputs=INPUTS[:3]), r"inputs: expected shape \(7, 1\)"),
+        (lambda: hg.run(NETWORK, {"b": np.zeros(3)}, np.zeros((3, 1))), "a mismatch in"),
+        (
+            lambda: hg.run(hg.Network(PLANT, {"b": node([1.0, 0.0])}), {"b": np.zeros(3)}, np.zeros((3, 1)), [0, 2, 1]),
+            "do not go backwards, got 1 after 2 in row 3",
+        ),
+        (lambda: hg.Network(PLANT, {}), "at least one node"),
+        (lambda: hg.Network(PLANT, {"b": 3}), "a Node, got int"),
+    ],
+)
+def test_bad_calls(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
