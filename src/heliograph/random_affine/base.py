@@ -57,6 +57,19 @@ class AbstractRandomAffine(eqx.Module):
         """Whether outputs can be NaN: lost, and the receiver knows."""
         return False
 
+    @property
+    def remembers(self) -> bool:
+        """Whether what is drawn depends on what was drawn before: then it has a state."""
+        return False
+
+    def init(self, key: jax.Array) -> Any:
+        """State before the first draw; a map that forgets has none."""
+        return ()
+
+    def draw(self, state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
+        """Next state and H of shape (outputs + 1, inputs + 1)."""
+        return state, self.sample(key)
+
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw H of shape (outputs + 1, inputs + 1)."""
         raise NotImplementedError
