@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph import plaza_recording
+from heliograph.examples import plaza_recording
 from heliograph.examples import plaza
 from heliograph.examples.plaza_recording import (
     WINDOW,
