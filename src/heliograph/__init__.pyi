@@ -90,10 +90,6 @@ from .linear.comparison import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,
 )
-from .linear.bounded import (
-    Boundedness as Boundedness,
-    boundedness as boundedness,
-)
 from .h_infinity.growth_system import (
     Growth as Growth,
     GrowthSystem as GrowthSystem,
@@ -126,13 +122,6 @@ from .filters.gaussian import (
 )
 from .filters.prediction import (
     prediction_of as prediction_of,
-)
-from .filters.boundedness import (
-    Ceiling as Ceiling,
-    GrowthCondition as GrowthCondition,
-    empirical_ceiling as empirical_ceiling,
-    growth_condition as growth_condition,
-    provable_ceiling as provable_ceiling,
 )
 from .filters.linear import (
     linear_filter as linear_filter,
@@ -205,10 +194,6 @@ from .relays.periodic import (
 from .relays.periodic_tuning import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
-)
-from .relays.certificate import (
-    RelayCertificate as RelayCertificate,
-    certify_relays as certify_relays,
 )
 from .simulation.simulate_relays import (
     initial_states as initial_states,

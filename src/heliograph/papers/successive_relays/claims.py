@@ -6,6 +6,7 @@ from scipy import stats
 import heliograph as hg
 from heliograph.papers.claim import Claim, holds
 from heliograph.papers.successive_relays import setting
+from heliograph.papers.successive_relays.certificate import RelayCertificate
 from heliograph.papers.successive_relays.compute import FILTERS, Misprinted, Reproduction, misprinted
 
 FALSE_ALARM = 1e-3  # that some step of a right design is told to disagree with the simulation
@@ -229,7 +230,7 @@ def _noise_squared() -> tuple[float, int, tuple[float, float]]:
     return float(hg.own_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
 
 
-def _below_state(certificate: hg.RelayCertificate, name: str) -> float:
+def _below_state(certificate: RelayCertificate, name: str) -> float:
     """Smallest eigenvalue of cov x_k - E e e' over its trace, over all k."""
     found = certificate.recomputed
     gap = np.linalg.eigvalsh(found.state - found.covariance[name])[:, 0]
