@@ -65,7 +65,6 @@ from .filters.correction import (
 )
 from .filters.update import (
     Interval as Interval,
-    LooseInterval as LooseInterval,
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
