@@ -151,7 +151,6 @@ from .fusion.quantizer import (
     EscapeQuantizer as EscapeQuantizer,
     Quantized as Quantized,
     UniformQuantizer as UniformQuantizer,
-    ZoomQuantizer as ZoomQuantizer,
 )
 from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
@@ -166,7 +165,6 @@ from .fusion.level import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
     level_weights as level_weights,
-    published_fused_level as published_fused_level,
 )
 from .model.relays import (
     RelayNetwork as RelayNetwork,

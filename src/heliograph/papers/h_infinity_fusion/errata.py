@@ -7,6 +7,7 @@ from heliograph.papers.claim import Claim, holds
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.compute import Reproduction
 from heliograph.papers.h_infinity_fusion.example import RECURSIVE
+from heliograph.papers.h_infinity_fusion.published_level import published_fused_level
 
 ROUNDING = 1e-12
 
@@ -79,7 +80,7 @@ def _fusion(result: Reproduction) -> list[Claim]:
         [[np.full((1, 1), -(best**2) / (2 * len(c))), (c * gamma)[None]], [(c * gamma)[:, None], -np.eye(4)]]
     )
     top = float(np.linalg.eigvalsh(edge)[-1])
-    one = hg.published_fused_level([gamma[0]], [1.0]) / gamma[0]
+    one = published_fused_level([gamma[0]], [1.0]) / gamma[0]
     return [
         Claim("the fused level is 2.5419", "Section IV", f"{setting.PAPER_FUSED_LEVEL}",
               f"{paper:.5f} with the printed weights, once they sum to 1 ({result.level_of_paper_weights(False):.5f} "
