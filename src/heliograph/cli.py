@@ -105,7 +105,7 @@ def reproduce(
     runs: Annotated[int | None, Parameter(help="Monte Carlo runs; each publication has its own default.")] = None,
     seed: Annotated[int, Parameter(help="Seed of the simulations.")] = 0,
 ) -> None:
-    """Run a published method as printed and as improved, and judge each of its claims by this very run."""
+    """Run a published method as printed and as improved, and judge each of its statements by this very run."""
     from heliograph.papers import METHODS
 
     if method is None:

@@ -29,7 +29,7 @@ from heliograph.papers.h_infinity_fusion import (
     violation,
     worst_disturbance,
 )
-from heliograph.papers.h_infinity_fusion.claims import claims
+from heliograph.papers.h_infinity_fusion.statements import statements
 
 RECURSIVE = example.RECURSIVE
 pytest.importorskip("cvxpy")
@@ -356,18 +356,20 @@ def test_every_file_is_there_and_the_record_can_be_read(folder):
 
 
 def test_claims_follow_the_numbers(result):
-    judged = claims(result)
-    assert len({c.claim for c in judged}) == len(judged)
-    assert all(c.claim and c.source and c.ours for c in judged)
-    verdict = {c.claim: c.verdict for c in judged}
+    judged = statements(result)
+    assert len({c.text for c in judged}) == len(judged)
+    assert all(c.text and c.source and c.ours for c in judged)
+    verdict = {c.text: c.verdict for c in judged}
     assert verdict["J_1 < 0 at every node"] == verdict["J_2 < 0"] == "holds_vacuously"
     assert verdict["the printed weights are optimal"] == verdict["|mu| <= u d / p"] == "fails"
     assert verdict["dynamic quantization beats static"] == "holds"
     assert verdict["(18) is E V(next) - V plus the terms of growth and level"] == "holds"
-    doubted = {c.claim: c.verdict for c in claims(replace(result, enumeration=1e-3))}
+    doubted = {c.text: c.verdict for c in statements(replace(result, enumeration=1e-3))}
     assert doubted["(18) is E V(next) - V plus the terms of growth and level"] == "fails"
     positive = replace(result.indices, local=result.indices.local | {RECURSIVE: np.ones(4)})
-    assert {c.claim: c.verdict for c in claims(replace(result, indices=positive))}["J_1 < 0 at every node"] == "fails"
+    assert {c.text: c.verdict for c in statements(replace(result, indices=positive))}[
+        "J_1 < 0 at every node"
+    ] == "fails"
 
 
 @pytest.mark.parametrize("runs", [0, 99, 100.5])

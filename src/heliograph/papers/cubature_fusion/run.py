@@ -13,10 +13,10 @@ import rich.progress
 import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.numerics.check import fail
-from heliograph.papers.claim import Claim
-from heliograph.papers.cubature_fusion.claims import claims
 from heliograph.papers.cubature_fusion.compute import RUNS, Outcome, Reproduction, Tell, reproduction
 from heliograph.papers.cubature_fusion.setting import NODES, STATES
+from heliograph.papers.cubature_fusion.statements import statements
+from heliograph.papers.statement import Statement
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
 FOLDER = "cubature-fusion"
@@ -55,7 +55,7 @@ def write(result: Reproduction, folder: Path) -> None:
     from heliograph.papers.cubature_fusion.pictures import drawings
     from heliograph.report.figures import png, svg
 
-    judged, vectors = claims(result), {}
+    judged, vectors = statements(result), {}
     for name, figure in drawings(result).items():
         (folder / f"{name}.png").write_bytes(png(figure))
         vectors[name] = svg(figure)
@@ -64,8 +64,8 @@ def write(result: Reproduction, folder: Path) -> None:
     (folder / SUMMARY).write_text(json.dumps(summary(result, judged), indent=2) + "\n", encoding="utf-8")
 
 
-def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
-    """All numbers: by scenario and filter, of the nodes together, and the claims."""
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
+    """All numbers: by scenario and filter, of the nodes together, and the statements."""
     return {
         "paper": "Cubature Kalman fusion filtering under amplify-and-forward relays with randomly varying channel "
         "parameters",
@@ -74,7 +74,7 @@ def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
         "rmse_is": "root of the mean over runs, nodes and steps 1..T of the squared error summed over the state",
         "scenarios": {o.setting.name: scenario(o) for o in result.outcomes},
         "strong_first_steps": {"runs": result.early.runs, "steps": result.early.steps, **scenario(result.early)},
-        "claims": [claim._asdict() for claim in judged],
+        "claims": [each.entry() for each in judged],
     }
 
 

@@ -9,14 +9,14 @@ import numpy as np
 import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.numerics.check import fail
-from heliograph.papers.claim import Claim
 from heliograph.papers.h_infinity_fusion import setting
-from heliograph.papers.h_infinity_fusion.claims import claims
 from heliograph.papers.h_infinity_fusion.compute import RUNS, STAGES, Reproduction, reproduction
 from heliograph.papers.h_infinity_fusion.discriminating import NODE, Discriminating
 from heliograph.papers.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZERS, RECURSIVE, Outcome, fused_name
 from heliograph.papers.h_infinity_fusion.levels import NodeDesigns
+from heliograph.papers.h_infinity_fusion.statements import statements
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
+from heliograph.papers.statement import Statement
 from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
@@ -58,7 +58,7 @@ def write(result: Reproduction, folder: Path) -> None:
     from heliograph.papers.h_infinity_fusion.pictures import drawings
     from heliograph.report.figures import png, svg
 
-    judged, vectors = claims(result), {}
+    judged, vectors = statements(result), {}
     for name, figure in drawings(result).items():
         vectors[name] = svg(figure)
         (folder / f"{name}.png").write_bytes(png(figure))
@@ -68,7 +68,7 @@ def write(result: Reproduction, folder: Path) -> None:
     (folder / SUMMARY).write_text(json.dumps(summary(result, judged), indent=2) + "\n", encoding="utf-8")
 
 
-def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
     """All numbers."""
     outcome = result.outcome
     decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
@@ -104,7 +104,7 @@ def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
             "node": setting.NODES[0], "guaranteed": result.nodes[0].horizon.level, **found(result.broken)
         },
         "discriminating": second_numbers(result.discriminating),
-        "claims": [claim._asdict() for claim in judged],
+        "claims": [each.entry() for each in judged],
     }  # fmt: skip
 
 

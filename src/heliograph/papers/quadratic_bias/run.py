@@ -8,7 +8,6 @@ import numpy as np
 
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.numerics.check import fail
-from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
     RUNS,
@@ -20,6 +19,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
     simulated_over_time,
 )
+from heliograph.papers.quadratic_bias.statements import statements
 from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
@@ -71,7 +71,7 @@ def summary(result: Reproduction) -> dict[str, Any]:
         "gain_percent_is": "100 (1 - ratio of the means of the error variances) against the linear filter",
         **numbers(result.example),
         "outage": numbers(result.outage),
-        "claims": [claim._asdict() for claim in claims(result)],
+        "claims": [each.entry() for each in statements(result)],
     }
 
 

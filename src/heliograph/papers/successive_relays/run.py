@@ -10,8 +10,8 @@ import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.files.recording import write_estimates
 from heliograph.numerics.check import fail
-from heliograph.papers.successive_relays.claims import claims, tuned_mean_ratio
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
+from heliograph.papers.successive_relays.statements import statements, tuned_mean_ratio
 from heliograph.report.progress import progress
 
 SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
@@ -65,7 +65,7 @@ def summary(result: Reproduction) -> dict[str, Any]:
         },
         "steady": {name: {"even": result.steady[name].even, "odd": result.steady[name].odd} for name in STEADY},
         "tuned_mean_ratio": tuned_mean_ratio(result),
-        "claims": [claim._asdict() for claim in claims(result)],
+        "claims": [each.entry() for each in statements(result)],
     }
 
 
