@@ -32,7 +32,7 @@ from heliograph.papers.h_infinity_fusion.violation import violation
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
 
 RUNS = 4_000
-STAGES = 7  # as `reproduction` tells them, and one for drawing
+STAGES = 6  # as `reproduction` tells them
 
 
 @dataclass(frozen=True)
