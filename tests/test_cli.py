@@ -219,10 +219,10 @@ def test_a_command_line_that_is_none(folder, capsys, arguments, fragments):
     refused(folder, capsys, arguments, *fragments)
 
 
-def demo_module(monkeypatch, run_demo) -> None:
-    module = ModuleType("heliograph.demo.run")
-    module.run_demo = run_demo
-    monkeypatch.setitem(sys.modules, "heliograph.demo.run", module)
+def demo_module(monkeypatch, example) -> None:
+    module = ModuleType("heliograph.examples.demo")
+    module.example = example
+    monkeypatch.setitem(sys.modules, "heliograph.examples.demo", module)
 
 
 def test_demo_takes_folder_and_seed(folder, monkeypatch):
@@ -230,7 +230,8 @@ def test_demo_takes_folder_and_seed(folder, monkeypatch):
     demo_module(monkeypatch, lambda out, seed: calls.append((str(out), seed)))
     assert cli.main(["demo", "--out", "results", "--seed", "3"]) == 0
     assert cli.main(["demo", "--out", "results"]) == 0
-    assert calls == [("results", 3), ("results", 0)]
+    assert cli.main(["example", "demo", "--out", "results", "--seed", "4"]) == 0
+    assert calls == [("results", 3), ("results", 0), ("results", 4)]
 
 
 def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
@@ -283,12 +284,24 @@ def test_help_in_a_process_of_its_own_does_not_load_jax():
 def test_a_refusal_in_a_process_of_its_own(folder):
     (folder / "data.csv").write_text("time,push,poss\n0,0,1\n")
     before = contents(folder)
-    command = [sys.executable, "-m", "heliograph.cli", *run_arguments()]
+    command = [sys.executable, "-m", "heliograph", *run_arguments()]
     done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
     assert done.returncode == 2
     assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, got")
     assert done.stderr.count("\n") == 1 and done.stdout == ""
     assert contents(folder) == before
+
+
+def test_examples_are_listed_without_loading_jax():
+    code = (
+        "import sys; from heliograph.cli import main; code = main(['example']); "
+        "assert not {'jax', 'numpy', 'equinox', 'scipy'} & set(sys.modules); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    lines = done.stdout.splitlines()
+    assert [line.split()[0] for line in lines] == ["demo", "motor-drive"]
+    assert all(len(line.split()) > 5 for line in lines)
 
 
 def test_reproduce_alone_lists_the_methods(capsys):
@@ -303,7 +316,10 @@ def test_reproduce_alone_lists_the_methods(capsys):
         (["reproduce", "cubature-fusion"], ["reproduce: expected a folder for the results (--out DIR), got none"]),
         (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
         (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
+        (["example", "dmeo", "--out", "o"], ["example: expected one of demo, motor-drive, got 'dmeo'"]),
+        (["example", "demo"], ["example: expected a folder for the results (--out DIR), got none"]),
+        (["example", "demo", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
     ],
 )
-def test_bad_reproductions(folder, capsys, arguments, fragments):
+def test_bad_reproductions_and_examples(folder, capsys, arguments, fragments):
     refused(folder, capsys, arguments, *fragments)

@@ -24,8 +24,8 @@ ORDER = [
     ["report"],
     ["campaign"],
     ["examples", "papers"],
-    ["demo"],
     ["cli"],
+    ["__main__"],
 ]
 RANK = {name: rank for rank, names in enumerate(ORDER) for name in names}
 

@@ -1,14 +1,14 @@
 """FilterPy: a loop over runs and steps, on the first runs; its time of a step does not depend on how many there are."""
 
 import numpy as np
-from filterpy.kalman import LinearSystemFilter
+from filterpy.kalman import KalmanFilter
 from timed import Arrays, Contender, serve
 
 RUNS = 20
 
 
 def one_run(p: Arrays, run: int) -> np.ndarray:
-    kf = LinearSystemFilter(dim_x=4, dim_z=2)
+    kf = KalmanFilter(dim_x=4, dim_z=2)
     kf.F, kf.Q, kf.R = p["A"], p["Q"], p["R"]
     kf.x, kf.P = p["mean"], p["covariance"]
     means = np.empty((p["z"].shape[1], 4))

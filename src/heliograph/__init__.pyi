@@ -65,7 +65,6 @@ from .filters.correction import (
 )
 from .filters.update import (
     Interval as Interval,
-    LooseInterval as LooseInterval,
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
@@ -89,10 +88,6 @@ from .linear.recursion import (
 from .linear.comparison import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,
-)
-from .linear.bounded import (
-    Boundedness as Boundedness,
-    boundedness as boundedness,
 )
 from .h_infinity.growth_system import (
     Growth as Growth,
@@ -127,13 +122,6 @@ from .filters.gaussian import (
 from .filters.prediction import (
     prediction_of as prediction_of,
 )
-from .filters.boundedness import (
-    Ceiling as Ceiling,
-    GrowthCondition as GrowthCondition,
-    empirical_ceiling as empirical_ceiling,
-    growth_condition as growth_condition,
-    provable_ceiling as provable_ceiling,
-)
 from .filters.linear import (
     linear_filter as linear_filter,
     open_loop_filter as open_loop_filter,
@@ -163,7 +151,6 @@ from .fusion.quantizer import (
     EscapeQuantizer as EscapeQuantizer,
     Quantized as Quantized,
     UniformQuantizer as UniformQuantizer,
-    ZoomQuantizer as ZoomQuantizer,
 )
 from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
@@ -178,7 +165,6 @@ from .fusion.level import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
     level_weights as level_weights,
-    published_fused_level as published_fused_level,
 )
 from .model.relays import (
     RelayNetwork as RelayNetwork,
@@ -205,10 +191,6 @@ from .relays.periodic import (
 from .relays.periodic_tuning import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
-)
-from .relays.certificate import (
-    RelayCertificate as RelayCertificate,
-    certify_relays as certify_relays,
 )
 from .simulation.simulate_relays import (
     initial_states as initial_states,

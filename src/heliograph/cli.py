@@ -2,8 +2,8 @@
 
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -30,6 +30,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "h5py": "sweep",
     "dask": "cluster",
     "distributed": "cluster",
+    "gym_electric_motor": "motor",
 }
 
 app = App(
@@ -58,11 +59,13 @@ def run(
     """
     from heliograph.files.table import check_output
     from heliograph.numerics.check import fail
+    from heliograph.report.progress import progress
 
     check_output(out)
     if out.resolve() == measurements.resolve():
         raise fail(f"output file {out}", "another file than the measurements", "the same")
-    with _progress("Starting") as say:
+    with progress(3) as advance:
+        advance("starting")
         from heliograph.files.network_file import load_network
         from heliograph.files.recording import read_recording, write_estimates
 
@@ -70,9 +73,9 @@ def run(
         if not any(node.filters for node in loaded.nodes.values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
         recording = read_recording(measurements, loaded)
-        say(f"Filtering {len(recording.time)} rows")
+        advance(f"filtering {len(recording.time)} rows")
         record = heliograph.run(loaded, *recording)
-        say(f"Writing {out}")
+        advance(f"writing {out}")
         write_estimates(record, out)
     for failure in record.failures():
         print(f"heliograph: warning: {failure}", file=sys.stderr)
@@ -91,9 +94,27 @@ def demo(
     seed: Annotated[int, Parameter(help="Seed of the simulated relays.")] = 0,
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
-    from heliograph.demo.run import run_demo
+    example("demo", out=out, seed=seed)
 
-    run_demo(out, seed)
+
+@app.command
+def example(
+    name: Annotated[str | None, Parameter(help="Which example; without it, the list of them.")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, Parameter(help="Folder for the example's own, with report and summary.")] = None,
+    seed: Annotated[int, Parameter(help="Seed of what is simulated.")] = 0,
+) -> None:
+    """Run an example and report, or list them."""
+    from heliograph.examples import examples, load_example
+
+    if name is None:
+        known = examples()
+        width = max(map(len, known))
+        print("\n".join(f"{each:{width}}  {what}" for each, what in known.items()))
+        return
+    run_example = load_example(name)
+    run_example(_folder("example", out), seed)
 
 
 @app.command
@@ -105,25 +126,21 @@ def reproduce(
     runs: Annotated[int | None, Parameter(help="Monte Carlo runs; each publication has its own default.")] = None,
     seed: Annotated[int, Parameter(help="Seed of the simulations.")] = 0,
 ) -> None:
-    """Run a published method as printed and as improved, and judge each of its claims by this very run."""
+    """Run a published method as printed and as improved, and judge each of its statements by this very run."""
+    from heliograph.numerics.check import fail
     from heliograph.papers import METHODS
 
     if method is None:
         print("\n".join(METHODS))
         return
-    from heliograph.files.table import check_output_folder
-    from heliograph.numerics.check import fail
-
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":
         raise fail("method", f"one of {', '.join(METHODS)} or all", repr(method))
-    if out is None:
-        raise fail("reproduce", "a folder for the results (--out DIR)", "none")
+    target = _folder("reproduce", out)
     if runs is not None and runs < 1:
         raise fail("--runs", "a positive whole number", runs)
-    check_output_folder(out)
     for name in chosen:
-        import_module(METHODS[name]).reproduce(out, runs, seed)
+        import_module(METHODS[name]).reproduce(target, runs, seed)
 
 
 @app.command
@@ -175,6 +192,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(signal.SIGTERM, before)
 
 
+def _folder(command: str, out: Path | None) -> Path:
+    from heliograph.files.table import check_output_folder
+    from heliograph.numerics.check import fail
+
+    if out is None:
+        raise fail(command, "a folder for the results (--out DIR)", "none")
+    check_output_folder(out)
+    return out
+
+
 def _refuse(message: str) -> int:
     print("heliograph:", " ".join(message.split()), file=sys.stderr)
     return BAD_INPUT
@@ -182,20 +209,3 @@ def _refuse(message: str) -> int:
 
 def _terminate(_: int, __: FrameType | None) -> None:
     raise SystemExit(TERMINATED)  # unwinds, so that no temporary file stays
-
-
-@contextmanager
-def _progress(message: str) -> Iterator[Callable[[str], None]]:
-    """A spinner on stderr with a message that can be changed; nothing where stderr is not a terminal."""
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    console = Console(stderr=True)
-    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as shown:
-        task = shown.add_task(message)
-        yield lambda text: shown.update(task, description=text)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,6 +1,5 @@
 """The motor-drive example: its model against a fine integration, its steady state, its scores, and the simulator."""
 
-import subprocess
 import sys
 from importlib.util import find_spec
 
@@ -10,7 +9,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import heliograph as hg
-from heliograph.examples.motor_drive import compute, drive, listeners, machine
+from heliograph import cli
+from heliograph.examples.motor_drive import compute, drive, example, listeners, machine
 from heliograph.examples.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
 
 needs_simulator = pytest.mark.skipif(find_spec("gym_electric_motor") is None, reason="needs the extra motor")
@@ -57,9 +57,24 @@ def test_the_methods_have_the_orders_they_claim():
         assert np.log2(errors[0] / errors[1]) == pytest.approx(order, abs=0.06)
 
 
+def steady_state(speed: float, frequency: float, amplitude: float) -> tuple[complex, complex]:
+    """Current (A) and rotor flux (Vs) of a machine turned at `speed` (rad/s) by a voltage turning at `frequency` (Hz).
+
+    psi (1 / tau_r + j (omega_1 - p omega)) = L_m i / tau_r,  u = (R_s + j omega_1 sigma L_s) i + j omega_1 k psi.
+    """
+    omega = 2 * np.pi * frequency
+    damping = machine.ROTOR_RESISTANCE / machine.WINDING_INDUCTANCE
+    flux_of_current = damping * machine.MAIN_INDUCTANCE / (damping + 1j * (omega - POLE_PAIRS * speed))
+    impedance = machine.STATOR_RESISTANCE + 1j * omega * (
+        machine.TRANSIENT_INDUCTANCE + machine.COUPLING * flux_of_current
+    )
+    current = complex(amplitude / impedance)
+    return current, complex(flux_of_current * current)
+
+
 def test_steady_state_turns_without_changing_and_balances_power():
     speed, frequency, amplitude = 122.0, 40.0, 105.0
-    current, flux = machine.steady_state(speed, frequency, amplitude)
+    current, flux = steady_state(speed, frequency, amplitude)
     x = np.array([current.real, current.imag, flux.real, flux.imag, speed, 0.0])
     x[5] = torque = float(machine.torque(x))
     turned = 2j * np.pi * frequency * np.array([current, flux])
@@ -124,10 +139,12 @@ def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     assert not np.array_equal(found["relay_1"], listeners.received(truth, 1)["relay_1"])
 
 
-def test_a_missing_simulator_is_told_by_name(monkeypatch):
-    monkeypatch.setattr(drive, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r'gym-electric-motor: .* pip install "heliograph\[motor\]"'):
-        drive.simulate_drive()
+def test_a_missing_simulator_is_told_before_the_work_starts(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gym_electric_motor", None)
+    with pytest.raises(ModuleNotFoundError) as caught:
+        example(tmp_path / "out")
+    assert caught.value.name == "gym_electric_motor" and cli.EXTRAS[caught.value.name] == "motor"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_refuses_one_seed():
@@ -167,17 +184,10 @@ def test_the_simulator_s_speed_obeys_torque_and_load():
 def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
     found = drive.simulate_drive()
     case = compute.Case("load", found.voltages, [found.truth[:, :5]] * 2, machine.plant(Machine()))
-    record = compute.run_case(case)
+    record = compute.run_case(case, range(2))
     assert record.failures() == []
     scores = {name: compute.score(record, *name.split("/")) for name in ("fused/zero_mean", "relay_1/mean_gain")}
     # Twenty seeds give 0.223 and 4.31 with 2 % between seeds.
     assert scores["fused/zero_mean"].nees[0] == pytest.approx(0.223, rel=0.15)
     assert scores["relay_1/mean_gain"].nees[0] == pytest.approx(4.31, rel=0.15)
     assert scores["fused/zero_mean"].common["current"] < 0.2, "the seeds draw different sensors and relays"
-
-
-def test_the_command_says_what_it_needs():
-    done = subprocess.run(
-        [sys.executable, "-m", "heliograph.examples.motor_drive", "--help"], capture_output=True, text=True, check=True
-    )
-    assert "--out" in done.stdout and "--seeds" in done.stdout

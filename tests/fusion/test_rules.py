@@ -252,7 +252,7 @@ def test_a_claim_through_a_quantizer():
         (lambda: quantized(3.0), "quantizer: expected an AbstractQuantizer, got float"),
         (lambda: quantized(hg.UniformQuantizer(8, [1.0, 2.0, 3.0])), r"numbers or shape \(2,\)"),
         (
-            lambda: quantized({"a": QUANTIZER, "b": QUANTIZER, "c": hg.ZoomQuantizer(8, 1.0, 0.5, 0.1)}),
+            lambda: quantized({"a": QUANTIZER, "b": QUANTIZER, "c": hg.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)}),
             "objects of one structure",
         ),
     ],

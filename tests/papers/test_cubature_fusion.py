@@ -14,7 +14,6 @@ import pytest
 
 import heliograph as hg
 from heliograph.papers.cubature_fusion import compute, one_step, run
-from heliograph.papers.cubature_fusion.claims import claims, vacuous
 from heliograph.papers.cubature_fusion.setting import (
     NODES,
     PRINTED,
@@ -26,6 +25,7 @@ from heliograph.papers.cubature_fusion.setting import (
     plant,
     sensor,
 )  # fmt: skip
+from heliograph.papers.cubature_fusion.statements import statements, vacuous
 from heliograph.papers.cubature_fusion.variants import MixedCross, variants
 from tests import machine
 from tests.oracles import cubature_fusion as oracle
@@ -188,13 +188,13 @@ def test_the_record_is_labelled_and_agrees_with_the_statistics(result, tmp_path)
 
 
 def test_claims_follow_the_numbers(result):
-    by_text = {c.claim: c.verdict for c in claims(result)}
+    by_text = {c.text: c.verdict for c in statements(result)}
     text = "The polytope bound is one"
     assert by_text[text] == "holds"  # made up from their own claims
     polytope = {node: by_name | {"cubature_polytope": overstated(by_name["cubature_polytope"])}
                 for node, by_name in result.strong.statistics.items() if node != "fused"}  # fmt: skip
     strong = replace(result.strong, statistics=result.strong.statistics | polytope)
-    assert {c.claim: c.verdict for c in claims(replace(result, strong=strong))}[text] == "fails"
+    assert {c.text: c.verdict for c in statements(replace(result, strong=strong))}[text] == "fails"
     assert (vacuous(True, True), vacuous(True, False), vacuous(False, True)) == ("holds_vacuously", "holds", "fails")
 
 

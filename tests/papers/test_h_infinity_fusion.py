@@ -22,13 +22,14 @@ from heliograph.papers.h_infinity_fusion import (
     levels,
     losses,
     one_step,
+    published_level,
     run,
     setting,
     structured,
     violation,
     worst_disturbance,
 )
-from heliograph.papers.h_infinity_fusion.claims import claims
+from heliograph.papers.h_infinity_fusion.statements import statements
 
 RECURSIVE = example.RECURSIVE
 pytest.importorskip("cvxpy")
@@ -151,7 +152,7 @@ def test_the_growth_constant_is_false_for_differences_and_true_for_sizes():
 def test_fused_levels():
     weights = hg.level_weights(setting.LEVELS)
     np.testing.assert_allclose(weights, [0.248842, 0.278979, 0.248842, 0.223337], atol=5.1e-7)  # printed digits
-    assert hg.published_fused_level(setting.LEVELS, weights) == pytest.approx(2.539682, abs=5.1e-7)
+    assert published_level.published_fused_level(setting.LEVELS, weights) == pytest.approx(2.539682, abs=5.1e-7)
 
 
 @pytest.fixture(scope="module")
@@ -355,18 +356,20 @@ def test_every_file_is_there_and_the_record_can_be_read(folder):
 
 
 def test_claims_follow_the_numbers(result):
-    judged = claims(result)
-    assert len({c.claim for c in judged}) == len(judged)
-    assert all(c.claim and c.source and c.ours for c in judged)
-    verdict = {c.claim: c.verdict for c in judged}
+    judged = statements(result)
+    assert len({c.text for c in judged}) == len(judged)
+    assert all(c.text and c.source and c.ours for c in judged)
+    verdict = {c.text: c.verdict for c in judged}
     assert verdict["J_1 < 0 at every node"] == verdict["J_2 < 0"] == "holds_vacuously"
     assert verdict["the printed weights are optimal"] == verdict["|mu| <= u d / p"] == "fails"
     assert verdict["dynamic quantization beats static"] == "holds"
     assert verdict["(18) is E V(next) - V plus the terms of growth and level"] == "holds"
-    doubted = {c.claim: c.verdict for c in claims(replace(result, enumeration=1e-3))}
+    doubted = {c.text: c.verdict for c in statements(replace(result, enumeration=1e-3))}
     assert doubted["(18) is E V(next) - V plus the terms of growth and level"] == "fails"
     positive = replace(result.indices, local=result.indices.local | {RECURSIVE: np.ones(4)})
-    assert {c.claim: c.verdict for c in claims(replace(result, indices=positive))}["J_1 < 0 at every node"] == "fails"
+    assert {c.text: c.verdict for c in statements(replace(result, indices=positive))}[
+        "J_1 < 0 at every node"
+    ] == "fails"
 
 
 @pytest.mark.parametrize("runs", [0, 99, 100.5])

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from heliograph.papers.successive_relays import setting
-from heliograph.papers.successive_relays.claims import z_limit
 from heliograph.papers.successive_relays.printed import by_filter, recursion
 from heliograph.papers.successive_relays.run import reproduce
+from heliograph.papers.successive_relays.statements import z_limit
 from heliograph.relays.design import given_design
 from tests.oracles import successive_relays as oracle
 

@@ -118,7 +118,9 @@ LINKED = hg.Network(
         "plain": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5])),
         "static": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
         "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
-        "zoom": hg.Fusion("linear", hg.EqualIntersection(), hg.ZoomQuantizer(40, [3.0, 2.0], 0.6, 0.1)),
+        "by component": hg.Fusion(
+            "linear", hg.EqualIntersection(), hg.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
+        ),
     },
 )
 
@@ -143,7 +145,7 @@ def sent_step_by_step(fusion, record, run):
     ]
 
 
-@pytest.mark.parametrize("name", ["static", "escape", "zoom"])
+@pytest.mark.parametrize("name", ["static", "escape", "by component"])
 def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
     fusion, uplink = LINKED.fused[name], linked.uplinks[name]
     for run in (0, 5):
@@ -164,7 +166,7 @@ def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
 
 def test_links_change_nothing_else(linked, record):
     assert np.array_equal(linked.truth, record.truth) and record.uplinks == {}
-    assert list(linked.uplinks) == ["static", "escape", "zoom"]
+    assert list(linked.uplinks) == ["static", "escape", "by component"]
     for node in NETWORK.nodes:
         np.testing.assert_allclose(linked.estimates[node]["linear"].mean, record.estimates[node]["linear"].mean)
 

@@ -104,7 +104,7 @@ class Interval(AbstractUpdate):
         Raises:
             ValueError: a channel that is not a chain of scalar hops.
         """
-        return _interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
+        return interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
@@ -113,34 +113,8 @@ class Interval(AbstractUpdate):
         return young_correction(prior, signal, channel, present, self.scalars)
 
 
-class LooseInterval(AbstractUpdate):
-    """`Interval` with the squared mean added where it should be subtracted: var g <= s + q + (m - r)^2.
-
-    As published. A bound still, but of the power of g instead of its variance, so it trusts a good channel too little:
-    with a perfect channel it does not become the filter without one.
-
-    Source: cubature fusion under amplify-and-forward relays, equation (11) as printed.
-    """
-
-    scalars: Scalars | None = None
-
-    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """Worst cases from intervals.
-
-        Raises:
-            ValueError: a channel that is not a chain of scalar hops.
-        """
-        return _interval_description(channel, lambda hop: hop.second + (hop.mean - hop.mean_radius) ** 2)
-
-    def correct(
-        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
-        """Minimise the trace over K, and over the scalars unless they are fixed."""
-        return young_correction(prior, signal, channel, present, self.scalars)
-
-
-class _HopRange(NamedTuple):
-    """One hop's amplitude, E g with its radius, the largest E g^2, and noise covariance."""
+class HopRange(NamedTuple):
+    """One hop's amplitude, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
 
     amplitude: float
     mean: float
@@ -149,22 +123,28 @@ class _HopRange(NamedTuple):
     noise: np.ndarray
 
 
-def _hop_range(hop: AbstractRandomAffine) -> _HopRange:
+def _hop_range(hop: AbstractRandomAffine) -> HopRange:
     if not isinstance(hop, GainAndNoise) or not _is_scalar(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
     radius, law = (0.0, 0.0), hop.gain
     if isinstance(law, Discrete):
         radius = (float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius))
     amplitude = float(hop.matrix[0, 0])
-    return _HopRange(amplitude, law.moment(1), radius[0], law.moment(2) + radius[1], hop.noise.covariance)
+    return HopRange(amplitude, law.moment(1), radius[0], law.moment(2) + radius[1], hop.noise.covariance)
 
 
 def _is_scalar(matrix: np.ndarray) -> bool:
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 
-def _interval_description(channel: AbstractRandomAffine, variance: Callable[[_HopRange], float]) -> SecondOrder:
-    """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise."""
+def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
+    """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
+
+    `variance` says how large var g of a hop is taken to be.
+
+    Raises:
+        ValueError: a channel that is not a chain of scalar hops.
+    """
     hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
     spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
     for hop in hops:

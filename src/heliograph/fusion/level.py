@@ -12,11 +12,10 @@ from heliograph.numerics.check import array, fail, probabilities
 
 
 def level_weights(levels: Any) -> np.ndarray:
-    """Weights c_i proportional to 1 / gamma_i^2, which minimise `published_fused_level` on the simplex.
+    """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
 
-    By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. A strict matrix inequality has
-    the minimum as its infimum only, so solvers approach it without reaching it. The sharper `fused_level` is linear in
-    c: there the best single node is best.
+    By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
+    linear in c: there the best single node is best.
 
     Raises:
         ValueError: levels that are not positive.
@@ -25,17 +24,6 @@ def level_weights(levels: Any) -> np.ndarray:
     inverse = _levels(levels) ** -2.0
     result: np.ndarray = inverse / inverse.sum()
     return result
-
-
-def published_fused_level(levels: Any, weights: Any) -> float:
-    """sqrt(2 N sum c_i^2 gamma_i^2) for N filters, as published; it exceeds every local level where those are alike.
-
-    Raises:
-        ValueError: levels that are not positive, weights off the simplex or not as many.
-    Source: H-infinity quantized fusion over amplify-and-forward relays, equation (33).
-    """
-    gamma, c = _levels_and_weights(levels, weights)
-    return float(np.sqrt(2 * len(gamma) * np.sum((c * gamma) ** 2)))
 
 
 def fused_level(levels: Any, weights: Any) -> float:

@@ -91,46 +91,6 @@ class UniformQuantizer(AbstractQuantizer):
         return weakest([claim, "upper"])
 
 
-class ZoomQuantizer(AbstractQuantizer):
-    """A uniform quantizer whose amplitude follows the square of what it is given: d+ = decay d + growth x^2.
-
-    As published: driven by the unquantized x, which a fusion centre does not know, so nobody there can decode it; and d
-    saturates for every constant |x| below (1 - decay) / (growth scale), since it tends to growth x^2 / (1 - decay).
-    `EscapeQuantizer` has neither fault.
-
-    Raises:
-        ValueError: fewer than two levels, amplitude or scale not positive, decay outside (0, 1), negative growth.
-    Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10) to (13).
-    """
-
-    levels: np.ndarray
-    amplitude: np.ndarray
-    decay: np.ndarray
-    growth: np.ndarray
-    scale: np.ndarray
-
-    def __init__(self, levels: int, amplitude: Any, decay: Any, growth: Any, scale: Any = 1.0):
-        self.levels = _levels(levels)
-        self.amplitude, self.scale = _positive("amplitude", amplitude), _positive("scale", scale)
-        self.decay, self.growth = _decay(decay), _growth(growth)
-
-    @in_float64
-    def init(self, n: int) -> jax.Array:
-        """The first amplitude (n,)."""
-        return jnp.broadcast_to(jnp.asarray(self.amplitude), (n,))
-
-    @in_float64
-    def step(self, state: Any, value: Any) -> tuple[Any, Quantized]:
-        """Quantize with the present amplitude; the next one follows x."""
-        x = jnp.asarray(value, dtype=float)
-        following = jnp.where(jnp.isfinite(x), self.decay * state + self.growth * x**2, state)
-        return following, _published(x, state, self.levels, self.scale)
-
-    def claim(self, claim: Claim) -> Claim:
-        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
-        return weakest([claim, "nominal"])
-
-
 class Symbols(NamedTuple):
     """What goes over the link: how many escapes, then the segment from 0; -1 says that there is no number.
 

@@ -4,6 +4,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol
 
 import rich.console
 import rich.progress
@@ -11,24 +12,35 @@ import rich.progress
 LINE_EVERY = 60.0  # seconds between lines, where stderr is no terminal
 
 
-@contextmanager
-def progress(total: int) -> Iterator[Callable[[str], None]]:
-    """A progress bar on stderr; the callable says what begins, and counts what was begun before as done."""
-    columns = (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.TimeElapsedColumn(),
-    )
-    console = rich.console.Console(stderr=True)
-    hidden = not console.is_terminal
-    with rich.progress.Progress(*columns, console=console, transient=True, disable=hidden) as shown:
-        task = shown.add_task("starting", total=total)
-        begun = 0
+class Advance(Protocol):
+    """Hears what begins, or how much of what began is done."""
 
-        def advance(what: str) -> None:
-            nonlocal begun
-            shown.update(task, description=what, completed=begun)
-            begun += 1
+    def __call__(self, what: str, done: int = 0, total: int = 0) -> None:
+        """`done` of `total`, where that can be said."""
+
+
+@contextmanager
+def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
+    """A bar on stderr with what is being done, gone at the end; nothing where stderr is no terminal."""
+    console = rich.console.Console(stderr=True)
+    columns = rich.progress.TextColumn("{task.description}"), rich.progress.BarColumn(), *more
+    with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        yield bar
+
+
+@contextmanager
+def progress(stages: int) -> Iterator[Advance]:
+    """A progress bar over stages of work; a new name begins the next stage, and those before it are done."""
+    with _bar(rich.progress.TimeElapsedColumn()) as bar:
+        task = bar.add_task("starting", total=stages)
+        stage, begun = "", 0
+
+        def advance(what: str, done: int = 0, total: int = 0) -> None:
+            nonlocal stage, begun
+            if what != stage:
+                stage, begun = what, begun + 1
+            shown = f"{what}: {done:,} of {total:,}" if total else what
+            bar.update(task, description=shown, completed=begun - 1 + (done / total if total else 0))
 
         yield advance
 
@@ -78,23 +90,20 @@ def counting(countdown: Countdown) -> Iterator[Callable[[str, int, int], None]]:
     The callable takes what is being done, how much of it is done and how much there is; the countdown hears of it from
     whoever knows what counts as a piece.
     """
-    console = rich.console.Console(stderr=True)
     columns = (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
         rich.progress.MofNCompleteColumn(),
         rich.progress.TimeElapsedColumn(),
         rich.progress.TextColumn("{task.fields[left]}"),
     )
     said = time.monotonic()
-    with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with _bar(*columns) as bar:
         task = bar.add_task("starting", total=1, left="")
 
         def tell(what: str, done: int, total: int) -> None:
             nonlocal said
             left = "" if countdown.first is None else spoken(countdown.left(total))
             bar.update(task, description=what, completed=done, total=total, left=left)
-            if not console.is_terminal and time.monotonic() - said >= LINE_EVERY:
+            if not bar.console.is_terminal and time.monotonic() - said >= LINE_EVERY:
                 said = time.monotonic()
                 print(f"{what}: {done} of {total}{left and ', '}{left}", file=sys.stderr)
 

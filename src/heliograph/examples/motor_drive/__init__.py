@@ -1,4 +1,3 @@
-"""An induction machine simulated by gym-electric-motor; its currents reach flux and speed filters through relays.
+"""Flux and speed of an induction machine that gym-electric-motor simulates, its currents heard through relays."""
 
-Run it with `python -m heliograph.examples.motor_drive --out out` (extras `motor` and `report`).
-"""
+from heliograph.examples.motor_drive.run import example as example

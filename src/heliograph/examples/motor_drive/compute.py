@@ -80,12 +80,14 @@ CASES = {
     "load_as_state": "load; the filters estimate its torque as a sixth state",
 }
 
+STAGES = len(TRUSTS) * len(CASES)
 
-def cases(trust: float, seeds: int) -> list[Case]:
+
+def cases(trust: float, seeds: range) -> list[Case]:
     """One departure at a time, then all that can occur together, then a cure for the greatest."""
     free, loaded, dead = simulate_drive(loaded=False), simulate_drive(), simulate_drive(dead_time=DEAD_TIME)
     right, wrong = plant(Machine(), trust=trust), plant(Machine(WRONG_RESISTANCE), trust=trust)
-    own = [_draw_truth(right, loaded.voltages, seed) for seed in range(seeds)]
+    own = [_draw_truth(right, loaded.voltages, seed) for seed in seeds]
     found = [Case("own_model", loaded.voltages, own, right)]
     for name, drive, model in (
         ("no_load", free, right),
@@ -97,7 +99,7 @@ def cases(trust: float, seeds: int) -> list[Case]:
         ("load_as_state", loaded, plant(Machine(), load_is_state=True, trust=trust)),
     ):
         truth = drive.truth[:, : len(model.states)]
-        found.append(Case(name, drive.voltages, [truth] * seeds, model))
+        found.append(Case(name, drive.voltages, [truth] * len(seeds), model))
     return found
 
 
@@ -106,10 +108,11 @@ def _draw_truth(model: hg.Plant, voltages: np.ndarray, seed: Any) -> Any:
     return draw_truth(model, voltages, jax.random.key(seed))
 
 
-def run_case(case: Case) -> hg.Record:
+def run_case(case: Case, seeds: range) -> hg.Record:
     """Run every filter on what each seed's sensors and channels make of the truth; a leading axis of seeds."""
     listeners = network(case.model)
-    records = [hg.run(listeners, received(truth, seed), case.voltages) for seed, truth in enumerate(case.truths)]
+    draws = zip(seeds, case.truths, strict=True)
+    records = [hg.run(listeners, received(truth, seed), case.voltages) for seed, truth in draws]
     estimates = jax.tree.map(lambda *parts: np.stack(parts), *[record.estimates for record in records])
     return replace(records[0], truth=np.stack(case.truths), measurements={}, estimates=estimates)
 
@@ -144,26 +147,26 @@ def _mean_and_interval(values: np.ndarray) -> tuple[float, float, float]:
     return mean, mean - width, mean + width
 
 
-def compute(seeds: int = SEEDS, advance: Callable[[str], None] = lambda what: None) -> Outcome:
-    """Run all cases at both levels of trust; `advance` is told what begins.
+def compute(count: int, seed: int = 0, advance: Callable[[str], None] = lambda what: None) -> Outcome:
+    """Run all cases at both levels of trust with `count` seeds from `seed` on; `advance` is told what begins.
 
     Raises:
         ValueError: fewer than 2 seeds.
         ModuleNotFoundError: the extra `motor` is not installed.
     """
-    if check_count("seeds", seeds) < 2:
-        raise fail("seeds", "at least 2", seeds)
+    if check_count("seeds", count) < 2:
+        raise fail("seeds", "at least 2", count)
     scores: dict[str, dict[str, dict[str, Score]]] = {}
     shown: dict[str, dict[str, np.ndarray]] = {}
-    failures = []
+    failures, seeds = [], range(seed, seed + count)
     for level, trust in TRUSTS.items():
         scores[level] = {}
         for case in cases(trust, seeds):
             advance(f"process noise {level}: {CASES[case.name]}")
-            record = run_case(case)
+            record = run_case(case, seeds)
             failures += [f"{level}, {case.name}: {line}" for line in record.failures()]
             names = [(node, name) for node, filters in record.estimates.items() for name in filters]
             scores[level][case.name] = {f"{node}/{name}": score(record, node, name) for node, name in names}
             if case.name == "load":
                 shown[level] = {f"{n}/{f}": np.asarray(record.estimates[n][f].mean[0]) * RATED[:5] for n, f in names}
-    return Outcome(seeds, simulate_drive(), scores, shown, failures)
+    return Outcome(count, simulate_drive(), scores, shown, failures)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -100,9 +99,4 @@ def simulator() -> Any:
     Raises:
         ModuleNotFoundError: the extra `motor` is not installed.
     """
-    if find_spec("gym_electric_motor") is None:
-        raise ModuleNotFoundError(
-            'gym-electric-motor: expected to be installed, got no such package: pip install "heliograph[motor]"',
-            name="gym_electric_motor",
-        )
     return import_module("gym_electric_motor.physical_systems")

@@ -108,19 +108,6 @@ def plant(machine: Machine, load_is_state: bool = False, trust: float = 1.0) -> 
     return hg.Plant(machine, covariances[0], np.zeros(n), covariances[1], STATES[:n], INPUTS)
 
 
-def steady_state(speed: float, frequency: float, amplitude: float) -> tuple[complex, complex]:
-    """Current (A) and rotor flux (Vs) of a machine turned at `speed` (rad/s) by a voltage turning at `frequency` (Hz).
-
-    psi (1 / tau_r + j (omega_1 - p omega)) = L_m i / tau_r,  u = (R_s + j omega_1 sigma L_s) i + j omega_1 k psi.
-    """
-    omega = 2 * np.pi * frequency
-    damping = ROTOR_RESISTANCE / WINDING_INDUCTANCE
-    flux_of_current = damping * MAIN_INDUCTANCE / (damping + 1j * (omega - POLE_PAIRS * speed))
-    impedance = STATOR_RESISTANCE + 1j * omega * (TRANSIENT_INDUCTANCE + COUPLING * flux_of_current)
-    current = complex(amplitude / impedance)
-    return current, complex(flux_of_current * current)
-
-
 def draw_truth(model: hg.Plant, voltages: np.ndarray, key: Any) -> Any:
     """One trajectory of the filters' own model with its process noise, (steps, n) per unit."""
 

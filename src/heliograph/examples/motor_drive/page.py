@@ -127,7 +127,7 @@ def motor_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
             f"{nees['own_model']} on truth drawn from its own model, {nees['load']} on the simulator, "
             f"{nees['dead_time']} if the inverter has a dead time of 2 µs, and {nees['euler']} with Euler's rule."
         ),
-        sections=[_result(outcome, drawings), _why(outcome, drawings), _origin(), _limits(outcome), _rerun(outcome)],
+        sections=[_result(outcome, drawings), _why(outcome, drawings), _origin(), _limits(outcome), _rerun()],
         footer="Simulator: gym-electric-motor, its squirrel-cage induction motor with default parameters.",
     )
 
@@ -212,6 +212,6 @@ def _limits(outcome: Outcome) -> Section:
     return Section("What to keep in mind", blocks)
 
 
-def _rerun(outcome: Outcome) -> Section:
-    command = f"python -m heliograph.examples.motor_drive --out out --seeds {outcome.seeds}"
+def _rerun() -> Section:
+    command = "heliograph example motor-drive --out out"
     return Section("Run it again", [Code(command), Text(["Beside this page: `summary.json` and the figures."])])

@@ -1,6 +1,6 @@
 """The Monte Carlo runs behind every number of the reproduction."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,14 +20,15 @@ from heliograph.papers.cubature_fusion.setting import (
     sensor,
 )
 from heliograph.papers.cubature_fusion.variants import variants
+from heliograph.report.progress import Advance
 
 SIGNIFICANT = 3.0  # standard errors: an excess smaller than this may be sampling
 
 RUNS = 5_000  # what the judgement of the worst direction needs
+STAGES = 5  # as `reproduction` tells them
 EARLY, EARLY_FACTOR = 3, 20  # first steps, where fused bounds overstate themselves by little, with 20 times the runs
 
 Statistics = dict[str, dict[str, hg.ErrorStatistics]]
-Tell = Callable[[str, int, int], None]  # what, runs done, runs in all
 
 
 @dataclass(frozen=True)
@@ -134,7 +135,7 @@ def _assemble(
     return hg.Network(plant(s), nodes, fused)
 
 
-def reproduction(runs: int, seed: int, tell: Tell) -> Reproduction:
+def reproduction(runs: int, seed: int, tell: Advance) -> Reproduction:
     """Run everything; `tell` hears how many runs of what are done."""
     printed, strong = (
         outcome(s, {"filters": network(s), "literal readings": literal_network(s)}, s.horizon, runs, seed, tell)
@@ -144,7 +145,7 @@ def reproduction(runs: int, seed: int, tell: Tell) -> Reproduction:
     return Reproduction(printed, strong, outcome(STRONG, first, EARLY, EARLY_FACTOR * runs, seed, tell), runs, seed)
 
 
-def outcome(s: Setting, networks: dict[str, hg.Network], horizon: int, runs: int, seed: int, tell: Tell) -> Outcome:
+def outcome(s: Setting, networks: dict[str, hg.Network], horizon: int, runs: int, seed: int, tell: Advance) -> Outcome:
     """Run a scenario's networks on the same data, and one run in full."""
     statistics: Statistics = {}
     for what, item in networks.items():

@@ -3,17 +3,17 @@
 import numpy as np
 
 import heliograph as hg
-from heliograph.papers.claim import Claim, holds
 from heliograph.papers.cubature_fusion import one_step
 from heliograph.papers.cubature_fusion.compute import SIGNIFICANT, Outcome, Reproduction
 from heliograph.papers.cubature_fusion.setting import B4, B6, K1, NODES, PRINTED, STRONG, H, Setting
+from heliograph.papers.statement import Statement, holds
 from heliograph.random_affine import Discrete
 
 DRAWS = 100_000  # of the uniform Delta: their spread is known to a third of a percent
 
 
-def errata(result: Reproduction) -> list[Claim]:
-    """Every erratum: the claim is that the formula is right as printed."""
+def errata(result: Reproduction) -> list[Statement]:
+    """Every erratum: the statement is that the formula is right as printed."""
     return [
         _sign(result), _raw_minus(), _cross(result), _one_symbol(result), _raw_everywhere(result), _root(result),
         _fusion(result), _relay_energy(), _process_noise(result), _offset(result), _prediction(), _uncertainty(result),
@@ -38,7 +38,7 @@ def change(outcome: Outcome, name: str, reference: str) -> float:
     return 100 * (outcome.pooled(name).rmse()[0] / outcome.pooled(reference).rmse()[0] - 1)
 
 
-def _sign(result: Reproduction) -> Claim:
+def _sign(result: Reproduction) -> Statement:
     terms = [[one_step.box_terms(one_step.channel_of(s), sign).V for sign in (1, -1)] for s in (PRINTED, STRONG)]
     excess = [100 * one_step.perfect_channel_excess(s) for s in (PRINTED, STRONG)]
     strong, printed = result.strong, result.printed
@@ -55,10 +55,10 @@ def _sign(result: Reproduction) -> Claim:
         f"{rmse(strong, 'cubature_tight')}"
     )
     paper = "plus (ξ₁ − κ₁)²; the note on this paper: perfect channel +66 %"
-    return Claim("The variance bounds of ξ and γ add the squared mean", "(11), (19), (20)", paper, ours, "fails")
+    return Statement("The variance bounds of ξ and γ add the squared mean", "(11), (19), (20)", paper, ours, "fails")
 
 
-def _raw_minus() -> Claim:
+def _raw_minus() -> Statement:
     law = Discrete([0.0, 1.0], [1.0, 0.0], 0.9)
     raw, right = (one_step.variance_bound(law, sign) for sign in (0, -1))
     actual = max(p * (1 - p) for p in np.linspace(0, 0.9, 901))
@@ -66,12 +66,12 @@ def _raw_minus() -> Claim:
         f"ξ in {{0, 1}}, p = (1, 0), radius 0.9: the minus alone gives {raw:.2f}, but a variance of {actual:.2f} is "
         f"possible; with the positive part of |ξ₁| − κ₁ the bound is {right:.2f}"
     )
-    return Claim(
+    return Statement(
         "A minus sign alone repairs (19)", "step behind (19)", "(ξ₁ + Δ)² ≥ (ξ₁ − κ₁)²", ours, holds(raw >= actual)
     )
 
 
-def _cross(result: Reproduction) -> Claim:
+def _cross(result: Reproduction) -> Statement:
     right = one_step.innovation(PRINTED, hg.Cubature()).Pxy
     error = 100 * np.max(np.abs(one_step.mixed_cross(PRINTED) - right)) / np.max(np.abs(right))
     strong = result.strong
@@ -80,20 +80,22 @@ def _cross(result: Reproduction) -> Claim:
         f"over claimed covariance {ratio(strong, 'mixed_cross')}, RMSE {rmse(strong, 'mixed_cross')} against "
         f"{rmse(strong, 'cubature_polytope_fixed')} with redrawn points on both sides"
     )
-    return Claim("P^xy from propagated points and outputs of redrawn ones", "Algorithm 1, Step 3", "", ours, "fails")
+    return Statement(
+        "P^xy from propagated points and outputs of redrawn ones", "Algorithm 1, Step 3", "", ours, "fails"
+    )
 
 
-def _one_symbol(result: Reproduction) -> Claim:
+def _one_symbol(result: Reproduction) -> Statement:
     strong = result.strong
     ours = (
         "Y = E[yy′] belongs to the terms of the gains, the covariance of the innovation to the (1 + β₂) term. With the "
         f"covariance everywhere (polytope bound, strong): actual over claimed {ratio(strong, 'central_moment')}, RMSE "
         f"{rmse(strong, 'central_moment')} against {rmse(strong, 'cubature_polytope_fixed')}"
     )
-    return Claim("One symbol P^yy serves both moments", "(10), Steps 3 and 4", "defined twice", ours, "fails")
+    return Statement("One symbol P^yy serves both moments", "(10), Steps 3 and 4", "defined twice", ours, "fails")
 
 
-def _raw_everywhere(result: Reproduction) -> Claim:
+def _raw_everywhere(result: Reproduction) -> Statement:
     strong = result.strong
     traces = [strong.pooled(name).mean_trace() for name in ("raw_moment", "cubature_polytope_fixed")]
     ours = (
@@ -101,12 +103,12 @@ def _raw_everywhere(result: Reproduction) -> Claim:
         f"{rmse(strong, 'raw_moment')}, actual over claimed {ratio(strong, 'raw_moment')}"
     )
     worst = strong.pooled("raw_moment").worst_direction()
-    return Claim(
+    return Statement(
         "The other reading, E[yy′] everywhere, is a bound", "(10), Step 4", "", ours, holds(worst.z <= SIGNIFICANT)
     )
 
 
-def _root(result: Reproduction) -> Claim:
+def _root(result: Reproduction) -> Statement:
     factors = [s.mean_gain**-0.5 for s in (PRINTED, STRONG)]
     changes = [change(o, "step_four_gain", "cubature_printed_fixed") for o in result.outcomes]
     ours = (
@@ -114,27 +116,27 @@ def _root(result: Reproduction) -> Claim:
         f"large and (31) no longer belongs to it. RMSE {changes[0]:+.1f} % (printed), {changes[1]:+.1f} % (strong)"
     )
     paper = "α√(E ξ̄ γ̄); the note on this paper: RMSE changes by at most 1.3 %"
-    return Claim("The gain of Step 4 is that of Theorem 2", "Step 4 against (29)", paper, ours, "fails")
+    return Statement("The gain of Step 4 is that of Theorem 2", "Step 4 against (29)", paper, ours, "fails")
 
 
-def _fusion(result: Reproduction) -> Claim:
+def _fusion(result: Reproduction) -> Statement:
     local = [result.printed.shown.estimates[node]["cubature_printed_fixed"] for node in NODES]
     means, bounds = (np.stack([np.asarray(getattr(e, a))[0] for e in local], axis=1) for a in ("mean", "covariance"))
     error = one_step.printed_fusion_error(means, bounds)
     ours = f"ΞΣw Ξᵢ⁻¹x̂ᵢ, as in (8); the printed inverse is off by up to {error:.1e} in a run of the printed example"
-    return Claim("The fused estimate is Ξ⁻¹ Σ w Ξᵢ⁻¹ x̂ᵢ", "Step 6", "", ours, "fails")
+    return Statement("The fused estimate is Ξ⁻¹ Σ w Ξᵢ⁻¹ x̂ᵢ", "Step 6", "", ours, "fails")
 
 
-def _relay_energy() -> Claim:
+def _relay_energy() -> Statement:
     s = PRINTED
     ours = (
         f"The relay's noise passes the second hop alone: α²Eʳ, as in (17). With Eᵢ = EˡEʳ its power would be "
         f"{s.sensor_power:g} of what it is. Also (27), (28): λ̄ for λ̌"
     )
-    return Claim("The relay noise enters with energy Eᵢ", "(16), sixth term", "E{α²Eᵢξ²Kmm′K′}", ours, "fails")
+    return Statement("The relay noise enters with energy Eᵢ", "(16), sixth term", "E{α²Eᵢξ²Kmm′K′}", ours, "fails")
 
 
-def _process_noise(result: Reproduction) -> Claim:
+def _process_noise(result: Reproduction) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()[9]
     gap = one_step.predicted(PRINTED, hg.Linearization(), claimed)[1]
     ours = (
@@ -142,10 +144,10 @@ def _process_noise(result: Reproduction) -> Claim:
         f"trace at "
         "s = 10 (printed example)"
     )
-    return Claim("The cross terms of the prediction hold e e′", "(37)", "", ours, "fails")
+    return Statement("The cross terms of the prediction hold e e′", "(37)", "", ours, "fails")
 
 
-def _offset(result: Reproduction) -> Claim:
+def _offset(result: Reproduction) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()
     gaps = []
     for rule in (hg.Cubature(), hg.PolynomialMoments(2)):
@@ -159,10 +161,10 @@ def _offset(result: Reproduction) -> Claim:
         f"part is up to {size.max():.3f} long (s = {size.argmax() + 2}), the exact mean to {same:.0e}; (35) has no "
         f"place for it"
     )
-    return Claim("x⁻ = f(x̂) up to what acts on e", "(35)", "", ours, "fails")
+    return Statement("x⁻ = f(x̂) up to what acts on e", "(35)", "", ours, "fails")
 
 
-def _prediction() -> Claim:
+def _prediction() -> Statement:
     exact = one_step.predicted(PRINTED, hg.PolynomialMoments(2))[1]
     least = np.linalg.eigvalsh(one_step.predicted(PRINTED, hg.Cubature())[1] - exact)[0]
     start = PRINTED.claimed_initial_variance
@@ -170,10 +172,12 @@ def _prediction() -> Claim:
         f"Theorem 1 needs P̂⁻ ≥ P⁻. At Ξ = {start:g} I the cubature rule misses the products of two states: the least "
         f"eigenvalue of P̂⁻ minus the Gaussian covariance is {least:.4f} = −h²Ξ²; exact moments have none"
     )
-    return Claim("The cubature covariance may stand for P⁻ in Theorem 1", "Algorithm 1", "", ours, holds(least >= 0))
+    return Statement(
+        "The cubature covariance may stand for P⁻ in Theorem 1", "Algorithm 1", "", ours, holds(least >= 0)
+    )
 
 
-def _uncertainty(result: Reproduction) -> Claim:
+def _uncertainty(result: Reproduction) -> Statement:
     delta = np.random.default_rng(result.seed).uniform(-0.01, 0.01, (DRAWS, 3))
     miss = np.mean(np.abs(delta.sum(axis=1)))
     marginal = np.max(np.abs(delta.mean(axis=0)))
@@ -183,26 +187,26 @@ def _uncertainty(result: Reproduction) -> Claim:
         f"run uses "
         "the nominal law"
     )
-    return Claim("The Δ are independent, uniform on ±0.01", "Section IV", "three at a time", ours, "fails")
+    return Statement("The Δ are independent, uniform on ±0.01", "Section IV", "three at a time", ours, "fails")
 
 
-def _whiteness() -> Claim:
+def _whiteness() -> Statement:
     value = one_step.correlation_term()
     ours = f"Needs ξ and γ white in time, which is not assumed: with a constant ξ it is {value:+.3f} K E x²"
-    return Claim("𝔖₄ and 𝔖₅ vanish", "below (16)", "", ours, holds(value == 0))
+    return Statement("𝔖₄ and 𝔖₅ vanish", "below (16)", "", ours, holds(value == 0))
 
 
-def _units(result: Reproduction) -> Claim:
+def _units(result: Reproduction) -> Statement:
     o = result.printed
     trace, error = o.claimed_trace("cubature_printed_fixed"), o.rmse("cubature_printed_fixed")
     ours = (
         f"An RMSE compares with √trace. Mean over nodes and steps: RMSE {error.mean():.3f}, √trace "
         f"{np.sqrt(trace).mean():.3f}, trace {trace.mean():.3f}"
     )
-    return Claim("RMSE and trace are drawn as one quantity", "Fig. 7", "", ours, "fails")
+    return Statement("RMSE and trace are drawn as one quantity", "Fig. 7", "", ours, "fails")
 
 
-def _horizon() -> Claim:
+def _horizon() -> Statement:
     s: Setting = PRINTED
     drift = H * B6 * s.torque
     reach = np.sqrt(1 - (1 + H * B4) ** 2) / H  # |1 + h b4 + i h (k1 - x5)| < 1
@@ -212,4 +216,4 @@ def _horizon() -> Claim:
         f"makes the "
         "Euler step of the rotor unstable: 40 steps are possible, 100 are not"
     )
-    return Claim("The example's state stays bounded", "Section IV, implied", "", ours, "fails")
+    return Statement("The example's state stays bounded", "Section IV, implied", "", ours, "fails")

@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
-from heliograph.papers.claim import Claim
-from heliograph.papers.cubature_fusion.claims import NOTE, OURS, REACH, THEOREM
 from heliograph.papers.cubature_fusion.compute import Outcome, Reproduction
 from heliograph.papers.cubature_fusion.pictures import COLOURS, label
 from heliograph.papers.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
+from heliograph.papers.cubature_fusion.statements import NOTE, OURS, REACH, THEOREM
+from heliograph.papers.statement import Statement
 from heliograph.report.page import Block, Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 HEADERS = ("filter", "RMSE", "mean trace", "worst ratio", "z")
@@ -14,7 +14,7 @@ VERDICTS = {"holds": "holds", "holds_vacuously": "vacuous", "fails": "fails"}
 LITERAL = ("step_four_gain", "mixed_cross", "central_moment", "raw_moment")
 
 
-def page(result: Reproduction, claims: Sequence[Claim], pictures: Mapping[str, bytes]) -> Page:
+def page(result: Reproduction, statements: Sequence[Statement], pictures: Mapping[str, bytes]) -> Page:
     """The report; `pictures` holds each figure as SVG."""
     strong = result.strong
     names = ("cubature_printed_fixed", "cubature_polytope", "ci_equal", "mean_gain")
@@ -35,7 +35,7 @@ def page(result: Reproduction, claims: Sequence[Claim], pictures: Mapping[str, b
             _table(strong, "All filters, strong scenario"),
             _table(result.printed, "All filters, printed example"),
             *_figures(result, pictures),
-            *_claims(claims),
+            *_statements(statements),
             _notes(result),
             Section("Run it again", [_command(result)]),
         ],
@@ -121,24 +121,24 @@ def _figures(result: Reproduction, pictures: Mapping[str, bytes]) -> list[Sectio
     ]
 
 
-def _claims(claims: Sequence[Claim]) -> list[Section]:
+def _statements(statements: Sequence[Statement]) -> list[Section]:
     text = (
-        "Each claim is judged by the runs of this report or by a computation of one step made for it. **Vacuous**: "
+        "Each statement is judged by the runs of this report or by a computation of one step made for it. **Vacuous**: "
         "true, but so it would be without any measurement, or its premise is never met."
     )
-    paper = [c for c in claims if c.source.startswith(THEOREM)]
-    found = [c for c in claims if c.source in (NOTE, OURS)]
-    rest = [c for c in claims if c not in paper and c not in found]
+    paper = [c for c in statements if c.source.startswith(THEOREM)]
+    found = [c for c in statements if c.source in (NOTE, OURS)]
+    rest = [c for c in statements if c not in paper and c not in found]
     return [
-        Section("What the paper claims", [Text([text]), _table_of(paper)]),
+        Section("What the paper states", [Text([text]), _table_of(paper)]),
         Section("What else was found", [_table_of(found)]),
-        Section("Errata: what is printed, taken as a claim", [_table_of(rest)]),
+        Section("Errata: what is printed, taken as a statement", [_table_of(rest)]),
     ]
 
 
-def _table_of(claims: Sequence[Claim]) -> Table:
-    rows = [[VERDICTS[c.verdict], f"**{c.claim}** [{c.source}]. {c.ours}."] for c in claims]
-    return Table(["verdict", "claim, and what is found here"], rows, wordy=True)
+def _table_of(statements: Sequence[Statement]) -> Table:
+    rows = [[VERDICTS[c.verdict], f"**{c.text}** [{c.source}]. {c.ours}."] for c in statements]
+    return Table(["verdict", "statement, and what is found here"], rows, wordy=True)
 
 
 def _notes(result: Reproduction) -> Section:

@@ -1,71 +1,50 @@
 """`reproduce`: the paper's example and the strong scenario as summary, record, figures and report."""
 
-import json
-from collections.abc import Iterator
-from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rich.console
-import rich.progress
 
 import heliograph as hg
-from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
-from heliograph.papers.claim import Claim
-from heliograph.papers.cubature_fusion.claims import claims
-from heliograph.papers.cubature_fusion.compute import RUNS, Outcome, Reproduction, Tell, reproduction
+from heliograph.papers.cubature_fusion.compute import RUNS, STAGES, Outcome, Reproduction, reproduction
 from heliograph.papers.cubature_fusion.setting import NODES, STATES
-
-SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
-FOLDER = "cubature-fusion"
-FEWEST = 10  # runs: with fewer a standard error means nothing
+from heliograph.papers.cubature_fusion.statements import statements
+from heliograph.papers.runs import check_runs
+from heliograph.papers.statement import Statement
+from heliograph.report.results import Results, write_results
 
 
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     """Reproduce the paper's example and write summary, record, figures and report to `out`/cubature-fusion.
 
-    `runs` Monte Carlo runs (5,000 unless given) of every filter in both scenarios, on the same data. The folder appears
-    whole or not at all, in place of an earlier reproduction's.
+    `runs` Monte Carlo runs (5,000 unless given) of every filter in both scenarios, on the same data.
 
     Raises:
         ValueError: fewer than 10 runs, a folder that cannot be written or that holds something else.
         ModuleNotFoundError: an extra of `report`, `sweep` is not installed.
     """
-    import h5netcdf  # noqa: F401  a missing extra is told before the work starts
-    import jinja2  # noqa: F401
-    import matplotlib  # noqa: F401
-    import xarray  # noqa: F401
-
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < FEWEST:
-        raise fail("runs", f"a whole number of at least {FEWEST}", count)
-    target = Path(out) / FOLDER
-    check_replaceable(target, SUMMARY)
-    with progress() as tell, whole_folder(target) as folder:
-        result = reproduction(count, seed, tell)
-        tell("judging and drawing", 0, 1)
-        write(result, folder)
+    count = check_runs(runs, RUNS, 10)  # with fewer a standard error means nothing
+    work = partial(reproduction, count, seed)
+    write_results(Path(out) / "cubature-fusion", STAGES, work, results, ("xarray", "h5netcdf"))
 
 
-def write(result: Reproduction, folder: Path) -> None:
-    """Write everything into an empty folder."""
+def results(found: Reproduction) -> Results:
+    """Everything that the folder holds."""
     from heliograph.papers.cubature_fusion.page import page
     from heliograph.papers.cubature_fusion.pictures import drawings
-    from heliograph.report.figures import png, svg
 
-    judged, vectors = claims(result), {}
-    for name, figure in drawings(result).items():
-        (folder / f"{name}.png").write_bytes(png(figure))
-        vectors[name] = svg(figure)
-    (folder / "report.html").write_text(page(result, judged, vectors).html(), encoding="utf-8")
-    write_record(result, folder / "record.nc")
-    (folder / SUMMARY).write_text(json.dumps(summary(result, judged), indent=2) + "\n", encoding="utf-8")
+    judged = statements(found)
+    return Results(
+        drawings(found),
+        partial(page, found, judged),
+        summary(found, judged),
+        lambda folder: write_record(found, folder / "record.nc"),
+    )
 
 
-def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
-    """All numbers: by scenario and filter, of the nodes together, and the claims."""
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
+    """All numbers: by scenario and filter, of the nodes together, and the statements."""
     return {
         "paper": "Cubature Kalman fusion filtering under amplify-and-forward relays with randomly varying channel "
         "parameters",
@@ -74,7 +53,7 @@ def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
         "rmse_is": "root of the mean over runs, nodes and steps 1..T of the squared error summed over the state",
         "scenarios": {o.setting.name: scenario(o) for o in result.outcomes},
         "strong_first_steps": {"runs": result.early.runs, "steps": result.early.steps, **scenario(result.early)},
-        "claims": [claim._asdict() for claim in judged],
+        "claims": [each.entry() for each in judged],
     }
 
 
@@ -145,22 +124,3 @@ def _over_time(statistics: list[hg.ErrorStatistics]) -> dict[str, np.ndarray]:
         "mean_squared_error": np.diagonal(actual, axis1=-2, axis2=-1),
         "claimed_variance": np.diagonal(claimed, axis1=-2, axis2=-1),
     }
-
-
-@contextmanager
-def progress() -> Iterator[Tell]:
-    """A progress bar on stderr: what is run, and how many of its runs are done; compiling shows as none done."""
-    columns = (
-        rich.progress.TextColumn("{task.description}"),
-        rich.progress.BarColumn(),
-        rich.progress.MofNCompleteColumn(),
-        rich.progress.TimeElapsedColumn(),
-    )
-    console = rich.console.Console(stderr=True)
-    with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as shown:
-        task = shown.add_task("starting", total=1)
-
-        def tell(what: str, done: int, total: int) -> None:
-            shown.update(task, description=what, completed=done, total=total)
-
-        yield tell

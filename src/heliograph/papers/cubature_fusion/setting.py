@@ -13,6 +13,7 @@ import heliograph as hg
 from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.transform import AbstractTransform
 from heliograph.filters.update import AbstractUpdate
+from heliograph.papers.cubature_fusion.loose_interval import LooseInterval
 
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2", "x3", "x4", "x5")
@@ -146,15 +147,15 @@ def filters(s: Setting, node: int) -> dict[str, hg.AbstractFilter]:
         "open_loop": hg.open_loop_filter(parts[0], *start),
         "mean_gain": hg.mean_gain_filter(*parts, *start),
         "extended_polytope": cubature(s, node, hg.Polytope(), hg.Linearization()),
-        "cubature_printed": cubature(s, node, hg.LooseInterval()),
+        "cubature_printed": cubature(s, node, LooseInterval()),
         "cubature_tight": cubature(s, node, hg.Interval()),
         "cubature_polytope": cubature(s, node, hg.Polytope()),
         "cubature_zero_mean": cubature(s, node, hg.ZeroMean()),
         "extended_polytope_fixed": cubature(s, node, hg.Polytope(fixed), hg.Linearization()),
-        "cubature_printed_fixed": cubature(s, node, hg.LooseInterval(fixed)),
+        "cubature_printed_fixed": cubature(s, node, LooseInterval(fixed)),
         "cubature_tight_fixed": cubature(s, node, hg.Interval(fixed)),
         "cubature_polytope_fixed": cubature(s, node, hg.Polytope(fixed)),
         "cubature_zero_mean_fixed": cubature(s, node, hg.ZeroMean(FIXED_ZERO_MEAN_SCALAR)),
-        "extended_printed_fixed": cubature(s, node, hg.LooseInterval(fixed), hg.Linearization()),
-        "exact_moments_printed_fixed": cubature(s, node, hg.LooseInterval(fixed), hg.PolynomialMoments(2)),
+        "extended_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.Linearization()),
+        "exact_moments_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.PolynomialMoments(2)),
     }

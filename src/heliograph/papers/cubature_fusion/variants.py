@@ -15,20 +15,26 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import cholesky
+from heliograph.papers.cubature_fusion.loose_interval import LooseInterval
 from heliograph.papers.cubature_fusion.setting import Setting, cubature
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import SecondOrder
 
 
-class StepFourGain(AbstractUpdate):
-    """The gain of Step 4, sqrt(mu) where Theorem 2 has mu: larger by `factor` = 1 / sqrt(mu). The bound stays (31)."""
+class AbstractReading(AbstractUpdate):
+    """Another reading of the step in which `update` corrects; it describes the channel as that does."""
 
     update: AbstractUpdate
-    factor: float
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
         """As the update within."""
         return self.update.describe(channel)
+
+
+class StepFourGain(AbstractReading):
+    """The gain of Step 4, sqrt(mu) where Theorem 2 has mu: larger by `factor` = 1 / sqrt(mu). The bound stays (31)."""
+
+    factor: float
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
@@ -38,14 +44,8 @@ class StepFourGain(AbstractUpdate):
         return self.factor * gain, bound
 
 
-class CentralMoment(AbstractUpdate):
+class CentralMoment(AbstractReading):
     """The one symbol P^yy of (10) and Step 4 read as the covariance of the innovation in every term."""
-
-    update: AbstractUpdate
-
-    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """As the update within."""
-        return self.update.describe(channel)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
@@ -54,14 +54,8 @@ class CentralMoment(AbstractUpdate):
         return self.update.correct(prior, signal._replace(second=signal.covariance), channel, present)
 
 
-class RawMoment(AbstractUpdate):
+class RawMoment(AbstractReading):
     """The one symbol P^yy read as E[y y'] in every term."""
-
-    update: AbstractUpdate
-
-    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
-        """As the update within."""
-        return self.update.describe(channel)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
@@ -103,7 +97,7 @@ class MixedCross(AbstractFilter):
 
 def variants(s: Setting, node: int) -> dict[str, AbstractFilter]:
     """The literal readings of one node, all with the scenario's fixed scalars."""
-    printed, polytope = (rule(hg.Scalars(*s.beta)) for rule in (hg.LooseInterval, hg.Polytope))
+    printed, polytope = (rule(hg.Scalars(*s.beta)) for rule in (LooseInterval, hg.Polytope))
     return {
         "step_four_gain": cubature(s, node, StepFourGain(printed, s.mean_gain**-0.5)),
         "mixed_cross": MixedCross(base=cubature(s, node, polytope), claim="nominal"),

@@ -27,11 +27,12 @@ from heliograph.papers.h_infinity_fusion.levels import (
     true_growth,
 )
 from heliograph.papers.h_infinity_fusion.one_step import enumeration_gap
+from heliograph.papers.h_infinity_fusion.published_level import published_fused_level
 from heliograph.papers.h_infinity_fusion.violation import violation
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
 
 RUNS = 4_000
-STAGES = 7  # as `reproduction` tells them, and one for drawing
+STAGES = 6  # as `reproduction` tells them
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Reproduction:
     @property
     def fused_level(self) -> float:
         """The smallest level that Theorem 4 can give, in closed form."""
-        return hg.published_fused_level(setting.LEVELS, hg.level_weights(setting.LEVELS))
+        return published_fused_level(setting.LEVELS, hg.level_weights(setting.LEVELS))
 
     @property
     def minkowski(self) -> float:
@@ -65,7 +66,7 @@ class Reproduction:
         """sqrt(2 N sum c^2 gamma^2) for the printed weights, which sum to 0.9999."""
         c = np.array(setting.PAPER_WEIGHTS)
         scale = float(c.sum())
-        return hg.published_fused_level(setting.LEVELS, c / scale) * (1.0 if normalised else scale)
+        return published_fused_level(setting.LEVELS, c / scale) * (1.0 if normalised else scale)
 
     def difference(self, quantizer: str, other: str) -> tuple[float, float, float]:
         """Mean over runs of the difference of fused errors, its standard error, and the share of runs below 0."""

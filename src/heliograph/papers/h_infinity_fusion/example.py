@@ -10,11 +10,12 @@ from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.prediction import prediction_of
 from heliograph.fusion.quantizer import Quantizer
 from heliograph.papers.h_infinity_fusion import setting
+from heliograph.papers.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
 QUANTIZERS: dict[str, Quantizer | None] = {
     "none": None,
-    "dynamic": hg.ZoomQuantizer(setting.SEGMENTS, setting.AMPLITUDE, setting.DECAY, setting.ZOOM),
+    "dynamic": ZoomQuantizer(setting.SEGMENTS, setting.AMPLITUDE, setting.DECAY, setting.ZOOM),
     "static": hg.UniformQuantizer(setting.SEGMENTS, setting.AMPLITUDE),
 }
 MORE_QUANTIZERS: dict[str, Quantizer | None] = {

@@ -7,6 +7,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.example import QUANTIZERS, RECURSIVE, Outcome, fused_name
+from heliograph.papers.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
 
 V = float(np.sum(setting.DISTURBANCES**2))
 RHO = float(np.sum(setting.CHANNEL_NOISES**2))
@@ -75,7 +76,7 @@ def _allowance(amplitude: np.ndarray) -> np.ndarray:
 def replay(outcome: Outcome) -> Replayed:
     """The quantizer again, since a record keeps neither amplitudes nor errors of single nodes."""
     quantizer, estimates = QUANTIZERS["dynamic"], outcome.estimates(RECURSIVE)
-    assert isinstance(quantizer, hg.ZoomQuantizer)
+    assert isinstance(quantizer, ZoomQuantizer)
     d, amplitude, error, astray = np.full_like(estimates[:, :, 0], setting.AMPLITUDE), [], [], 0.0
     own = d
     for s in range(setting.STEPS):

@@ -4,17 +4,17 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from heliograph.papers.claim import Claim
 from heliograph.papers.h_infinity_fusion import setting, structured
 from heliograph.papers.h_infinity_fusion.compute import Reproduction
 from heliograph.papers.h_infinity_fusion.discriminating import NODE
 from heliograph.papers.h_infinity_fusion.example import RECURSIVE, Outcome
 from heliograph.papers.h_infinity_fusion.pictures import COLOURS, LABELS, LINKS
+from heliograph.papers.statement import Statement
 from heliograph.report.figures import BLUE, GREEN, VERMILION
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 
-def page(result: Reproduction, claims: Sequence[Claim], pictures: Mapping[str, bytes]) -> Page:
+def page(result: Reproduction, statements: Sequence[Statement], pictures: Mapping[str, bytes]) -> Page:
     """The report; `pictures` holds each figure as SVG."""
     second, node = result.discriminating, result.nodes[0]
     kalman = second.worst["ekf_statistics"].level
@@ -35,7 +35,7 @@ def page(result: Reproduction, claims: Sequence[Claim], pictures: Mapping[str, b
             _errors(result, pictures),
             *_figures(pictures),
             _second(result, pictures),
-            _claims(claims),
+            _statements(statements),
             _notes(result),
             Section("Run it again", [Code(
                 f"heliograph reproduce h-infinity-fusion --out out --runs {result.outcome.runs} --seed {result.seed}"
@@ -188,9 +188,9 @@ def _second(result: Reproduction, pictures: Mapping[str, bytes]) -> Section:
     ])  # fmt: skip
 
 
-def _claims(claims: Sequence[Claim]) -> Section:
-    rows = [[c.verdict.replace("_", " "), f"**{c.claim}** [{c.source}]. {c.ours}."] for c in claims]
-    return Section("Claims", [Table(["verdict", "claim, and what is found here"], rows, wordy=True)])
+def _statements(statements: Sequence[Statement]) -> Section:
+    rows = [[c.verdict.replace("_", " "), f"**{c.text}** [{c.source}]. {c.ours}."] for c in statements]
+    return Section("Statements", [Table(["verdict", "statement, and what is found here"], rows, wordy=True)])
 
 
 def _notes(result: Reproduction) -> Section:

@@ -1,74 +1,55 @@
 """`reproduce`: Section IV's example and one that tells filters apart, as summary, record, figures and report."""
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import heliograph as hg
-from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
-from heliograph.papers.claim import Claim
 from heliograph.papers.h_infinity_fusion import setting
-from heliograph.papers.h_infinity_fusion.claims import claims
 from heliograph.papers.h_infinity_fusion.compute import RUNS, STAGES, Reproduction, reproduction
 from heliograph.papers.h_infinity_fusion.discriminating import NODE, Discriminating
 from heliograph.papers.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZERS, RECURSIVE, Outcome, fused_name
 from heliograph.papers.h_infinity_fusion.levels import NodeDesigns
+from heliograph.papers.h_infinity_fusion.statements import statements
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
-from heliograph.report.progress import progress
-
-SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
-FOLDER = "h-infinity-fusion"
+from heliograph.papers.runs import check_runs
+from heliograph.papers.statement import Statement
+from heliograph.report.results import Results, write_results
 
 
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     """Reproduce the paper's example and write summary, record, figures and report to `out`/h-infinity-fusion.
 
-    `runs` Monte Carlo runs (4,000 unless given) of every filter and quantizer. The folder appears whole or not at all,
-    in place of an earlier reproduction's.
+    `runs` Monte Carlo runs (4,000 unless given) of every filter and quantizer.
 
     Raises:
         ValueError: fewer than 100 runs (standard errors mean little), a folder that cannot be written or that holds
             something else.
         ModuleNotFoundError: an extra of `lmi`, `report`, `sweep` is not installed.
     """
-    import clarabel  # noqa: F401  a missing extra is told before the work starts
-    import cvxpy  # noqa: F401
-    import h5netcdf  # noqa: F401
-    import jinja2  # noqa: F401
-    import matplotlib  # noqa: F401
-    import xarray  # noqa: F401
-
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
-    target = Path(out) / FOLDER
-    check_replaceable(target, SUMMARY)
-    with progress(STAGES) as advance, whole_folder(target) as folder:
-        result = reproduction(count, seed, advance)
-        advance("judging and drawing")
-        write(result, folder)
+    count = check_runs(runs, RUNS, 100)
+    work = partial(reproduction, count, seed)
+    needs = ("clarabel", "cvxpy", "xarray", "h5netcdf")
+    write_results(Path(out) / "h-infinity-fusion", STAGES, work, results, needs)
 
 
-def write(result: Reproduction, folder: Path) -> None:
-    """Write everything into an empty folder."""
+def results(found: Reproduction) -> Results:
+    """Everything that the folder holds."""
     from heliograph.papers.h_infinity_fusion.page import page
     from heliograph.papers.h_infinity_fusion.pictures import drawings
-    from heliograph.report.figures import png, svg
 
-    judged, vectors = claims(result), {}
-    for name, figure in drawings(result).items():
-        vectors[name] = svg(figure)
-        (folder / f"{name}.png").write_bytes(png(figure))
-        (folder / f"{name}.svg").write_bytes(vectors[name])
-    (folder / "report.html").write_text(page(result, judged, vectors).html(), encoding="utf-8")
-    write_record(result, folder / "record.nc")
-    (folder / SUMMARY).write_text(json.dumps(summary(result, judged), indent=2) + "\n", encoding="utf-8")
+    judged = statements(found)
+    return Results(
+        drawings(found),
+        partial(page, found, judged),
+        summary(found, judged),
+        lambda folder: write_record(found, folder / "record.nc"),
+    )
 
 
-def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
     """All numbers."""
     outcome = result.outcome
     decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
@@ -104,7 +85,7 @@ def summary(result: Reproduction, judged: list[Claim]) -> dict[str, Any]:
             "node": setting.NODES[0], "guaranteed": result.nodes[0].horizon.level, **found(result.broken)
         },
         "discriminating": second_numbers(result.discriminating),
-        "claims": [claim._asdict() for claim in judged],
+        "claims": [each.entry() for each in judged],
     }  # fmt: skip
 
 

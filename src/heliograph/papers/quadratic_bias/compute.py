@@ -12,7 +12,6 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.mixture import mixture_filter
 from heliograph.filters.polynomial import MemoryFilter, PolynomialFilter
 from heliograph.filters.scheduled import ScheduledFilter
-from heliograph.linear.bounded import Boundedness, boundedness
 from heliograph.linear.comparison import skewness
 from heliograph.linear.lift import lifted_system
 from heliograph.linear.memory import memory_system
@@ -23,6 +22,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.papers.quadratic_bias import setting
+from heliograph.papers.quadratic_bias.bounds import Boundedness, boundedness
 from heliograph.papers.quadratic_bias.printed import Printed, printed_quadratic
 from heliograph.simulation.network import Network, Node
 from heliograph.simulation.record import AbstractReducer, Record, trajectories_record

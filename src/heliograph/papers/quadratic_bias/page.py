@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
     CLAIMED,
     NODE,
@@ -17,6 +16,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
     simulated_over_time,
 )
+from heliograph.papers.quadratic_bias.statements import statements
 from heliograph.report.curves import Panel, curves_over_time
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -88,8 +88,14 @@ def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
             f"{gain_percent(example, 'cubic')[0]:.1f} % less in x1. The filter as printed is not quite that filter: "
             f"with outages it can be {true:.0f} % worse than the linear one while claiming {-claimed:.0f} % better."
         ),
-        sections=[_result(result), *_figures(result, pictures), _scenario(outage, pictures), _claims(result), _notes(),
-                  _rerun(result, runs)],
+        sections=[
+            _result(result),
+            *_figures(result, pictures),
+            _scenario(outage, pictures),
+            _statements(result),
+            _notes(),
+            _rerun(result, runs),
+        ],
         footer="Every number is in summary.json; covariances, mean squared errors and the run are in record.nc.",
     )  # fmt: skip
 
@@ -168,9 +174,9 @@ def _scenario(outage: Outcome, pictures: Mapping[str, bytes]) -> Section:
     )  # fmt: skip
 
 
-def _claims(result: Reproduction) -> Section:
-    rows = [[c.claim, c.source, c.ours, c.verdict.replace("_", " ")] for c in claims(result)]
-    return Section("Claims", [Table(["claim", "source", "found here", "verdict"], rows)])
+def _statements(result: Reproduction) -> Section:
+    rows = [[c.text, c.source, c.ours, c.verdict.replace("_", " ")] for c in statements(result)]
+    return Section("Statements", [Table(["statement", "source", "found here", "verdict"], rows)])
 
 
 def _notes() -> Section:

@@ -1,14 +1,11 @@
 """`reproduce`: Section 4's example and our scenario as summary, record, figures and report."""
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
-from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
     RUNS,
@@ -20,45 +17,35 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
     simulated_over_time,
 )
-from heliograph.report.progress import progress
+from heliograph.papers.quadratic_bias.statements import statements
+from heliograph.papers.runs import check_runs
+from heliograph.report.results import Results, write_results
 
-SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
-FOLDER = "quadratic-bias"
-STAGES = 6
+STAGES = 5
 
 
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     """Reproduce the paper's example and write summary, record, figures and report to `out`/quadratic-bias.
 
-    `runs` Monte Carlo runs (20,000 unless given) of every filter, on the same data. The folder appears whole or not
-    at all, in place of an earlier reproduction's.
+    `runs` Monte Carlo runs (20,000 unless given) of every filter, on the same data.
 
     Raises:
         ValueError: fewer than 100 runs (standard errors come from batches of runs), a folder that cannot be written
             or that holds something else.
         ModuleNotFoundError: an extra of `report`, `sweep` is not installed.
     """
-    import xarray  # noqa: F401  a missing extra is told before the work starts
+    count = check_runs(runs, RUNS, 100)
+    work = partial(compute, count, seed)
+    write_results(Path(out) / "quadratic-bias", STAGES, work, results, ("xarray", "h5netcdf"))
 
+
+def results(found: Reproduction) -> Results:
+    """Everything that the folder holds."""
     from heliograph.papers.quadratic_bias.page import drawings, page
-    from heliograph.report.figures import png, svg
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
-    target = Path(out) / FOLDER
-    check_replaceable(target, SUMMARY)
-    with progress(STAGES) as advance, whole_folder(target) as folder:
-        result = compute(count, seed, advance)
-        advance("drawing and writing")
-        figures = {name: (png(figure), svg(figure)) for name, figure in drawings(result).items()}
-        for name, (pixels, vectors) in figures.items():
-            (folder / f"{name}.png").write_bytes(pixels)
-            (folder / f"{name}.svg").write_bytes(vectors)
-        html = page(result, {name: vectors for name, (_, vectors) in figures.items()}).html()
-        (folder / "report.html").write_text(html, encoding="utf-8")
-        write_record(result, folder / "record.nc")
-        (folder / SUMMARY).write_text(json.dumps(summary(result), indent=2) + "\n", encoding="utf-8")
+    return Results(
+        drawings(found), partial(page, found), summary(found), lambda folder: write_record(found, folder / "record.nc")
+    )
 
 
 def summary(result: Reproduction) -> dict[str, Any]:
@@ -71,7 +58,7 @@ def summary(result: Reproduction) -> dict[str, Any]:
         "gain_percent_is": "100 (1 - ratio of the means of the error variances) against the linear filter",
         **numbers(result.example),
         "outage": numbers(result.outage),
-        "claims": [claim._asdict() for claim in claims(result)],
+        "claims": [each.entry() for each in statements(result)],
     }
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.papers.successive_relays import setting
+from heliograph.papers.successive_relays.certificate import RelayCertificate, certify_relays
 from heliograph.papers.successive_relays.printed import MISPRINTS, by_filter, recursion
 
 RUNS = 20_000
@@ -49,11 +50,11 @@ class Reproduction(NamedTuple):
     best_behind: np.ndarray
     steady: dict[str, Steady]
     limits: dict[str, float]
-    certificates: dict[str, hg.RelayCertificate]
+    certificates: dict[str, RelayCertificate]
     misprints: dict[str, Misprinted]
     simulated: Simulated
     run: hg.Record
-    counterexample: hg.RelayCertificate
+    counterexample: RelayCertificate
 
 
 def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = lambda what: None) -> Reproduction:
@@ -67,7 +68,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     advance("designing the steady state")
     states = steady(network)
     advance("certificates and misprints")
-    certificates = {"paper": hg.certify_relays(network, paper.gains), "tuned": hg.certify_relays(network, tuned.gains)}
+    certificates = {"paper": certify_relays(network, paper.gains), "tuned": certify_relays(network, tuned.gains)}
     wrong = {name: misprinted(name) for name in MISPRINTS}
     advance("simulating")
     simulated = simulate(network, paper, runs, seed)
@@ -165,7 +166,7 @@ def simulate(network: hg.RelayNetwork, design: hg.RelayDesign, runs: int, seed: 
     return Simulated(mean, error)
 
 
-def counterexample() -> hg.RelayCertificate:
+def counterexample() -> RelayCertificate:
     """A scalar system that is bounded as Lemmas 8 and 9 ask, and obeys none of their printed lower bounds."""
     plant = hg.LinearPlant([[0.5]], [[1.0]], [0.0], [[10.0]])
     law = setting.shadowing(0.5, 0.1)
@@ -175,4 +176,4 @@ def counterexample() -> hg.RelayCertificate:
         {"relay_1": {"sensor": noisy, "relay_2": quiet}, "receiver": {"relay_2": noisy}},
     ]
     network = hg.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
-    return hg.certify_relays(network, hg.own_error_design(network, 60).gains)
+    return certify_relays(network, hg.own_error_design(network, 60).gains)

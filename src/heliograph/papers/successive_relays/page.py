@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from heliograph.papers.successive_relays import setting
-from heliograph.papers.successive_relays.claims import claims, tuned_mean_ratio, worst_z, z_limit
 from heliograph.papers.successive_relays.compute import FILTERS, Reproduction
+from heliograph.papers.successive_relays.statements import statements, tuned_mean_ratio, worst_z, z_limit
 from heliograph.report.curves import Panel, curves_over_time
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -80,7 +80,7 @@ def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
             f"{100 * (1 - ratio):.0f} % less error on average over 100 steps, and {100 * (1 - quiet):.0f} % less while "
             "sending at no step more power."
         ),
-        sections=[_result(result), _figures(pictures), _steady(result), _power(result), _claims(result),
+        sections=[_result(result), _figures(pictures), _steady(result), _power(result), _statements(result),
                   _certificate(result), _notes(), _rerun(result)],
         footer=(
             "Paper: H. Tan, B. Shen, Q. Li, H. Liu, Recursive filtering for stochastic systems with filter-and-forward "
@@ -156,10 +156,10 @@ def _power(result: Reproduction) -> Section:
     return Section("Over the horizon", [Table(headers, rows, caption)])
 
 
-def _claims(result: Reproduction) -> Section:
-    rows = [[c.claim, c.source, c.paper, c.ours, c.verdict.replace("_", " ")] for c in claims(result)]
-    headers = ["claim", "where", "paper", "here", "verdict"]
-    return Section("Claims", [Table(headers, rows, "Misprints are claims that fail.", wordy=True)])
+def _statements(result: Reproduction) -> Section:
+    rows = [[c.text, c.source, c.paper, c.ours, c.verdict.replace("_", " ")] for c in statements(result)]
+    headers = ["statement", "where", "paper", "here", "verdict"]
+    return Section("Statements", [Table(headers, rows, "Misprints are statements that fail.", wordy=True)])
 
 
 def _certificate(result: Reproduction) -> Section:

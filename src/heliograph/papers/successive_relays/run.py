@@ -1,22 +1,19 @@
 """`reproduce`: Section IV's circuit as summary, record, figures and report."""
 
-import json
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import heliograph as hg
-from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.files.recording import write_estimates
-from heliograph.numerics.check import fail
-from heliograph.papers.successive_relays.claims import claims, tuned_mean_ratio
+from heliograph.papers.runs import check_runs
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
-from heliograph.report.progress import progress
+from heliograph.papers.successive_relays.statements import statements, tuned_mean_ratio
+from heliograph.report.results import Results, write_results
 
-SUMMARY = "summary.json"  # also tells an earlier reproduction from other folders
-FOLDER = "successive-relays"
-STAGES = 5
+STAGES = 4
 NAMES = {"relay_1": "relay_1", "relay_2": "relay_2", "receiver": "remote"}
 STEADY = ("paper", "joint", "lmmse", "lmmse_tuned", "no_relay")
 
@@ -24,34 +21,23 @@ STEADY = ("paper", "joint", "lmmse", "lmmse_tuned", "no_relay")
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     """Reproduce the paper's example and write summary, record, figures and report to `out`/successive-relays.
 
-    `runs` Monte Carlo runs (20,000 unless given). The folder appears whole or not at all, in place of an earlier
-    reproduction's. The record is `record.csv`, the run of Figs 2 to 4, with each filter's claimed covariance, and
-    `gains.npz`, the design.
+    `runs` Monte Carlo runs (20,000 unless given). The record is `record.csv`, the run of Figs 2 to 4, with each
+    filter's claimed covariance, and `gains.npz`, the design.
 
     Raises:
         ValueError: fewer than 100 runs (standard errors come from batches of runs), a folder that cannot be written
             or that holds something else.
         ModuleNotFoundError: an extra of `report` is not installed.
     """
-    from heliograph.papers.successive_relays.page import drawings, page
-    from heliograph.report.figures import png, svg
+    count = check_runs(runs, RUNS, 100)
+    write_results(Path(out) / "successive-relays", STAGES, partial(compute, count, seed), results)
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
-    target = Path(out) / FOLDER
-    check_replaceable(target, SUMMARY)
-    with progress(STAGES) as advance, whole_folder(target) as folder:
-        result = compute(count, seed, advance)
-        advance("drawing and writing")
-        figures = {name: (png(figure), svg(figure)) for name, figure in drawings(result).items()}
-        for name, (pixels, vectors) in figures.items():
-            (folder / f"{name}.png").write_bytes(pixels)
-            (folder / f"{name}.svg").write_bytes(vectors)
-        html = page(result, {name: vectors for name, (_, vectors) in figures.items()}).html()
-        (folder / "report.html").write_text(html, encoding="utf-8")
-        write_record(result, folder)
-        (folder / SUMMARY).write_text(json.dumps(summary(result), indent=2) + "\n", encoding="utf-8")
+
+def results(found: Reproduction) -> Results:
+    """Everything that the folder holds."""
+    from heliograph.papers.successive_relays.page import drawings, page
+
+    return Results(drawings(found), partial(page, found), summary(found), partial(write_record, found))
 
 
 def summary(result: Reproduction) -> dict[str, Any]:
@@ -65,7 +51,7 @@ def summary(result: Reproduction) -> dict[str, Any]:
         },
         "steady": {name: {"even": result.steady[name].even, "odd": result.steady[name].odd} for name in STEADY},
         "tuned_mean_ratio": tuned_mean_ratio(result),
-        "claims": [claim._asdict() for claim in claims(result)],
+        "claims": [each.entry() for each in statements(result)],
     }
 
 

@@ -1,4 +1,4 @@
-"""One judged claim of a publication."""
+"""One statement of a publication, judged."""
 
 from typing import Literal, NamedTuple
 
@@ -7,17 +7,21 @@ import numpy as np
 Verdict = Literal["holds", "holds_vacuously", "fails"]
 
 
-class Claim(NamedTuple):
-    """A claim, where it is made, what it says there in numbers, what is found here, and the verdict.
+class Statement(NamedTuple):
+    """What a publication states, where, what it says there in numbers, what is found here, and the verdict.
 
     "holds_vacuously": true, but so it would be without any measurement, or its premise is never met.
     """
 
-    claim: str
+    text: str
     source: str
     paper: str
     ours: str
     verdict: Verdict
+
+    def entry(self) -> dict[str, str]:
+        """As it stands in a summary, which calls a statement a claim."""
+        return {"claim": self.text, **{name: value for name, value in self._asdict().items() if name != "text"}}
 
 
 def holds(condition: bool | np.bool | None) -> Verdict:

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.examples import plaza
-from heliograph.examples.plaza_recording import PlazaRecording
+from heliograph.examples.demo import robot
+from heliograph.examples.demo.recording import PlazaRecording
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.model.channel import hop, perfect
 from heliograph.model.estimate import Estimate
@@ -89,18 +89,18 @@ def average_noise(path: AbstractRandomAffine, signals: np.ndarray) -> float:
 
 def networks(extra_variance: float) -> Network:
     """The example's node with one more competitor, and a node that hears the ranges without any relay."""
-    node, count = plaza.network.nodes["robot"], len(plaza.BEACONS)
-    extra = cubature_filter(plaza.plant, plaza.sensor, hop(1.0, extra_variance, dimension=count))
-    direct = cubature_filter(plaza.plant, plaza.sensor, perfect(count))
+    node, count = robot.network.nodes["robot"], len(robot.BEACONS)
+    extra = cubature_filter(robot.plant, robot.sensor, hop(1.0, extra_variance, dimension=count))
+    direct = cubature_filter(robot.plant, robot.sensor, perfect(count))
     relayed = Node(node.sensor, node.channel, node.filters | {"extra_noise": extra})
     return Network(
-        plaza.plant, {"robot": relayed, "direct": Node(plaza.sensor, perfect(count), {"perfect_channel": direct})}
+        robot.plant, {"robot": relayed, "direct": Node(robot.sensor, perfect(count), {"perfect_channel": direct})}
     )
 
 
 def one_trial(recording: PlazaRecording, network: Network, seed: int) -> Trial:
     """Draw the relay, run every filter, and score it."""
-    received = relay(plaza.channel, recording.ranges, seed)
+    received = relay(robot.channel, recording.ranges, seed)
     measurements = {"robot": received, "direct": recording.ranges}
     record = run(network, measurements, recording.odometry, recording.time)
     if failures := record.failures():
@@ -129,7 +129,7 @@ def score(estimate: Estimate, truth: np.ndarray) -> Score:
 
 def compute(recording: PlazaRecording, seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
     """Run the trials of SEEDS seeds; `advance` is told what begins."""
-    extra_variance = average_noise(plaza.relay, recording.ranges)
+    extra_variance = average_noise(robot.relay, recording.ranges)
     network, trials = networks(extra_variance), []
     for s in range(seed, seed + SEEDS):
         advance(f"relay and filters, seed {s}")

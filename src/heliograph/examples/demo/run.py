@@ -1,69 +1,61 @@
-"""The demonstration's command: compute, draw, write a folder that appears whole, print a table."""
+"""The demonstration as a folder of results, and its table on the terminal."""
 
-import json
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from textwrap import fill
 from typing import Any
 
 import rich.box
 import rich.console
-import rich.progress
 import rich.table
 
-from heliograph.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
-from heliograph.examples import plaza
-from heliograph.examples.plaza_recording import read_recording
-from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.examples.demo import robot
+from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
+from heliograph.examples.demo.recording import find_recording, read_recording
 from heliograph.files.recording import write_estimates
 from heliograph.files.table import write_table
-from heliograph.report.progress import progress
+from heliograph.report.progress import Advance
+from heliograph.report.results import Results, write_results
 from heliograph.simulation.record import Record
 
-SUMMARY = "summary.json"  # also tells an earlier demonstration from other folders
+NAME = "demo"
+STAGES = SEEDS + 1  # of reading and computing
 
 
-def run_demo(out: Path, seed: int = 0) -> None:
+def example(out: Path, seed: int = 0) -> None:
     """Run the demonstration, print its table, and write estimates, figures, report and summary to `out`/demo.
-
-    The folder appears whole or not at all, in place of an earlier demonstration's.
 
     Raises:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: an extra of `recordings`, `report`, `tables` is not installed.
     """
-    import pyarrow  # noqa: F401  a missing extra is told before the work starts
+    find_recording()  # a missing extra is told before the work starts
 
-    from heliograph.demo.page import demo_figures, demo_page
-    from heliograph.report.figures import png, svg
-
-    target = Path(out) / "demo"
-    check_replaceable(target, SUMMARY)
-    with progress(SEEDS + 3) as advance, whole_folder(target) as folder:
+    def work(advance: Advance) -> Outcome:
         advance("reading the recording")
-        outcome = compute(read_recording(), seed, advance)
-        advance("drawing")
-        figures = demo_figures(outcome)
-        drawings = {name: svg(figure) for name, figure in figures.items()}
-        for name, figure in figures.items():
-            (folder / f"{name}.png").write_bytes(png(figure))
-            (folder / f"{name}.svg").write_bytes(drawings[name])
-        advance("writing")
-        (folder / "report.html").write_text(demo_page(outcome, drawings).html(), encoding="utf-8")
-        write_data(outcome, folder)
-    print_table(outcome, target)
+        return compute(read_recording(), seed, advance)
+
+    target = Path(out) / NAME
+    print_table(write_results(target, STAGES, work, results, ("pyarrow",)), target)
+
+
+def results(outcome: Outcome) -> Results:
+    """Everything that the folder holds."""
+    from heliograph.examples.demo.page import demo_figures, demo_page
+
+    return Results(demo_figures(outcome), partial(demo_page, outcome), summary(outcome), partial(write_data, outcome))
 
 
 def write_data(outcome: Outcome, folder: Path) -> None:
-    """Write what arrived with the odometry, all estimates of the first seed, and the summary."""
+    """Write what arrived with the odometry, and all estimates of the first seed."""
     trial, recording = outcome.trials[0], outcome.recording
     columns = {"time": recording.time}
-    columns |= dict(zip(plaza.plant.inputs, recording.odometry.T, strict=True))
-    columns |= dict(zip(plaza.sensor.outputs, trial.received.T, strict=True))
+    columns |= dict(zip(robot.plant.inputs, recording.odometry.T, strict=True))
+    columns |= dict(zip(robot.sensor.outputs, trial.received.T, strict=True))
     write_table(columns, folder / "measurements.csv")
-    record = Record(recording.time, plaza.plant.states, None, {}, {"robot": trial.estimates})
+    record = Record(recording.time, robot.plant.states, None, {}, {"robot": trial.estimates})
     write_estimates(record, folder / "estimates.parquet")
-    (folder / SUMMARY).write_text(json.dumps(summary(outcome), indent=2) + "\n", encoding="utf-8")
 
 
 def summary(outcome: Outcome) -> dict[str, Any]:

@@ -5,9 +5,9 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
-from heliograph.examples import plaza
-from heliograph.examples.plaza_recording import WINDOW
+from heliograph.examples.demo import robot
+from heliograph.examples.demo.calibration import WINDOW
+from heliograph.examples.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
 from heliograph.report.figures import (
     BLUE,
     GREEN,
@@ -170,13 +170,13 @@ def _constants(outcome: Outcome) -> Section:
     rows = [
         [
             "gyro rate at rest",
-            f"{plaza.GYRO_RATE:.3e} rad/s",
+            f"{robot.GYRO_RATE:.3e} rad/s",
             "mean reading before the first movement, without the truth",
         ],
-        ["range scale", f"{plaza.RANGE_SCALE:.4f}", "ranges on true distances, regression through the origin"],
-        ["range variance", f"{plaza.RANGE_VARIANCE:.4f} m²", "mean squared residual of that regression"],
-        ["position walk", f"{plaza.POSITION_WALK:.2e} m²/m", "odometry along the true headings against the truth"],
-        ["heading walk", f"{plaza.HEADING_WALK:.2e} rad²/s", "gyro less its rate at rest, against the true turn"],
+        ["range scale", f"{robot.RANGE_SCALE:.4f}", "ranges on true distances, regression through the origin"],
+        ["range variance", f"{robot.RANGE_VARIANCE:.4f} m²", "mean squared residual of that regression"],
+        ["position walk", f"{robot.POSITION_WALK:.2e} m²/m", "odometry along the true headings against the truth"],
+        ["heading walk", f"{robot.HEADING_WALK:.2e} rad²/s", "gyro less its rate at rest, against the true turn"],
     ]
     text = (
         f"Both walks match the mean square drift over windows of {WINDOW} rows (22.6 s): the odometry's errors are "
@@ -212,7 +212,7 @@ def _rerun(outcome: Outcome) -> Section:
     commands = (
         f"heliograph demo --out out --seed {seed}\n\n"
         "# the same filters on the relayed ranges, as you would run your own network\n"
-        "heliograph run heliograph.examples.plaza \\\n"
+        "heliograph run heliograph.examples.demo.robot \\\n"
         "    --measurements out/demo/measurements.csv --out estimates.csv"
     )
     text = (

@@ -1,17 +1,10 @@
 import numpy as np
 import pytest
 
-from heliograph.examples import plaza_recording
-from heliograph.examples import plaza
-from heliograph.examples.plaza_recording import (
-    WINDOW,
-    PlazaRecording,
-    calibrate,
-    calibrate_odometry,
-    calibrate_ranges,
-    find_recording,
-    read_recording,
-)
+from heliograph.examples.demo import recording as recording_module
+from heliograph.examples.demo import robot
+from heliograph.examples.demo.calibration import WINDOW, calibrate, calibrate_odometry, calibrate_ranges
+from heliograph.examples.demo.recording import PlazaRecording, find_recording, read_recording
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +36,13 @@ def test_odometry_belongs_to_the_truth_of_its_row(recording: PlazaRecording) -> 
 def test_constants_of_the_example_are_what_the_recording_gives(recording: PlazaRecording) -> None:
     got = calibrate(recording)
     # Half a unit in the last digit printed in the example.
-    assert got.gyro_rate == pytest.approx(plaza.GYRO_RATE, abs=0.5e-6)
-    assert got.range_scale == pytest.approx(plaza.RANGE_SCALE, abs=0.5e-5)
-    assert got.range_variance == pytest.approx(plaza.RANGE_VARIANCE, abs=0.5e-5)
-    assert got.position_walk == pytest.approx(plaza.POSITION_WALK, abs=0.5e-7)
-    assert got.heading_walk == pytest.approx(plaza.HEADING_WALK, abs=0.5e-9)
-    np.testing.assert_allclose(plaza.BEACONS, recording.beacons, atol=0.5e-3)
-    np.testing.assert_allclose(plaza.START, recording.start_pose, atol=0.5e-3)
+    assert got.gyro_rate == pytest.approx(robot.GYRO_RATE, abs=0.5e-6)
+    assert got.range_scale == pytest.approx(robot.RANGE_SCALE, abs=0.5e-5)
+    assert got.range_variance == pytest.approx(robot.RANGE_VARIANCE, abs=0.5e-5)
+    assert got.position_walk == pytest.approx(robot.POSITION_WALK, abs=0.5e-7)
+    assert got.heading_walk == pytest.approx(robot.HEADING_WALK, abs=0.5e-9)
+    np.testing.assert_allclose(robot.BEACONS, recording.beacons, atol=0.5e-3)
+    np.testing.assert_allclose(robot.START, recording.start_pose, atol=0.5e-3)
 
 
 def synthetic(rows: int, seed: int) -> PlazaRecording:
@@ -85,7 +78,7 @@ def test_a_beginning_keeps_the_start(recording: PlazaRecording) -> None:
 
 
 def test_missing_extra_is_one_line_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plaza_recording, "find_spec", lambda name: None)
+    monkeypatch.setattr(recording_module, "find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match=r"heliograph\[recordings\]") as caught:
         find_recording()
     assert caught.value.name == "gtsam"

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.demo import compute as compute_module
-from heliograph.demo import run
-from heliograph.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
-from heliograph.demo.run import run_demo
-from heliograph.examples import plaza
-from heliograph.examples.plaza_recording import PlazaRecording, read_recording
+from heliograph.examples.demo import compute as compute_module
+from heliograph.examples.demo import robot, run
+from heliograph.examples.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
+from heliograph.examples.demo.recording import PlazaRecording, read_recording
 from heliograph.files.recording import read_recording as read_measurements
 from heliograph.model.estimate import Estimate
 
@@ -31,7 +29,7 @@ def folder(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "new" / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "compute", lambda *_: outcome)  # computed once for all tests
-        run_demo(out)
+        run.example(out)
     assert [p.name for p in out.iterdir()] == ["demo"]  # nothing temporary is left beside it
     return out / "demo"
 
@@ -45,19 +43,19 @@ def cubature_oracle(
         spread = np.sqrt(3) * np.linalg.cholesky(p).T
         return np.asarray(x + np.vstack([spread, -spread]))
 
-    x, p, means, covariances = plaza.START, np.diag(plaza.START_DEVIATION**2), [], []
+    x, p, means, covariances = robot.START, np.diag(robot.START_DEVIATION**2), [], []
     for (distance, turn, dt), z in zip(recording.odometry, received, strict=True):
-        turn = turn - plaza.GYRO_RATE * dt
+        turn = turn - robot.GYRO_RATE * dt
         c = points(x, p)
         course = c[:, 2] + turn / 2
         c = c + np.column_stack([distance * np.cos(course), distance * np.sin(course), np.full(6, turn)])
         x = c.mean(0)
-        walk = [plaza.POSITION_WALK * distance] * 2 + [plaza.HEADING_WALK * dt]
+        walk = [robot.POSITION_WALK * distance] * 2 + [robot.HEADING_WALK * dt]
         p = (c - x).T @ (c - x) / 6 + np.diag(walk)
         c = points(x, p)
-        b = plaza.BEACONS[~np.isnan(z)]
-        y = plaza.RANGE_SCALE * np.linalg.norm(c[:, None, :2] - b, axis=-1)
-        mean, pyy = y.mean(0), (y - y.mean(0)).T @ (y - y.mean(0)) / 6 + plaza.RANGE_VARIANCE * np.eye(len(b))
+        b = robot.BEACONS[~np.isnan(z)]
+        y = robot.RANGE_SCALE * np.linalg.norm(c[:, None, :2] - b, axis=-1)
+        mean, pyy = y.mean(0), (y - y.mean(0)).T @ (y - y.mean(0)) / 6 + robot.RANGE_VARIANCE * np.eye(len(b))
         s = pyy + np.diag(gain_variance * (np.diag(pyy) + mean**2) + noise)
         k = (c - x).T @ (y - mean) / 6 @ np.linalg.inv(s)
         x, p = x + k @ (z[~np.isnan(z)] - mean), p - k @ s @ k.T
@@ -67,14 +65,14 @@ def cubature_oracle(
 
 
 SECOND = 0.25 * 0.8**2 + 0.5 + 0.25 * 1.2**2  # E[g^2] of one hop
-RELAY_NOISE = (SECOND + 1) * plaza.HOP_VARIANCE
+RELAY_NOISE = (SECOND + 1) * robot.HOP_VARIANCE
 
 
 @pytest.mark.parametrize(
     ("name", "gain_variance", "noise"),
     [
         ("relay_aware", SECOND**2 - 1, RELAY_NOISE),
-        ("mean_gain", 0.0, 2 * plaza.HOP_VARIANCE),
+        ("mean_gain", 0.0, 2 * robot.HOP_VARIANCE),
         ("perfect_channel", 0.0, 0.0),
     ],
 )
@@ -102,11 +100,11 @@ def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:
 
 
 def test_relay_draws_follow_the_channel(recording: PlazaRecording) -> None:
-    received = relay(plaza.channel, recording.ranges, 3)
+    received = relay(robot.channel, recording.ranges, 3)
     heard = ~np.isnan(recording.ranges)
     np.testing.assert_array_equal(np.isnan(received), ~heard)
-    np.testing.assert_array_equal(received, relay(plaza.channel, recording.ranges, 3))
-    assert not np.any(received[heard] == relay(plaza.channel, recording.ranges, 4)[heard])
+    np.testing.assert_array_equal(received, relay(robot.channel, recording.ranges, 3))
+    assert not np.any(received[heard] == relay(robot.channel, recording.ranges, 4)[heard])
     y, z = recording.ranges[heard], received[heard]
     deviation = np.sqrt((SECOND**2 - 1) * y**2 + RELAY_NOISE)
     scaled = (z - y) / deviation  # mean 0, variance 1
@@ -116,14 +114,14 @@ def test_relay_draws_follow_the_channel(recording: PlazaRecording) -> None:
 
 
 def test_rows_do_not_depend_on_later_rows(recording: PlazaRecording) -> None:
-    whole = relay(plaza.channel, recording.ranges, 0)
-    np.testing.assert_array_equal(relay(plaza.channel, recording.ranges[:50], 0), whole[:50])
+    whole = relay(robot.channel, recording.ranges, 0)
+    np.testing.assert_array_equal(relay(robot.channel, recording.ranges[:50], 0), whole[:50])
 
 
 def test_average_noise_is_the_mean_variance(recording: PlazaRecording) -> None:
     y = recording.ranges[~np.isnan(recording.ranges)]
     expected = (SECOND**2 - 1) * np.mean(y**2) + RELAY_NOISE
-    assert average_noise(plaza.relay, recording.ranges) == pytest.approx(expected, rel=1e-12)
+    assert average_noise(robot.relay, recording.ranges) == pytest.approx(expected, rel=1e-12)
     assert expected == pytest.approx(102.15, abs=0.01)
 
 
@@ -152,11 +150,11 @@ def test_summary_holds_the_scores(folder: Path, outcome: Outcome) -> None:
 
 
 def test_written_measurements_give_the_written_estimates(folder: Path) -> None:
-    data = read_measurements(folder / "measurements.csv", plaza.network)
-    record = hg.run(plaza.network, *data)
+    data = read_measurements(folder / "measurements.csv", robot.network)
+    record = hg.run(robot.network, *data)
     written = _parquet(folder / "estimates.parquet")
     for name in ("relay_aware", "mean_gain", "open_loop"):
-        for i, state in enumerate(plaza.plant.states):
+        for i, state in enumerate(robot.plant.states):
             # The same numbers through CSV; the networks differ, so does the order of rounding.
             again = record.estimates["robot"][name].mean[:, i]
             np.testing.assert_allclose(written[f"{name}.{state}"], again, rtol=0, atol=1e-9)
@@ -195,7 +193,7 @@ def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(run, "compute", lambda *_: outcome)
     monkeypatch.setattr(run, "write_data", broken)
     with pytest.raises(OSError, match="disk full"):
-        run_demo(tmp_path / "a" / "b")
+        run.example(tmp_path / "a" / "b")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -203,5 +201,5 @@ def test_other_peoples_files_are_not_replaced(tmp_path: Path) -> None:
     (tmp_path / "demo").mkdir()
     (tmp_path / "demo" / "thesis.txt").write_text("mine")
     with pytest.raises(ValueError, match=r"demo: expected .*, got other files"):
-        run_demo(tmp_path)
+        run.example(tmp_path)
     assert (tmp_path / "demo" / "thesis.txt").read_text() == "mine"

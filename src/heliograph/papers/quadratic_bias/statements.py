@@ -1,8 +1,7 @@
-"""What the paper claims, beside what is found here."""
+"""What the paper states, beside what is found here."""
 
 import numpy as np
 
-from heliograph.papers.claim import Claim, holds, if_met
 from heliograph.papers.quadratic_bias import setting
 from heliograph.papers.quadratic_bias.compute import (
     CLAIMED,
@@ -12,26 +11,27 @@ from heliograph.papers.quadratic_bias.compute import (
     settled_mean,
     simulated_mean,
 )
+from heliograph.papers.statement import Statement, holds, if_met
 from heliograph.random_affine import NoiseMoments
 
 
-def claims(result: Reproduction) -> list[Claim]:
-    """All claims that the example and the scenario speak to."""
+def statements(result: Reproduction) -> list[Statement]:
+    """All statements that the example and the scenario speak to."""
     return [_better(result), *_optimal(result), _moments(), _table(), *_bounds(result)]
 
 
-def _better(result: Reproduction) -> Claim:
+def _better(result: Reproduction) -> Statement:
     gain = gain_percent(result.example, TRUE)
     covariance = result.example.designs.covariance
     ratio = [np.diagonal(covariance[name][1:, :2, :2], axis1=1, axis2=2) for name in (TRUE, "linear")]
     worst = float((1 - ratio[0] / ratio[1]).min() * 100)
     ours = f"{gain[0]:.1f} % (x1) and {gain[1]:.1f} % (x2) less variance; at every step, at least {worst:.1f} %"
-    return Claim(
+    return Statement(
         "The quadratic filter beats the linear one in the example", "Figs 3-6", "no numbers", ours, holds(worst > 0)
     )
 
 
-def _optimal(result: Reproduction) -> list[Claim]:
+def _optimal(result: Reproduction) -> list[Statement]:
     example, outage = result.example, result.outage
     claimed, true, best = (settled_mean(example, n)[0] for n in (CLAIMED, TRUE, "quadratic"))
     exact = f"x1: claims {claimed:.6f}, has {true:.6f}; V_t is correlated with the state once powers are random"
@@ -44,16 +44,16 @@ def _optimal(result: Reproduction) -> list[Claim]:
     )
     ours = f"example: {loss:.1e} % above the best quadratic filter; {scenario}"
     return [
-        Claim("(31), (36) are the error covariance", "Theorems 1 and 2", "exact", exact, holds(true <= claimed)),
-        Claim("(35) minimises it", "Theorem 2", "optimal among quadratic filters", ours, holds(true <= best)),
+        Statement("(31), (36) are the error covariance", "Theorems 1 and 2", "exact", exact, holds(true <= claimed)),
+        Statement("(35) minimises it", "Theorem 2", "optimal among quadratic filters", ours, holds(true <= best)),
     ]
 
 
-def _moments() -> Claim:
+def _moments() -> Statement:
     ours = [[noise.moment((k,)) for k in (2, 3, 4)] for noise in setting.NOISES.values()]
     gap = float(np.max(np.abs(np.array(ours) - np.array([setting.TABLE_1[name] for name in setting.NOISES]))))
     rounding = 5.5e-5  # four digits are printed; the laws are given exactly
-    return Claim(
+    return Statement(
         "The noises have the moments of Table 1",
         "Table 1",
         "four digits",
@@ -62,7 +62,7 @@ def _moments() -> Claim:
     )
 
 
-def _table() -> Claim:
+def _table() -> Statement:
     refused = []
     for name, moments in setting.TABLE_1.items():
         try:
@@ -71,23 +71,23 @@ def _table() -> Claim:
             refused.append(name)
     names = ", ".join(refused)
     ours = f"rounded to four digits, those of {names} belong to no distribution; the laws themselves are used"
-    return Claim("Table 1 can stand in for the laws", "Table 1", "implied", ours, holds(not refused))
+    return Statement("Table 1 can stand in for the laws", "Table 1", "implied", ours, holds(not refused))
 
 
-def _bounds(result: Reproduction) -> list[Claim]:
+def _bounds(result: Reproduction) -> list[Statement]:
     b = result.bounds
     ours = f"does not apply to the example: {b.lower.reason}"
     end = f"{b.growth.value:.2g} at t = {result.example.model.horizon}, where P has {b.growth.actual:.3f}"
     grows = f"{end}; {b.growth.reason}"
     instead = f"P_t <= Cov(X_t): {b.covariance.value:.4f}, reached to {b.covariance.actual:.4f}; {b.covariance.reason}"
     return [
-        Claim("P_t >= beta I", "Theorem 3", "under Assumptions 1 and 2", ours, if_met(b.lower.applies)),
-        Claim(
+        Statement("P_t >= beta I", "Theorem 3", "under Assumptions 1 and 2", ours, if_met(b.lower.applies)),
+        Statement(
             "P_t is bounded from above",
             "Theorem 4",
             "if q_a < 1",
             f"{grows}. What holds: {instead}",
             if_met(b.growth.applies),
         ),
-        Claim("P_t is bounded from above", "Theorem 5", "by a window", b.window.reason, if_met(b.window.applies)),
+        Statement("P_t is bounded from above", "Theorem 5", "by a window", b.window.reason, if_met(b.window.applies)),
     ]

@@ -1,6 +1,6 @@
 """A robot mower hears four radio beacons; each range reaches the remote filters through a two-hop relay.
 
-The constants come from the Plaza2 recording itself; `examples.plaza_recording` says how and computes them again.
+The constants come from the Plaza2 recording itself; `calibration` says how and computes them again.
 """
 
 from typing import Any

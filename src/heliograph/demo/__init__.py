@@ -1,1 +1,0 @@
-"""The demonstration: recorded ranges through a simulated relay, to filters that know it or do not."""

@@ -1,0 +1,68 @@
+"""A folder of results: computed under a progress bar, drawn, written, and there as a whole or not at all."""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.report.progress import Advance, progress
+
+if TYPE_CHECKING:  # a missing extra is told by `write_results`, in one line
+    from matplotlib.figure import Figure
+
+    from heliograph.report.page import Page
+
+SUMMARY = "summary.json"  # also tells earlier results from other folders
+NEEDS = ("jinja2", "matplotlib")
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Results:
+    """What was found, as it is told.
+
+    figures: by file name. page: the report, from every figure as SVG. summary: all numbers, as JSON has them.
+    write_data: writes what else belongs into the folder.
+    """
+
+    figures: "Mapping[str, Figure]"
+    page: "Callable[[Mapping[str, bytes]], Page]"
+    summary: Mapping[str, object]
+    write_data: Callable[[Path], None]
+
+
+def write_results(
+    target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
+) -> T:
+    """Compute in `stages` that the progress bar is told of, and write figures, report, data and summary to `target`.
+
+    The folder takes the place of earlier results, and of nothing else. `needs` are packages of extras beside those of
+    `report`: one that is missing is told before the work starts.
+
+    Raises:
+        ValueError: a folder that cannot be written, or that holds something else.
+        ModuleNotFoundError: an extra is not installed.
+    """
+    for name in (*NEEDS, *needs):
+        import_module(name)
+    check_replaceable(target, SUMMARY)
+    with progress(stages + 1) as advance, whole_folder(target) as folder:
+        found = compute(advance)
+        advance("drawing and writing")
+        _write(tell(found), folder)
+    return found
+
+
+def _write(results: Results, folder: Path) -> None:
+    from heliograph.report.figures import png, svg
+
+    pictures = {name: svg(figure) for name, figure in results.figures.items()}
+    for name, figure in results.figures.items():
+        (folder / f"{name}.png").write_bytes(png(figure))
+        (folder / f"{name}.svg").write_bytes(pictures[name])
+    (folder / "report.html").write_text(results.page(pictures).html(), encoding="utf-8")
+    results.write_data(folder)
+    (folder / SUMMARY).write_text(json.dumps(results.summary, indent=2) + "\n", encoding="utf-8")
