@@ -178,13 +178,21 @@ class Losing(h.AbstractFilter):
     """A filter whose covariance is indefinite from its third step."""
 
     claim: Claim = eqx.field(static=True, default="nominal")
+    states: tuple[str, ...] = eqx.field(static=True, default=("p", "v"))
+    inputs: tuple[str, ...] = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=1)
 
     def init(self):
-        return jnp.zeros(2)
+        return jnp.ones(2)
 
-    def step(self, state, z, u=(), k=0):
-        lost = jnp.where(k >= 2, -1.0, 1.0)
-        return state, h.Estimate(state, jnp.diag(jnp.stack([1.0, lost])), self.claim)
+    def predict(self, state, u=(), k=0):
+        return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
+
+    def correct(self, state, z, k=0):
+        return state, h.Innovation(z, jnp.eye(1), 0.0)
+
+    def estimate(self, state):
+        return h.Estimate(0 * state, jnp.diag(state), self.claim)
 
 
 def test_a_covariance_that_is_lost_is_flagged_and_kept():

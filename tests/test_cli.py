@@ -39,12 +39,21 @@ import equinox as eqx
 
 class Losing(h.AbstractFilter):
     claim: str = eqx.field(static=True, default="nominal")
+    states: tuple = eqx.field(static=True, default=("p", "v"))
+    inputs: tuple = eqx.field(static=True, default=("push", "dt"))
+    received: int = eqx.field(static=True, default=1)
 
     def init(self):
-        return jnp.zeros(2)
+        return jnp.ones(2)
 
-    def step(self, state, z, u=(), k=0):
-        return state, h.Estimate(state, jnp.diag(jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])), self.claim)
+    def predict(self, state, u=(), k=0):
+        return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
+
+    def correct(self, state, z, k=0):
+        return state, h.Innovation(z, jnp.eye(1), 0.0)
+
+    def estimate(self, state):
+        return h.Estimate(0 * state, jnp.diag(state), self.claim)
 
 
 network = h.Network(plant, {"remote": h.Node(sensor, link, {"losing": Losing()})})

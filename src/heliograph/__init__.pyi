@@ -51,6 +51,7 @@ from .model.channel import (
 )
 from .model.estimate import (
     Estimate as Estimate,
+    Innovation as Innovation,
 )
 from .filters.base import (
     AbstractFilter as AbstractFilter,
@@ -118,6 +119,9 @@ from .filters.gaussian import (
     extended_filter as extended_filter,
     gaussian_filter as gaussian_filter,
     mean_gain_filter as mean_gain_filter,
+)
+from .filters.kalman import (
+    kalman_filter as kalman_filter,
 )
 from .filters.prediction import (
     prediction_of as prediction_of,
@@ -203,6 +207,9 @@ from .simulation.network import (
 from .simulation.simulate import (
     monte_carlo as monte_carlo,
     run as run,
+)
+from .simulation.likelihood import (
+    log_likelihood as log_likelihood,
 )
 from .simulation.over_runs import (
     over_runs as over_runs,

@@ -18,12 +18,21 @@ import heliograph as hg
 
 class Bare(hg.AbstractFilter):
     claim: str = eqx.field(static=True, default="none")
+    states: tuple = eqx.field(static=True, default=("x",))
+    inputs: tuple = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=0)
 
     def init(self):
         return jnp.zeros(1)
 
-    def step(self, state, z, u=(), k=0):
-        return state, hg.Estimate(state, jnp.full((1, 1), jnp.nan), self.claim)
+    def predict(self, state, u=(), k=0):
+        return state
+
+    def correct(self, state, z, k=0):
+        return state, hg.Innovation(z, jnp.zeros((0, 0)), 0.0)
+
+    def estimate(self, state):
+        return hg.Estimate(state, jnp.full((1, 1), jnp.nan), self.claim)
 
 
 def build(gain, noise=0.1, kind="linear"):

@@ -25,15 +25,15 @@ def test_it_is_the_step_ahead_of_the_filtered_estimate():
         own, _ = base.step(own, value, (), k)
         np.testing.assert_allclose(ahead.mean, expected[0], rtol=0, atol=1e-13)  # rounding of a few operations
         np.testing.assert_allclose(ahead.covariance, expected[1], rtol=0, atol=1e-13)
-        np.testing.assert_array_equal(state.mean, own.mean)
-        np.testing.assert_array_equal(state.covariance, own.covariance)
+        np.testing.assert_array_equal(state.belief.mean, own.mean)
+        np.testing.assert_array_equal(state.belief.covariance, own.covariance)
 
 
 def test_it_does_not_see_the_present_measurement():
     item = prediction_of(filtered())
     estimates = [item.step(item.init(), z)[1].mean for z in ([0.0], [50.0])]
     np.testing.assert_array_equal(*estimates)
-    states = [item.step(item.init(), z)[0].mean for z in ([0.0], [50.0])]
+    states = [item.step(item.init(), z)[0].belief.mean for z in ([0.0], [50.0])]
     assert abs(states[0][0] - states[1][0]) > 1  # the next one does
 
 

@@ -99,8 +99,8 @@ def test_a_missing_measurement_counts_as_expected():
     state = item.init()
     for k in range(4):
         state, _ = item.step(state, data[k], (), k)
-    g = [np.asarray(field)[4] for field in item.gains.values]
-    expected = g[6] @ np.asarray(state.value) + g[7]
+    g = item.gains.values
+    expected = g.expected[4] @ np.asarray(state.value) + g.expected_offset[4]
     left, _ = item.step(state, np.array([np.nan]), (), 4)
     right, _ = item.step(state, expected, (), 4)
     np.testing.assert_allclose(left.value, right.value, rtol=0, atol=1e-15)
@@ -108,9 +108,9 @@ def test_a_missing_measurement_counts_as_expected():
 
 def test_filters_keep_the_contract():
     s = model(two_sensors(), HORIZON)
-    check_filter(hg.polynomial_filter(*s, HORIZON), 2)
-    check_filter(hg.LinearSystemFilter(hg.lifted_system(*s, 1, HORIZON)), 2)
-    check_filter(hg.mixture_filter(*s, resolution=0.1), 2)
+    check_filter(hg.polynomial_filter(*s, HORIZON))
+    check_filter(hg.LinearSystemFilter(hg.lifted_system(*s, 1, HORIZON)))
+    check_filter(hg.mixture_filter(*s, resolution=0.1))
 
 
 def test_horizon_beyond_the_schedule_is_refused_by_the_driver():

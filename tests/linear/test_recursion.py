@@ -59,8 +59,9 @@ def test_true_error_of_wrong_gains_counts_bias_and_spread():
     system = scalar(horizon=1)
     zero = np.zeros((1, 1))
     gains = hg.Gains(
-        zero[None], zero[None], zero, zero[None], 0.5 + zero[None], 0.2 + zero, zero[None], zero, zero[None]
-    )
+        zero[None], zero[None], zero, zero[None], 0.5 + zero[None], 0.2 + zero, zero[None], zero, zero[None],
+        np.nan + zero[None], np.nan + zero[None],
+    )  # fmt: skip
     # x+ = x + 1 + w has mean 1 and variance 3
     expected = 0.25 * 3 + 0.25 + (0.5 - 0.2) ** 2
     found = hg.true_covariance(system, hg.Schedule(gains, [0.0], "nominal"))

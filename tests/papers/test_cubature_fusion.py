@@ -102,7 +102,8 @@ def test_mixed_points_do_no_harm_where_propagation_moves_nothing():
     still = hg.Plant(lambda x, u: jnp.asarray(x), np.zeros((5, 5)), np.zeros(5), np.eye(5))
     base = hg.cubature_filter(still, sensor(STRONG, 0), channel(STRONG), hg.Polytope(hg.Scalars(*STRONG.beta)))
     z = np.array([0.3, -0.2])
-    (state, _), (expected, _) = MixedCross(base=base, claim="nominal").step(base.init(), z), base.step(base.init(), z)
+    mixed = MixedCross(base)
+    (state, _), (expected, _) = mixed.step(mixed.init(), z), base.step(base.init(), z)
     np.testing.assert_allclose(state.mean, expected.mean, atol=1e-13)
     np.testing.assert_allclose(state.covariance, expected.covariance, atol=1e-13)
 

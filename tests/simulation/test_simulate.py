@@ -3,6 +3,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.filters.base import correction, prediction
 from heliograph.testing import check_filter
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1, [0.0, 1.0], 0.3, input_matrix=[[1.0], [0.5]])
@@ -234,12 +235,24 @@ class Silent(hg.AbstractFilter):
     """Gives the initial mean and claims nothing."""
 
     claim: str = "none"
+    states: tuple = ("p", "v")
+    inputs: tuple = ("u0",)
+    received: int = 1
 
     def init(self):
         return np.zeros(2)
 
-    def step(self, state, z, u=(), k=0):
-        return state, hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
+    @prediction
+    def predict(self, state, u=(), k=0):
+        return state
+
+    @correction
+    def correct(self, state, z, k=0):
+        nothing = jax.numpy.where(jax.numpy.isnan(z[0]), 0.0, jax.numpy.nan)
+        return state, hg.Innovation(z, jax.numpy.full((1, 1), jax.numpy.nan), nothing)
+
+    def estimate(self, state):
+        return hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
 
 
 def test_a_filter_that_claims_no_covariance_harms_no_other():
@@ -247,7 +260,7 @@ def test_a_filter_that_claims_no_covariance_harms_no_other():
     filters = {"silent": Silent(), "linear": hg.linear_filter(PLANT, sensor, CHANNEL)}
     nodes = {name: hg.Node(sensor, CHANNEL, filters) for name in ("p", "q")}
     network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.WeightedFusion([0.5, 0.5]))})
-    check_filter(Silent(), 1)
+    check_filter(Silent(), [0.0])
     assert hg.monte_carlo(network, 4, 8, 0, inputs=INPUTS[:4]).failures() == []
     found = hg.monte_carlo(network, 4, 200, 0, hg.Statistics(), INPUTS[:4])
     silent, linear = found["p"]["silent"], found["p"]["linear"]

@@ -1,25 +1,163 @@
-"""What every filter is: a deterministic (init, step) with explicit state, and an estimate that says what it claims."""
+"""What every filter is: deterministic predictions and corrections of an explicit state, of known sizes and claim."""
 
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from typing import ParamSpec, TypeVar, cast
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import steps_covered
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+Step = int | np.integer | Int[Array, ""]
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class AbstractFilter(eqx.Module):
-    """A filter: `init()` gives the state before any data, `step(state, z, u, k)` the next state and the estimate.
+    """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
 
     Deterministic: it never receives a random key. A component of z that is NaN did not arrive and is skipped. The
     state is a pytree of arrays, so one filter object serves a stream, a recording and thousands of runs at once.
+
+    It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
+    what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
+    give the four fields, `init`, `predict` under `@prediction`, `correct` under `@correction`, and `estimate`.
     """
 
     claim: eqx.AbstractVar[Claim]
+    states: eqx.AbstractVar[tuple[str, ...]]
+    inputs: eqx.AbstractVar[tuple[str, ...]]
+    received: eqx.AbstractVar[int]
 
-    def init(self) -> Any:
+    def init(self) -> PyTree:
         """State before the first step."""
         raise NotImplementedError
 
-    def step(self, state: Any, z: Any, u: Any = (), k: Any = 0) -> tuple[Any, Estimate]:
-        """Predict over step k with the input u, then use the measurement z of shape (m,)."""
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Over step k with the input u of shape (inputs,): from what is known of x before it to x after it."""
         raise NotImplementedError
+
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Use the measurement z of shape (received,) of step k; where nothing arrived, the state stays as it is."""
+        raise NotImplementedError
+
+    def estimate(self, state: PyTree) -> Estimate:
+        """What is known in this state: after `predict` the prediction, after `correct` the estimate."""
+        raise NotImplementedError
+
+    def step(self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0) -> tuple[PyTree, Estimate]:
+        """Predict over step k with the input u, then use the measurement z.
+
+        Raises:
+            ValueError: z, u or k of another size than the filter's; infinite values; an input that is NaN.
+        """
+        z, u = measured(self, z), given(self, u)
+        return _step(self, state, z, u, step_number(self, k))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """`estimate(state)` after the correction of step k, for a filter that looks its covariance up by the step."""
+        return self.estimate(state)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
+        """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
+        return self
+
+    @property
+    def horizon(self) -> int | None:
+        """Number of steps that it covers; None if it may go on for ever."""
+        return steps_covered(self)
+
+
+@compiled
+def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
+    after, _ = item.correct(item.predict(state, u, k), z, k)
+    return after, item.after_step(after, k)
+
+
+def prediction(predict: Callable[P, R]) -> Callable[P, R]:
+    """Check what a filter's `predict(state, u, k)` is given, hand it arrays, compile it."""
+    return _checked(predict, given)
+
+
+def correction(correct: Callable[P, R]) -> Callable[P, R]:
+    """Check what a filter's `correct(state, z, k)` is given, hand it arrays, compile it."""
+    return _checked(correct, measured)
+
+
+def _checked(
+    function: Callable[P, R], check: Callable[[AbstractFilter, ArrayLike], Float[Array, " length"]]
+) -> Callable[P, R]:
+    run = cast(Callable[..., R], compiled(function))
+
+    @wraps(function)
+    def call(item: AbstractFilter, state: PyTree, data: ArrayLike = (), k: Step = 0) -> R:
+        return run(item, state, check(item, data), step_number(item, k))
+
+    return cast(Callable[P, R], call)
+
+
+def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
+    """A measurement of the filter's length, NaN where a component did not arrive; empty for a filter that hears none.
+
+    Raises:
+        ValueError: another shape, infinite values, or no real numbers.
+    """
+    found = _numbers("measurement", z, item.received or None)
+    if not isinstance(found, jax.core.Tracer) and np.any(np.isinf(found)):
+        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(found).tolist())
+    return found if item.received else found[:0]
+
+
+def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
+    """An input of the filter's length.
+
+    Raises:
+        ValueError: another shape, values that are not finite, or no real numbers.
+    """
+    found = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
+    if not isinstance(found, jax.core.Tracer) and not np.all(np.isfinite(found)):
+        raise fail("inputs", "finite numbers", np.asarray(found).tolist())
+    return found
+
+
+def step_number(item: AbstractFilter, k: Step) -> Step:
+    """A number of a step that the filter covers.
+
+    Raises:
+        ValueError: no whole number, a negative one, or one past the end of what varies over time.
+    """
+    if isinstance(k, jax.core.Tracer):
+        return k
+    found = np.asarray(k)
+    if found.shape or found.dtype.kind not in "iu" or found < 0:
+        raise fail("step", "a whole number from 0", k)
+    if item.horizon is not None and found >= item.horizon:
+        raise fail("step", f"one of the {item.horizon} that the filter covers, counted from 0", k)
+    return found
+
+
+def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
+    """Real numbers of one axis as an array of floats; a single number will do for a length of one."""
+    expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
+    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
+        found: Array = jnp.asarray(value, dtype=float)
+    else:
+        try:
+            found = np.asarray(value)
+        except ValueError:  # rows of different lengths
+            raise fail(name, expected, repr(value)[:60]) from None
+        if found.dtype.kind not in "fiub":
+            raise fail(name, expected, repr(value)[:60])
+        found = found.astype(np.float64)
+    found = found[None] if found.ndim == 0 and length in (1, None) else found
+    if found.ndim != 1 or length not in (len(found), None):
+        raise fail(name, expected, f"shape {found.shape}" if found.size else "none")
+    return found

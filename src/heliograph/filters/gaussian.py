@@ -1,32 +1,35 @@
 """The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.correction import Signal
+from heliograph.filters.innovation import innovation, innovation_covariance
+from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.channel import Channel, check_link, mean_gain
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import array, covariance
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.second_order import SecondOrder
 
 
 class Belief(NamedTuple):
     """Mean (n,) and covariance (n, n) of the state given the data so far."""
 
-    mean: jax.Array
-    covariance: jax.Array
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
 
 
 class GaussianFilter(AbstractFilter):
@@ -34,8 +37,10 @@ class GaussianFilter(AbstractFilter):
 
     A linear plant or sensor needs no transform: its moments are exact.
 
-    `channel` is what the filter believes; the world may have another. Built by `cubature_filter`, `extended_filter`
-    and `mean_gain_filter`.
+    `channel` is what the filter believes; the world may have another. Its innovation covariance is M Cov(y) M' and the
+    spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
+
+    `linear`: plant and sensor are, and no gain is random, so that nothing but the mean depends on data.
     """
 
     plant: AnyPlant
@@ -45,47 +50,58 @@ class GaussianFilter(AbstractFilter):
     update: AbstractUpdate
     initial_mean: np.ndarray
     initial_covariance: np.ndarray
+    linear: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:
         """The prior."""
         return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict over step k, then use what arrived of z."""
-        after = self.correct(self.predict(state, u, k), z, k)
-        return after, Estimate(after.mean, after.covariance, self.claim)
-
-    @compiled
-    def predict(self, state: Belief, u: Any = (), k: Any = 0) -> Belief:
+    @prediction
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
-        plant, u = at(self.plant, k), jnp.asarray(u, dtype=float)
+        plant, u = at(self.plant, k), jnp.asarray(u)
         if isinstance(plant, LinearPlant):
             moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
         else:
             moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
         return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
-    @compiled
-    def correct(self, prior: Belief, z: Any, k: Any = 0) -> Belief:
+    @correction
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
         if isinstance(sensor, LinearSensor):
-            measured = linear_transform(sensor.matrix, sensor.measure(prior.mean), prior.covariance)
+            measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
         else:
-            measured = self.transform.apply(sensor.measure, *prior)
+            measured = self.transform.apply(sensor.measure, *state)
         mean = measured.mean + sensor.noise.mean
         spread = measured.covariance + sensor.noise.covariance
         signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
-        return corrected(prior, signal, channel, self.update, jnp.asarray(z, dtype=float))
+        return corrected(state, signal, channel, self.update, jnp.asarray(z))
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The belief."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before, where they do not depend on data."""
+        return plan(self, inputs) if self.linear else self
 
 
-def corrected(prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array) -> Belief:
+def corrected(
+    prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array
+) -> tuple[Belief, Innovation]:
     """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
     gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
-    return _use(prior, gain, bound, signal.mean, channel, z)
+    after = _use(prior, gain, bound, signal.mean, channel, z)
+    expected = channel.gain @ signal.mean + channel.offset
+    return after, innovation(z, expected, innovation_covariance(signal, channel))
 
 
 @runs_last
@@ -111,8 +127,8 @@ def _build(
     channel: Channel,
     transform: AbstractTransform,
     update: AbstractUpdate,
-    initial_mean: Any,
-    initial_covariance: Any,
+    initial_mean: ArrayLike | None,
+    initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
     start = first(plant)
@@ -124,7 +140,8 @@ def _build(
         spread = covariance("filter's initial covariance", initial_covariance, n)
     described = describe(channel, update)
     linear = is_linear(plant, sensor) and not bool(np.any([s.random_gain for s in _each(described)]))
-    claim: Claim = "exact" if linear and trusted else "nominal"
+    own_prior = initial_mean is not None or initial_covariance is not None
+    claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
     return GaussianFilter(
         plant=plant,
         sensor=sensor,
@@ -133,7 +150,11 @@ def _build(
         update=update,
         initial_mean=mean,
         initial_covariance=spread,
+        linear=linear,
         claim=claim,
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
     )
 
 
@@ -147,13 +168,14 @@ def gaussian_filter(
     channel: Channel,
     transform: AbstractTransform,
     update: AbstractUpdate | None = None,
-    initial_mean: Any = None,
-    initial_covariance: Any = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
 ) -> GaussianFilter:
     """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
-    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
-    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter). `update` is `Polytope()` unless given; the initial mean and covariance are the
+    plant's unless given.
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
@@ -168,13 +190,14 @@ def cubature_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: Any = None,
-    initial_covariance: Any = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
 ) -> GaussianFilter:
     """Cubature Kalman filter that knows its channel's moments.
 
-    Claim: "nominal"; "exact" where plant and sensor are linear and no gain is random (then it is the Kalman filter).
-    `update` is `Polytope()` unless given; the initial mean and covariance are the plant's unless given.
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter). `update` is `Polytope()` unless given; the initial mean and covariance are the
+    plant's unless given.
 
     Raises:
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
@@ -188,8 +211,8 @@ def extended_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: Any = None,
-    initial_covariance: Any = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
 ) -> GaussianFilter:
     """Extended Kalman filter that knows its channel's moments; Jacobians by automatic differentiation.
 
@@ -206,8 +229,8 @@ def mean_gain_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    initial_mean: Any = None,
-    initial_covariance: Any = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
 ) -> GaussianFilter:
     """The cubature filter that most people would write: it takes the mean gain as the truth.
 

@@ -1,28 +1,29 @@
 """The H-infinity filter: gains designed for a level, run on any plant and sensor."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.growth_system import GrowthSystem
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, check_sensor
 from heliograph.numerics.check import array, fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, Float
 
 
 class Pending(NamedTuple):
     """The last estimate (n,), and the correction (n,) that what came since will make to the next."""
 
-    mean: jax.Array
-    correction: jax.Array
+    mean: Float[jax.Array, " n"]
+    correction: Float[jax.Array, " n"]
 
 
 class HInfinityFilter(AbstractFilter):
@@ -38,6 +39,9 @@ class HInfinityFilter(AbstractFilter):
     expected_gain: OverTime
     initial_mean: np.ndarray
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Pending:
@@ -45,20 +49,33 @@ class HInfinityFilter(AbstractFilter):
         mean = jnp.asarray(self.initial_mean)
         return Pending(mean, jnp.zeros_like(mean))
 
-    @compiled
-    def step(self, state: Pending, z: Any, u: Any = (), k: Any = 0) -> tuple[Pending, Estimate]:
-        """Predict over step k, and keep what z will correct in the next."""
-        plant, sensor = at(self.plant, k), at(self.sensor, k)
-        z, u = jnp.asarray(z, dtype=float), jnp.asarray(u, dtype=float)
-        mean = plant.transition(state.mean, u) + state.correction
-        innovation = z - at(self.expected_gain, k) @ sensor.measure(mean)
-        correction = at(self.gains, k) @ jnp.where(jnp.isnan(z), 0.0, innovation)
-        n = mean.shape[0]
-        return Pending(mean, correction), Estimate(mean, jnp.full((n, n), jnp.nan), self.claim)
+    @prediction
+    def predict(self, state: Pending, u: ArrayLike = (), k: Step = 0) -> Pending:
+        """Over step k, with what came before it."""
+        mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
+        return Pending(mean, jnp.zeros_like(mean))
+
+    @correction
+    def correct(self, state: Pending, z: ArrayLike, k: Step = 0) -> tuple[Pending, Innovation]:
+        """Keep what z will correct in the next estimate; this one stays."""
+        value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)
+        later = at(self.gains, k) @ jnp.where(jnp.isnan(value), 0.0, value)
+        nothing = jnp.where(jnp.any(~jnp.isnan(value)), jnp.nan, 0.0)
+        return Pending(state.mean, later), Innovation(value, jnp.full((len(value), len(value)), jnp.nan), nothing)
+
+    @in_float64
+    def estimate(self, state: Pending) -> Estimate:
+        """The mean, without a covariance."""
+        n = state.mean.shape[0]
+        return Estimate(state.mean, jnp.full((n, n), jnp.nan), self.claim)
 
 
 def h_infinity_filter(
-    plant: AnyPlant, sensor: AnySensor, system: GrowthSystem, design: HInfinityDesign, initial_mean: Any = None
+    plant: AnyPlant,
+    sensor: AnySensor,
+    system: GrowthSystem,
+    design: HInfinityDesign,
+    initial_mean: ArrayLike | None = None,
 ) -> HInfinityFilter:
     """The filter with designed gains; it covers the steps of the system, whose A x + f(x) must be `plant`'s transition.
 
@@ -89,4 +106,7 @@ def h_infinity_filter(
         expected_gain=OverTime(expected),
         initial_mean=mean,
         claim="none",
+        states=start.states,
+        inputs=start.inputs,
+        received=system.received,
     )

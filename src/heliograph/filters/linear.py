@@ -1,34 +1,38 @@
 """The best linear filter behind a random channel, and the filter that hears nothing."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, describe
+from heliograph.filters.innovation import innovation, innovation_covariance, no_innovation
+from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import array, covariance, fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.second_order import SecondOrder
 
 
 class LinearBelief(NamedTuple):
     """The estimate's mean and error covariance, and the state's own mean and covariance before any data."""
 
-    mean: jax.Array
-    covariance: jax.Array
-    state_mean: jax.Array
-    state_covariance: jax.Array
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    state_mean: Float[jax.Array, " n"]
+    state_covariance: Float[jax.Array, "n n"]
 
 
 class LinearFilter(AbstractFilter):
@@ -36,6 +40,7 @@ class LinearFilter(AbstractFilter):
 
     With G random, the innovation covariance needs E[y y'] = C E[x x'] C' + R, which is propagated before any data
     instead of being read off the estimate. Then the claim is exact; where probabilities are uncertain, an upper bound.
+    The innovation has the nominal law's covariance; it is not Gaussian, so its Gaussian likelihood is nominal.
 
     Source: De Koning, Optimal estimation of linear discrete-time systems with stochastic parameters (1984).
     """
@@ -45,6 +50,9 @@ class LinearFilter(AbstractFilter):
     channel: SecondOrder | OverTime
     update: Polytope
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> LinearBelief:
@@ -53,31 +61,70 @@ class LinearFilter(AbstractFilter):
         mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
         return LinearBelief(mean, spread, mean, spread)
 
-    @compiled
-    def step(self, state: LinearBelief, z: Any, u: Any = (), k: Any = 0) -> tuple[LinearBelief, Estimate]:
-        """Predict both moments over step k, then use what arrived of z."""
-        plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
-        u, z = jnp.asarray(u, dtype=float), jnp.asarray(z, dtype=float)
-        a, c = plant.matrix, sensor.matrix
+    @prediction
+    def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
+        """Both moments over step k."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
+        error, own = (_moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
+        return LinearBelief(*error, *own)
 
-        def move(mean: jax.Array, spread: jax.Array) -> Belief:
-            moved = plant.transition(mean, u) + plant.noise_mean()
-            return Belief(moved, a @ spread @ a.T + plant.noise_covariance(u))
-
-        prior, own = move(state.mean, state.covariance), move(state.state_mean, state.state_covariance)
-        noise, own_signal = sensor.noise, c @ own.mean + sensor.noise.mean
-        second = c @ own.covariance @ c.T + noise.covariance + jnp.outer(own_signal, own_signal)
-        cross = prior.covariance @ c.T
-        gain, bound = self.update.correct(
-            prior.covariance,
-            Signal(own_signal, c @ cross + noise.covariance, cross, second),
-            channel,
-            present := ~jnp.isnan(z),
+    @correction
+    def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
+        """Use what arrived of z."""
+        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        signal = _signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+        gain, bound = self.update.correct(state.covariance, signal, channel, ~jnp.isnan(z))
+        mean, covariance, expected = _used(
+            state.mean, state.covariance, gain, bound, sensor.matrix, sensor.noise.mean, channel.gain, channel.offset, z
         )
-        expected = channel.gain @ (c @ prior.mean + noise.mean) + channel.offset
-        mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
-        after = jnp.where(jnp.any(present), bound, prior.covariance)
-        return LinearBelief(mean, after, *own), Estimate(mean, after, self.claim)
+        heard = innovation(z, expected, innovation_covariance(signal, channel))
+        return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), heard
+
+    @in_float64
+    def estimate(self, state: LinearBelief) -> Estimate:
+        """The estimate's mean and covariance."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs)
+
+
+@runs_last
+def _moved(
+    mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """A m + b and A P A' + Q."""
+    return times_vector(matrix, mean) + shift, congruence(matrix, spread) + noise
+
+
+@runs_last
+def _signal(state: LinearBelief, c: jax.Array, noise_mean: jax.Array, noise: jax.Array) -> Signal:
+    """y = C x + v: its mean before any data, the covariance of what is not known of it, E[y y']."""
+    cross = times(state.covariance, transpose(c))
+    mean = times_vector(c, state.state_mean) + noise_mean
+    second = congruence(c, state.state_covariance) + noise + mean[:, None] * mean[None]
+    return Signal(mean, times(c, cross) + noise, cross, second)
+
+
+@runs_last
+def _used(
+    mean: jax.Array,
+    prior: jax.Array,
+    gain: jax.Array,
+    bound: jax.Array,
+    c: jax.Array,
+    noise_mean: jax.Array,
+    channel_gain: jax.Array,
+    channel_offset: jax.Array,
+    z: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean and covariance after z, and what was expected, M (C m + v) + b."""
+    present = ~jnp.isnan(z)
+    expected = times_vector(channel_gain, times_vector(c, mean) + noise_mean) + channel_offset
+    after = mean + times_vector(gain, jnp.where(present, z - expected, 0.0))
+    return after, jnp.where(jnp.any(present, axis=0), bound, prior), expected
 
 
 def linear_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None) -> LinearFilter:
@@ -97,8 +144,17 @@ def linear_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, update: 
     rule = Polytope() if update is None else update
     described = describe(channel, rule)
     uncertain = described.values.uncertain if isinstance(described, OverTime) else described.uncertain
-    claim: Claim = "upper" if uncertain else "exact"
-    return LinearFilter(plant=plant, sensor=sensor, channel=described, update=rule, claim=claim)
+    start = first(plant)
+    return LinearFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        update=rule,
+        claim="upper" if uncertain else "exact",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
 
 
 class OpenLoop(AbstractFilter):
@@ -109,22 +165,36 @@ class OpenLoop(AbstractFilter):
     initial_mean: np.ndarray
     initial_covariance: np.ndarray
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:
         """The prior."""
         return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict over step k; z is not used."""
-        plant, u = at(self.plant, k), jnp.asarray(u, dtype=float)
+    @prediction
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """Mean and covariance of f(x, u) + w."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
         moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
-        after = Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
-        return after, Estimate(after.mean, after.covariance, self.claim)
+        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+
+    @correction
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """z, of whatever length, is not used."""
+        return state, no_innovation()
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The prediction."""
+        return Estimate(state.mean, state.covariance, self.claim)
 
 
-def open_loop_filter(plant: AnyPlant, initial_mean: Any = None, initial_covariance: Any = None) -> OpenLoop:
+def open_loop_filter(
+    plant: AnyPlant, initial_mean: ArrayLike | None = None, initial_covariance: ArrayLike | None = None
+) -> OpenLoop:
     """Prediction by cubature points without any measurement.
 
     Claim: "exact" for a linear plant started from its own initial law, else "nominal".
@@ -141,4 +211,13 @@ def open_loop_filter(plant: AnyPlant, initial_mean: Any = None, initial_covarian
         spread = covariance("filter's initial covariance", initial_covariance, n)
     own = initial_mean is None and initial_covariance is None
     claim: Claim = "exact" if isinstance(start, LinearPlant) and own else "nominal"
-    return OpenLoop(plant=plant, transform=Cubature(), initial_mean=mean, initial_covariance=spread, claim=claim)
+    return OpenLoop(
+        plant=plant,
+        transform=Cubature(),
+        initial_mean=mean,
+        initial_covariance=spread,
+        claim=claim,
+        states=start.states,
+        inputs=start.inputs,
+        received=0,
+    )

@@ -1,7 +1,7 @@
 """A filter that knows the full finite-support laws: every combination of gains and noises, then one Gaussian again."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,16 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.gaussian import Belief
 from heliograph.model.channel import Channel, check_link
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, is_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail, scalar
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
@@ -51,7 +52,8 @@ class MixtureFilter(AbstractFilter):
 
     With z = G_a x + c_a + N(0, R_a) and probability p_a, the posterior is a mixture of as many Gaussians with weights
     p_a N(z; G_a m + c_a, G_a P G_a' + R_a); its mean and covariance are kept (GPB1). Nominal: after the first step the
-    prior is not Gaussian, and process noise enters by its covariance only.
+    prior is not Gaussian, and process noise enters by its covariance only. The log-likelihood is that of the mixture,
+    log sum_a p_a N(z; ...); the innovation's covariance is the mixture's too.
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970), with random gains as modes.
     """
@@ -59,6 +61,9 @@ class MixtureFilter(AbstractFilter):
     plant: AnyPlant
     components: Components | OverTime
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:
@@ -66,30 +71,51 @@ class MixtureFilter(AbstractFilter):
         start = at(self.plant, 0)
         return Belief(jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance))
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict over step k with the input u, then weigh the combinations by what arrived of z."""
-        plant, c, z = at(self.plant, k), at(self.components, k), jnp.asarray(z, dtype=float)
-        mean = plant.transition(state.mean, jnp.asarray(u, dtype=float)) + plant.noise_mean()
-        spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(jnp.asarray(u, dtype=float))
+    @prediction
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """A m + B u + E w and A P A' + Q."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
+        return Belief(plant.transition(state.mean, u) + plant.noise_mean(), spread)
+
+    @correction
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Weigh the combinations by what arrived of z."""
+        c, z, (mean, spread) = at(self.components, k), jnp.asarray(z), state
         present = ~jnp.isnan(z)
+        both = present[:, None] & present
 
         def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
             cross = jnp.where(present[:, None], gain @ spread, 0.0)
-            both = present[:, None] & present
             total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
-            innovation = jnp.where(present, z - gain @ mean - offset, 0.0)
-            solved = psd_solve(total, jnp.concatenate([cross, innovation[:, None]], axis=1))
-            likelihood = -innovation @ solved[:, -1] / 2 - jnp.sum(jnp.log(jnp.diagonal(cholesky(total))))
-            return likelihood, cross.T @ solved[:, -1], cross.T @ solved[:, :-1]
+            value = z - gain @ mean - offset
+            heard = jnp.where(present, value, 0.0)
+            solved = psd_solve(total, jnp.concatenate([cross, heard[:, None]], axis=1))
+            likelihood = -heard @ solved[:, -1] / 2 - jnp.sum(jnp.log(jnp.diagonal(cholesky(total))))
+            return likelihood, cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
 
-        likelihood, moved, known = jax.vmap(condition)(c.gain, c.offset, c.noise)
-        weight = jax.nn.softmax(likelihood + jnp.log(c.weight))
+        likelihood, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        weighed = likelihood + jnp.log(c.weight)
+        weight = jax.nn.softmax(weighed)
         shift = weight @ moved
         apart = moved - shift
         after = spread - jnp.einsum("a,aij->ij", weight, known) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
-        belief = Belief(mean + shift, symmetrize(after))
-        return belief, Estimate(belief.mean, belief.covariance, self.claim)
+        density = jax.nn.logsumexp(weighed) - jnp.sum(present) * np.log(2 * np.pi) / 2
+        heard = _mixed(jnp.asarray(c.weight), value, jnp.where(both, total, jnp.nan), density)
+        return Belief(mean + shift, symmetrize(after)), heard
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The belief."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+
+def _mixed(weight: jax.Array, value: jax.Array, total: jax.Array, density: jax.Array) -> Innovation:
+    """Mean and covariance of the innovation over the prior weights: those of the parts, and what is between them."""
+    mean = weight @ value
+    apart = value - mean
+    covariance = jnp.einsum("a,aij->ij", weight, total) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
+    return Innovation(mean, covariance, density)
 
 
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
@@ -110,16 +136,25 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    floor = float(scalar("resolution", resolution, 0.0)) ** 2
+    floor, start = float(scalar("resolution", resolution, 0.0)) ** 2, first(plant)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
-        return MixtureFilter(plant=plant, components=_components(sensor, channel, floor), claim="nominal")
-    steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
-    sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
-    each = [_components(s, c, floor) for s, c in zip(sensors, channels, strict=True)]
-    return MixtureFilter(plant=plant, components=over_time(each), claim="nominal")
+        components: Components | OverTime = _components(sensor, channel, floor)
+    else:
+        steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
+        sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
+        components = over_time([_components(s, c, floor) for s, c in zip(sensors, channels, strict=True)])
+    return MixtureFilter(
+        plant=plant,
+        components=components,
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
 
 
-def _components(sensor: Any, channel: AbstractRandomAffine, floor: float) -> Components:
+def _components(sensor: AnySensor, channel: AbstractRandomAffine, floor: float) -> Components:
+    assert isinstance(sensor, LinearSensor)  # checked before
     route = Series([GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise), channel])
     found = [c for c in atoms_of(route) if c.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*found, strict=True))

@@ -1,50 +1,98 @@
 """Filters that use powers and products of what they hear: a lift of the measurement before a linear filter."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.innovation import log_density
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.linear.lift import lifted_system
 from heliograph.linear.memory import memory_system
 from heliograph.linear.recursion import lmmse
+from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import OverTime, first, unstack
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.monomials import monomials
+from heliograph.random_affine.monomials import count, monomials, position
 
 
 class PolynomialFilter(AbstractFilter):
     """Give a filter all monomials of z up to `degree` in place of z; with a component, every monomial of it is missing.
 
-    `inner` is a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system.
+    `inner` is a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system. The innovation is that of z itself,
+    among its monomials, with its exact covariance; the log-likelihood is Gaussian with it. `endless`: the last step's
+    matrices hold for ever, so that it may go on beyond them.
+
+    Raises:
+        ValueError: an inner filter that hears no such monomials.
     """
 
     inner: AbstractFilter
     degree: int = eqx.field(static=True)
+    endless: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
-    def __init__(self, inner: AbstractFilter, degree: int):
-        self.inner, self.degree, self.claim = inner, degree, inner.claim
+    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False):
+        self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
+        self.states, self.inputs = inner.states, inner.inputs
+        fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
+        if not fitting:
+            raise fail("inner filter", f"one that hears monomials up to degree {degree}", f"{inner.received} numbers")
+        self.received = fitting[0]
+
+    @property
+    def horizon(self) -> int | None:
+        """The inner filter's, unless its last matrices hold for ever."""
+        return None if self.endless else self.inner.horizon
 
     @in_float64
-    def init(self) -> Any:
+    def init(self) -> PyTree:
         """The inner filter's state."""
         return self.inner.init()
 
-    @compiled
-    def step(self, state: Any, z: Any, u: Any = (), k: Any = 0) -> tuple[Any, Estimate]:
-        """Lift z and step the inner filter."""
-        result: tuple[Any, Estimate] = self.inner.step(
-            state, monomials(jnp.asarray(z, dtype=float), self.degree)[:-1], u, k
-        )
-        return result
+    @prediction
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """The inner filter's prediction."""
+        return self.inner.predict(state, u, k)
+
+    @correction
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Lift z and correct the inner filter."""
+        after, heard = self.inner.correct(state, monomials(jnp.asarray(z), self.degree)[:-1], k)
+        return after, _of_degree_one(heard, jnp.asarray(z), self.degree)
+
+    @in_float64
+    def estimate(self, state: PyTree) -> Estimate:
+        """The inner filter's."""
+        return self.inner.estimate(state)
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """The inner filter's."""
+        return self.inner.after_step(state, k)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """The inner filter planned."""
+        return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless)
+
+
+def _of_degree_one(heard: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
+    """The part of a lifted innovation that is z itself."""
+    m, places = len(z), position(len(z) + 1, degree)
+    own = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
+    value, covariance = heard.value[own], heard.covariance[own][:, own]
+    return Innovation(value, covariance, log_density(value, covariance, jnp.abs(z)))
 
 
 def polynomial_filter(
@@ -57,14 +105,22 @@ def polynomial_filter(
     complete runs `scheduled_polynomial_filter` does the same with saved gains.
 
     Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are trusted). Covers `horizon`
-    steps; a stream that goes on keeps the last step's matrices, which is right once they have settled.
+    steps; a stream may go on beyond them where nothing varies over time and the matrices have settled by then.
 
     Raises:
         ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
     system = lifted_system(plant, sensor, channel, degree, horizon)
-    return PolynomialFilter(LinearSystemFilter(system, claim_of(channel)), degree)
+    inner = LinearSystemFilter(system, claim_of(channel), first(plant).states)
+    return PolynomialFilter(inner, degree, _settled(plant, sensor, channel, system))
+
+
+def _settled(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
+    """Whether a model that does not vary has come to matrices that do not change any more, to rounding."""
+    if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
+        return False
+    return all(np.allclose(part[-1], part[-2], rtol=1e-12, atol=0) for part in system.steps)
 
 
 def scheduled_polynomial_filter(
@@ -77,7 +133,7 @@ def scheduled_polynomial_filter(
     Source: as `polynomial_filter`.
     """
     system = lifted_system(plant, sensor, channel, degree, horizon)
-    return PolynomialFilter(ScheduledFilter(lmmse(system, claim_of(channel))), degree)
+    return PolynomialFilter(ScheduledFilter(lmmse(system, claim_of(channel)), first(plant).states), degree)
 
 
 class MemoryState(NamedTuple):
@@ -90,27 +146,47 @@ class MemoryState(NamedTuple):
 class MemoryFilter(AbstractFilter):
     """The quadratic filter with memory: it hears z, its squares, and the products of z and the linear estimate.
 
-    With saved gains, for complete data; see `ScheduledFilter` for what gaps do.
+    With saved gains, for complete data; see `ScheduledFilter` for what gaps do, `PolynomialFilter` for the innovation.
     """
 
     linear: ScheduledFilter
     products: ScheduledFilter
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim):
+        self.linear, self.products, self.claim = linear, products, claim
+        self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
 
     @in_float64
     def init(self) -> MemoryState:
         """Both filters' starts."""
         return MemoryState(self.linear.init(), self.products.init())
 
-    @compiled
-    def step(self, state: MemoryState, z: Any, u: Any = (), k: Any = 0) -> tuple[MemoryState, Estimate]:
-        """Step the linear filter, then give (z, squares, products of z and its estimate) to the other."""
-        z = jnp.asarray(z, dtype=float)
-        linear, guess = self.linear.step(state.linear, z, u, k)
-        squares = monomials(z, 2)[:-1]
-        heard = jnp.concatenate([squares, jnp.outer(z, jnp.asarray(guess.mean)).reshape(-1)])
-        products, estimate = self.products.step(state.products, heard, u, k)
-        return MemoryState(linear, products), estimate
+    @prediction
+    def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
+        """Both filters' predictions."""
+        return MemoryState(self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k))
+
+    @correction
+    def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
+        """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
+        z = jnp.asarray(z)
+        linear, _ = self.linear.correct(state.linear, z, k)
+        lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
+        products, heard = self.products.correct(state.products, lifted, k)
+        return MemoryState(linear, products), _of_degree_one(heard, z, 2)
+
+    @in_float64
+    def estimate(self, state: MemoryState) -> Estimate:
+        """The filter of the products'."""
+        return self.products.estimate(state.products)
+
+    def after_step(self, state: MemoryState, k: Step) -> Estimate:
+        """The filter of the products'."""
+        return self.products.after_step(state.products, k)
 
 
 def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
@@ -125,7 +201,8 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     claim = claim_of(channel)
     linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
     products = lmmse(memory_system(plant, sensor, channel, linear), claim)
-    return MemoryFilter(linear=ScheduledFilter(linear), products=ScheduledFilter(products), claim=claim)
+    names = first(plant).states
+    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), claim)
 
 
 def claim_of(channel: Channel) -> Claim:

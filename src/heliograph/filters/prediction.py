@@ -1,14 +1,22 @@
 """A filter's prediction as its estimate, so that it can be compared with filters that predict."""
 
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.gaussian import Belief, GaussianFilter
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike
+
+
+class Ahead(NamedTuple):
+    """The belief, and the prediction that it was corrected from."""
+
+    belief: Belief
+    prior: Belief
 
 
 class PredictionFilter(AbstractFilter):
@@ -19,17 +27,35 @@ class PredictionFilter(AbstractFilter):
 
     base: GaussianFilter
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, base: GaussianFilter):
+        self.base, self.claim = base, base.claim
+        self.states, self.inputs, self.received = base.states, base.inputs, base.received
 
     @in_float64
-    def init(self) -> Belief:
+    def init(self) -> Ahead:
         """The prior of the filter."""
-        return self.base.init()
+        return Ahead(self.base.init(), self.base.init())
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict over step k, say so, then use what arrived of z."""
-        prior = self.base.predict(state, u, k)
-        return self.base.correct(prior, z, k), Estimate(prior.mean, prior.covariance, self.claim)
+    @prediction
+    def predict(self, state: Ahead, u: ArrayLike = (), k: Step = 0) -> Ahead:
+        """The filter's prediction, kept beside what z_k will make of it."""
+        prior = self.base.predict(state.belief, u, k)
+        return Ahead(prior, prior)
+
+    @correction
+    def correct(self, state: Ahead, z: ArrayLike, k: Step = 0) -> tuple[Ahead, Innovation]:
+        """Use what arrived of z for the next step; the estimate stays."""
+        belief, heard = self.base.correct(state.belief, z, k)
+        return Ahead(belief, state.prior), heard
+
+    @in_float64
+    def estimate(self, state: Ahead) -> Estimate:
+        """The prediction."""
+        return Estimate(state.prior.mean, state.prior.covariance, self.claim)
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:
@@ -43,4 +69,4 @@ def prediction_of(filter: AbstractFilter) -> PredictionFilter:
     """
     if not isinstance(filter, GaussianFilter):
         raise fail("filter", "a GaussianFilter", type(filter).__name__)
-    return PredictionFilter(base=filter, claim=filter.claim)
+    return PredictionFilter(filter)

@@ -1,62 +1,127 @@
 """Filters whose gains were computed before any data, and the same recursion on-line for data with gaps."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.gaussian import Belief
+from heliograph.filters.innovation import innovation
+from heliograph.filters.plan import plan
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.check import names
+from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
 class ScheduleState(NamedTuple):
-    """The schedule's state (N,), and whether everything has arrived so far."""
+    """The schedule's state (N,), the estimate's mean (q,), what is expected next (m,), and whether all has arrived.
 
-    value: jax.Array
-    complete: jax.Array
+    `stage` is the place of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
+    """
+
+    value: Float[jax.Array, " N"]
+    mean: Float[jax.Array, " q"]
+    expected: Float[jax.Array, " m"]
+    complete: Bool[jax.Array, ""]
+    stage: Int[jax.Array, ""]
 
 
 class ScheduledFilter(AbstractFilter):
     """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d. A step costs a few products of a matrix and a vector.
 
-    The claimed covariance is the schedule's, and it is computed for complete data. A component that did not arrive
-    counts as what the filter expected, and from then on the bound is NaN: no covariance is known any more, and the
-    record says so. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains.
+    Predicted is what follows if what the schedule expects arrives, e = G s + g; a correction adds K (z - e) and
+    J (z - e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not
+    arrive counts as what the filter expected, and from then on the covariance is NaN: none is known any more, and the
+    record says so. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains. Before its first
+    prediction a schedule estimates nothing (NaN).
+
+    Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
     """
 
     gains: OverTime
+    covariances: np.ndarray
     start: np.ndarray
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
-    def __init__(self, schedule: Schedule):
-        self.gains, self.start, self.claim = OverTime(schedule.gains), schedule.start, schedule.claim
+    def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
+        g = schedule.gains
+        self.gains = OverTime(_if_expected(g))
+        known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
+        self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
+        self.start, self.claim = schedule.start, schedule.claim
+        self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
+        self.received = g.direct.shape[2]
 
     @in_float64
     def init(self) -> ScheduleState:
         """The schedule's start."""
-        return ScheduleState(jnp.asarray(self.start), jnp.asarray(True))
+        mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
+        return ScheduleState(jnp.asarray(self.start), mean, expected, jnp.asarray(True), jnp.asarray(0))
 
-    @compiled
-    def step(self, state: ScheduleState, z: Any, u: Any = (), k: Any = 0) -> tuple[ScheduleState, Estimate]:
-        """Apply the gains of step k; the input is not used."""
+    @prediction
+    def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
+        """What follows if what is expected arrives."""
         g: Gains = at(self.gains, k)
-        z = jnp.asarray(z, dtype=float)
-        s, present = state.value, ~jnp.isnan(z)
-        heard = jnp.where(present, z, g.expected @ s + g.expected_offset)
-        complete = state.complete & jnp.all(present)
-        estimate = g.output @ s + g.direct @ heard + g.output_offset
-        following = g.transition @ s + g.gain @ heard + g.offset
-        bound = jnp.where(complete, g.covariance, jnp.nan)
-        return ScheduleState(following, complete), Estimate(estimate, bound, self.claim)
+        s = state.value
+        return ScheduleState(
+            g.transition @ s + g.offset,
+            g.output @ s + g.output_offset,
+            g.expected @ s + g.expected_offset,
+            state.complete,
+            jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
+        )
+
+    @correction
+    def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
+        """Add what was not expected, times the gains of step k."""
+        g: Gains = at(self.gains, k)
+        z = jnp.asarray(z)
+        present = ~jnp.isnan(z)
+        heard = jnp.where(present, z - state.expected, 0.0)
+        after = ScheduleState(
+            state.value + g.gain @ heard,
+            state.mean + g.direct @ heard,
+            state.expected,
+            state.complete & jnp.all(present),
+            jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
+        )
+        return after, innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
+
+    @in_float64
+    def estimate(self, state: ScheduleState) -> Estimate:
+        """The estimate's mean, with the schedule's covariance while all has arrived."""
+        return self._estimate(state, state.stage)
+
+    def after_step(self, state: ScheduleState, k: Step) -> Estimate:
+        """The same, its place taken from the step: it is then common to all runs."""
+        return self._estimate(state, 2 * k + 2)
+
+    def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
+        claimed = jnp.where(state.complete, jnp.asarray(self.covariances)[stage], jnp.nan)
+        return Estimate(state.mean, claimed, self.claim)
+
+
+def _if_expected(g: Gains) -> Gains:
+    """The gains with e = G s + g in place of z: (F + K G) s + c + K g, (L + J G) s + d + J g."""
+    return g._replace(
+        transition=g.transition + g.gain @ g.expected,
+        offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
+        output=g.output + g.direct @ g.expected,
+        output_offset=g.output_offset + np.einsum("tim,tm->ti", g.direct, g.expected_offset),
+    )
 
 
 class LinearSystemFilter(AbstractFilter):
@@ -71,32 +136,49 @@ class LinearSystemFilter(AbstractFilter):
     covariance: np.ndarray
     want: np.ndarray
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
-    def __init__(self, system: LinearSystem, claim: Claim = "exact"):
+    def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
         self.steps = OverTime(system.steps)
         self.mean, self.covariance, self.want = system.mean, system.covariance, system.want
-        self.claim = claim
+        self.claim, self.inputs = claim, ()
+        self.states = names("state names", states, len(system.want), "x")
+        self.received = system.steps.offset.shape[-1]
 
     @in_float64
     def init(self) -> Belief:
         """The system's start."""
         return Belief(jnp.asarray(self.mean), jnp.asarray(self.covariance))
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict, then use what arrived of z; the input is not used."""
+    @prediction
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """A y + a and A P A' + Cov(w)."""
         s: Steps = at(self.steps, k)
-        z = jnp.asarray(z, dtype=float)
+        return Belief(s.transition @ state.mean + s.drift, s.transition @ state.covariance @ s.transition.T + s.process)
+
+    @correction
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Use what arrived of z."""
+        s: Steps = at(self.steps, k)
+        z, (mean, spread) = jnp.asarray(z), state
         present = ~jnp.isnan(z)
-        mean = s.transition @ state.mean + s.drift
-        spread = s.transition @ state.covariance @ s.transition.T + s.process
+        expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
-        innovation = jnp.where(present, z - s.output @ mean - s.offset, 0.0)
-        both = present[:, None] & present
-        gain = _solve(jnp.where(both, s.output @ spread @ s.output.T + s.noise, 0.0), cross).T
-        after = Belief(mean + gain @ innovation, symmetrize(spread - gain @ cross))
+        gain = _solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
+        after = Belief(mean + gain @ jnp.where(present, z - expected, 0.0), symmetrize(spread - gain @ cross))
+        return after, innovation(z, expected, total)
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """What is to be known of the belief."""
         want = jnp.asarray(self.want)
-        return after, Estimate(want @ after.mean, want @ after.covariance @ want.T, self.claim)
+        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs, self.want)
 
 
 def _solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:

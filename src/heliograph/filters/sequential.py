@@ -1,19 +1,19 @@
 """The central filter: it hears all nodes, predicts once, and uses their measurements one after another."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.gaussian import Belief, GaussianFilter
-from heliograph.model.estimate import Claim, Estimate, weakest
-from heliograph.model.over_time import OverTime, alike, first, stack
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.over_time import alike, stack
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
 
 
 class SequentialFilter(AbstractFilter):
@@ -21,38 +21,55 @@ class SequentialFilter(AbstractFilter):
 
     The posterior of one node is the prior of the next. Behind uncertain gains the first correction is not a conditional
     mean, so a next one that assumes E[e yhat'] = 0 (`ZeroMean`) is no bound: the claim is "nominal" unless every part
-    is exact.
+    is exact. The innovations are those of node after node, each given the nodes before it: the covariance has a block
+    for each, and the log-likelihood is their sum, which is that of all.
     """
 
     filters: tuple[GaussianFilter, ...]
-    lengths: tuple[int, ...] = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
     @in_float64
     def init(self) -> Belief:
         """The first node's prior."""
         return self.filters[0].init()
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict over step k, then use what arrived from each node."""
-        after = self.filters[0].predict(state, u, k)
-        after = self._correct(after, jnp.asarray(z, dtype=float), k)
-        return after, Estimate(after.mean, after.covariance, self.claim)
+    @prediction
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """As the first node's filter does."""
+        return self.filters[0].predict(state, u, k)
 
-    def _correct(self, prior: Belief, z: jax.Array, k: Any) -> Belief:
+    @correction
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Use what arrived from each node in turn."""
+        z = jnp.asarray(z)
         if all(alike(item, self.filters[0]) for item in self.filters):  # one correction compiled, run over the nodes
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
-            def correct(belief: Belief, item: tuple[Any, jax.Array]) -> tuple[Belief, None]:
+            def correct(belief: Belief, item: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
                 one: GaussianFilter = eqx.combine(item[0], rest)
-                return one.correct(belief, item[1], k), None
+                return one.correct(belief, item[1], k)
 
-            return jax.lax.scan(correct, prior, (arrays, z.reshape(len(self.filters), -1)))[0]
-        ends = np.cumsum(self.lengths)
+            state, heard = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
+            return state, _joined([jax.tree.map(lambda leaf: leaf[i], heard) for i in range(len(self.filters))])  # noqa: B023
+        ends, each = np.cumsum([item.received for item in self.filters]), []
         for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
-            prior = item.correct(prior, part, k)
-        return prior
+            state, one = item.correct(state, part, k)
+            each.append(one)
+        return state, _joined(each)
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The belief."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+
+def _joined(each: Sequence[Innovation]) -> Innovation:
+    covariance = jax.scipy.linalg.block_diag(*(one.covariance for one in each))
+    total = jnp.sum(jnp.stack([jnp.asarray(one.log_likelihood) for one in each]))
+    return Innovation(jnp.concatenate([one.value for one in each]), covariance, total)
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
@@ -65,16 +82,14 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
     Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
     """
     parts = tuple(filters)
-    if len({len(first(item.plant).states) for item in parts}) != 1:
-        raise fail("sequential filter", "filters of one state dimension", [len(first(f.plant).states) for f in parts])
+    sizes = [(len(item.states), len(item.inputs)) for item in parts]
+    if len(set(sizes)) != 1:
+        raise fail("sequential filter", "filters of as many states and inputs each", sizes)
     weakest_part = weakest([item.claim for item in parts])
     return SequentialFilter(
         filters=parts,
-        lengths=tuple(_received(item) for item in parts),
         claim="exact" if weakest_part == "exact" else "nominal",
+        states=parts[0].states,
+        inputs=parts[0].inputs,
+        received=sum(item.received for item in parts),
     )
-
-
-def _received(item: GaussianFilter) -> int:
-    channel = item.channel.values if isinstance(item.channel, OverTime) else item.channel
-    return int(channel.offset.shape[-1])

@@ -17,7 +17,13 @@ from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Discrete
-from heliograph.random_affine.second_order import QuadraticMap, SecondOrder, second_order, symmetric_product
+from heliograph.random_affine.second_order import (
+    QuadraticMap,
+    SecondOrder,
+    nominal_spread,
+    second_order,
+    symmetric_product,
+)
 
 
 class AbstractUpdate(eqx.Module):
@@ -164,4 +170,4 @@ def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopR
 
     zero = np.zeros_like(noise)
     parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
-    return SecondOrder(gain, np.zeros(len(noise)), *parts, shift > 0)
+    return SecondOrder(gain, np.zeros(len(noise)), *parts, nominal_spread(channel), shift > 0)

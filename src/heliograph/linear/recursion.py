@@ -64,12 +64,13 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     rounding, worst, when = np.zeros_like(spread), 0.0, 0
     for k in range(system.horizon):
         s = system.step(k)
-        gain, _, spread = covariance_step(spread, s)
+        gain, predicted, spread = covariance_step(spread, s)
         keep = np.eye(len(spread)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset
         estimate, claimed = (want @ transition, want @ gain, want @ offset), want @ spread @ want.T
-        parts.append((transition, gain, offset, *estimate, *expected, claimed))
+        before = want @ predicted @ want.T, s.output @ predicted @ s.output.T + s.noise
+        parts.append((transition, gain, offset, *estimate, *expected, claimed, *before))
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
         error = np.diag(want @ rounding @ want.T)

@@ -14,9 +14,11 @@ class Gains(NamedTuple):
     """One row per step: s+ = F s + K z + c and xhat = L s + J z + d, with s the state before the step.
 
     `expected` (and `expected_offset`) say what z the filter expects, G s + g: it stands in for what did not arrive.
+    `covariance` is that of x - xhat, `predicted` that of x - L s - J (G s + g) - d, before z; `innovation` is that of
+    z - G s - g. NaN in the last two where nobody knows.
     Shapes: transition F (time, N, N), gain K (time, N, m), offset c (time, N), output L (time, q, N), direct J
     (time, q, m), output_offset d (time, q), expected G (time, m, N), expected_offset g (time, m), covariance
-    (time, q, q).
+    (time, q, q), predicted (time, q, q), innovation (time, m, m).
     """
 
     transition: np.ndarray
@@ -28,13 +30,19 @@ class Gains(NamedTuple):
     expected: np.ndarray
     expected_offset: np.ndarray
     covariance: np.ndarray
+    predicted: np.ndarray
+    innovation: np.ndarray
+
+
+PERHAPS = ("predicted", "innovation")  # fields that may be unknown
 
 
 class Schedule(eqx.Module):
     """A linear filter over time from the state `start` (N,); `covariance` is claimed for complete data.
 
     Raises:
-        ValueError: shapes that do not fit, numbers that are not finite, an unknown claim.
+        ValueError: shapes that do not fit, numbers that are not finite (the last two fields may be NaN), an unknown
+            claim.
     """
 
     gains: Gains
@@ -47,10 +55,10 @@ class Schedule(eqx.Module):
         q = np.shape(gains.output_offset)[-1]
         shapes: tuple[tuple[int, ...], ...] = (
             (time, n, n), (time, n, m), (time, n), (time, q, n), (time, q, m), (time, q), (time, m, n), (time, m),
-            (time, q, q),
+            (time, q, q), (time, q, q), (time, m, m),
         )  # fmt: skip
-        checked = [array(f"schedule {f}", v, s) for f, v, s in zip(Gains._fields, gains, shapes, strict=True)]
-        self.gains = Gains(*checked)
+        named = zip(Gains._fields, gains, shapes, strict=True)
+        self.gains = Gains(*((_known if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
         if claim not in STRENGTH:
@@ -66,6 +74,13 @@ class Schedule(eqx.Module):
         """Write the arrays to a NumPy file (.npz), for another program or another day."""
         with open(path, "wb") as file:
             np.savez(file, start=self.start, claim=np.array(self.claim), **self.gains._asdict())
+
+
+def _known(name: str, value: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """An array of the given shape, NaN where it is not known."""
+    unknown = np.isnan(value)
+    checked = array(name, np.where(unknown, 0.0, value), shape)
+    return np.where(unknown, np.nan, checked)
 
 
 def load_schedule(path: str | Path) -> Schedule:

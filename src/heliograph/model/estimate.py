@@ -1,10 +1,10 @@
-"""An estimate: mean, covariance, and what the covariance claims to be."""
+"""An estimate and what its covariance claims to be; an innovation and how likely the filter finds it."""
 
 from typing import Literal
 
 import equinox as eqx
-import jax
-import numpy as np
+
+from heliograph.numerics.types import Array, Float
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
@@ -19,9 +19,25 @@ class Estimate(eqx.Module):
     Shapes: mean (..., n), covariance (..., n, n).
     """
 
-    mean: jax.Array | np.ndarray
-    covariance: jax.Array | np.ndarray
+    mean: Float[Array, "... n"]
+    covariance: Float[Array, "... n n"]
     claim: Claim = eqx.field(static=True)
+
+
+class Innovation(eqx.Module):
+    """What a measurement says that the filter did not expect, and how likely the filter finds it.
+
+    value: z - E[z | what came before]; covariance: what the filter believes of it. Both are NaN in the components that
+    did not arrive. log_likelihood: log p(components that arrived | what came before) as the filter sees it, 0 when
+    nothing arrived; a Gaussian one, log N(value; 0, covariance), unless the filter says otherwise. A filter that claims
+    no covariance has none: then all but the value is NaN.
+
+    Shapes: value (..., m), covariance (..., m, m), log_likelihood (...).
+    """
+
+    value: Float[Array, "... m"]
+    covariance: Float[Array, "... m m"]
+    log_likelihood: Float[Array, "..."]
 
 
 def weakest(claims: list[Claim]) -> Claim:

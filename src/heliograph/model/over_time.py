@@ -82,7 +82,7 @@ def over_time(items: Sequence[Any]) -> OverTime:
     return OverTime(stack(items))
 
 
-def at(tree: Any, k: int | Int[Array, ""]) -> Any:
+def at(tree: Any, k: int | np.integer | np.ndarray | Int[Array, ""]) -> Any:
     """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values."""
 
     def read(leaf: Any) -> Any:

@@ -40,6 +40,8 @@ class SecondOrder(eqx.Module):
     gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
     shift: ((M_v - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored).
 
+    nominal: the spread under the nominal law itself.
+
     Shapes: gain (m, p), offset (m,).
     """
 
@@ -48,6 +50,7 @@ class SecondOrder(eqx.Module):
     spread: QuadraticMap
     shift: QuadraticMap
     power: QuadraticMap
+    nominal: QuadraticMap
     uncertain: bool = eqx.field(static=True)
 
     @property
@@ -80,7 +83,16 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
         parts = [_dominate(np.array(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
-    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], not _is_known(channel))
+    return SecondOrder(
+        mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], nominal_spread(channel), not _is_known(channel)
+    )
+
+
+def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
+    """Cov(z | y) under the nominal law."""
+    nominal = channel.moments(2)
+    spread = _tensors(nominal, nominal.mean[:-1])[0]
+    return QuadraticMap(spread, np.zeros_like(spread))
 
 
 def _few_corners(channel: AbstractRandomAffine) -> bool:

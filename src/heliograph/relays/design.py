@@ -4,13 +4,14 @@ from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import compiled
-from heliograph.relays.second_moments import Propagated, initial_moments, propagate
+from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
 
 GainsByFilter = Mapping[str, Any]
 
@@ -114,16 +115,27 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     steps = network.steps(len(design.moments) - 1)
     rows, constants = expected_maps(steps)
+    n, before = len(network.states), np.asarray(_before_correction(steps, design.moments[:-1]))
+    d = design.moments.shape[-1]
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
     result = {}
-    for name, heard in zip(network.filters, network.received, strict=True):
+    for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
         mine = slice(ends[name] - heard, ends[name])
+        error = slice((1 + f) * n, (2 + f) * n)
+        believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
         gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]
         transition = steps.transition - gain @ expected
         offset = steps.drift - np.einsum("kir,kr->ki", gain, constant)
         moved = transition, gain, offset
-        arrays = Gains(*moved, *moved, expected, constant, design.covariance[name][1:])
+        arrays = Gains(*moved, *moved, expected, constant, *believed)
         result[name] = Schedule(arrays, network.initial()[0], "exact")
+    return result
+
+
+@compiled
+def _before_correction(steps: Steps, moments: Any) -> jax.Array:
+    """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, (time, d + R, d + R)."""
+    result: jax.Array = jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
     return result
 
 

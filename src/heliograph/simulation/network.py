@@ -36,6 +36,7 @@ class Node(eqx.Module):
         _check_type("channel", first(channel), AbstractRandomAffine)
         for name, item in self.filters.items():
             _check_type(f"filter {name!r}", item, AbstractFilter)
+            _check_received(f"filter {name!r}", item, self.received)
 
     @property
     def received(self) -> int:
@@ -70,6 +71,8 @@ class Network(eqx.Module):
         for name, node in self.nodes.items():
             _check_type(f"node {name!r}", node, Node)
             check_link(first(node.sensor), first(node.channel), len(self.states))
+            for filter_, one in node.filters.items():
+                self._check_sizes(f"filter {filter_!r} of node {name!r}", one)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -80,6 +83,13 @@ class Network(eqx.Module):
                 self._fused_claim(item)
             else:
                 _check_type(f"fused {name!r}", item, AbstractFilter)
+                _check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
+                self._check_sizes(f"fused {name!r}", item)
+
+    def _check_sizes(self, name: str, item: AbstractFilter) -> None:
+        for what, own, theirs in (("states", self.states, item.states), ("inputs", self.inputs, item.inputs)):
+            if len(own) != len(theirs):
+                raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
 
     def nodes_with(self, name: str) -> list[str]:
         """Names of the nodes that have the filter `name`, in the given order.
@@ -122,6 +132,11 @@ class Network(eqx.Module):
         covered = steps_covered(self)
         if covered is not None and horizon > covered:
             raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
+
+
+def _check_received(name: str, item: AbstractFilter, received: int) -> None:
+    if item.received not in (0, received):  # 0: it does not listen
+        raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
 
 
 def _check_type(name: str, value: Any, expected: type) -> None:

@@ -1,18 +1,14 @@
 """One filter on live data: push a measurement, read the estimate."""
 
-from typing import Any
-
-import numpy as np
-
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import fail
+from heliograph.numerics.types import ArrayLike
 
 
 class Stream:
     """Feed a filter one sample at a time; it holds the filter's state and the step counter.
 
-    The numbers are those of `run` over the same data. Raises ValueError for a measurement that is infinite.
+    The numbers are those of `run` over the same data.
     """
 
     def __init__(self, filter_: AbstractFilter):
@@ -20,15 +16,13 @@ class Stream:
         self.steps = 0
         self._state = filter_.init()
 
-    def push(self, measurement: Any, inputs: Any = ()) -> Estimate:
+    def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> Estimate:
         """Advance one step: `inputs` led to this `measurement` (NaN where a component did not arrive).
 
         Raises:
-            ValueError: an infinite measurement; the state stays as it was.
+            ValueError: a measurement or inputs that are not the filter's, infinite values, an input that is NaN, a
+                step past the end of what varies over time; the state stays as it was.
         """
-        z = np.atleast_1d(np.asarray(measurement, dtype=np.float64))
-        if np.any(np.isinf(z)):
-            raise fail("measurement", "numbers, or NaN for what is missing", z.tolist())
-        self._state, estimate = self.filter.step(self._state, z, np.asarray(inputs, dtype=np.float64), self.steps)
+        self._state, estimate = self.filter.step(self._state, measurement, inputs, self.steps)
         self.steps += 1
         return estimate

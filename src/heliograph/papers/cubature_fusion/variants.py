@@ -1,20 +1,20 @@
 """Algorithm 1 read literally where it contradicts its own theorems: each reading as a filter of its own."""
 
-from typing import Any
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 import heliograph as hg
-from heliograph.filters.base import AbstractFilter
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, GaussianFilter, corrected
 from heliograph.filters.update import AbstractUpdate
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.types import ArrayLike
 from heliograph.papers.cubature_fusion.loose_interval import LooseInterval
 from heliograph.papers.cubature_fusion.setting import Setting, cubature
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -70,29 +70,56 @@ def cubature_points(mean: jax.Array, covariance: jax.Array) -> jax.Array:
     return jnp.concatenate([mean + offsets, mean - offsets])
 
 
+class Propagated(NamedTuple):
+    """A belief, and the points (2 n, n) that were moved to predict it."""
+
+    mean: jax.Array
+    covariance: jax.Array
+    points: jax.Array
+
+
 class MixedCross(AbstractFilter):
     """Step 3's P^xy: propagated points on one side, redrawn points on the other."""
 
     base: GaussianFilter
     claim: Claim = eqx.field(static=True)
 
-    def init(self) -> Belief:
-        """The prior."""
-        return self.base.init()
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
 
-    @compiled
-    def step(self, state: Belief, z: Any, u: Any = (), k: Any = 0) -> tuple[Belief, Estimate]:
-        """Predict, redraw for y only, correct."""
-        plant, sensor, channel = (at(item, k) for item in (self.base.plant, self.base.sensor, self.base.channel))
-        propagated = jax.vmap(lambda x: plant.transition(x, u))(cubature_points(*state))
-        prior = self.base.predict(state, u, k)
+    def __init__(self, base: GaussianFilter):
+        self.base, self.claim = base, "nominal"
+        self.states, self.inputs, self.received = base.states, base.inputs, base.received
+
+    def init(self) -> Propagated:
+        """The prior."""
+        start = self.base.init()
+        return Propagated(*start, jnp.zeros((2 * len(start.mean), len(start.mean))))
+
+    @prediction
+    def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
+        """Move the points, and keep them."""
+        plant, (mean, covariance, _) = at(self.base.plant, k), state
+        points = jax.vmap(lambda x: plant.transition(x, jnp.asarray(u)))(cubature_points(mean, covariance))
+        return Propagated(*self.base.predict(Belief(mean, covariance), u, k), points)
+
+    @correction
+    def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
+        """Redraw for y only, correct."""
+        sensor, channel = at(self.base.sensor, k), at(self.base.channel, k)
+        prior = Belief(state.mean, state.covariance)
         y = jax.vmap(sensor.measure)(cubature_points(*prior))
         mean, count = y.mean(axis=0), len(y)
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
-        cross = (propagated - prior.mean).T @ (y - mean) / count
+        cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        after = corrected(prior, signal, channel, self.base.update, jnp.asarray(z, dtype=float))
-        return after, Estimate(after.mean, after.covariance, self.claim)
+        after, heard = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
+        return Propagated(*after, state.points), heard
+
+    def estimate(self, state: Propagated) -> Estimate:
+        """The belief."""
+        return Estimate(state.mean, state.covariance, self.claim)
 
 
 def variants(s: Setting, node: int) -> dict[str, AbstractFilter]:
@@ -100,7 +127,7 @@ def variants(s: Setting, node: int) -> dict[str, AbstractFilter]:
     printed, polytope = (rule(hg.Scalars(*s.beta)) for rule in (LooseInterval, hg.Polytope))
     return {
         "step_four_gain": cubature(s, node, StepFourGain(printed, s.mean_gain**-0.5)),
-        "mixed_cross": MixedCross(base=cubature(s, node, polytope), claim="nominal"),
+        "mixed_cross": MixedCross(cubature(s, node, polytope)),
         "central_moment": cubature(s, node, CentralMoment(polytope)),
         "raw_moment": cubature(s, node, RawMoment(polytope)),
     }

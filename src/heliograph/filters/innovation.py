@@ -1,0 +1,83 @@
+"""The innovation of a measurement: its value, the covariance that a filter believes, and its log-likelihood."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.correction import Signal, homogeneous
+from heliograph.model.estimate import Innovation
+from heliograph.numerics.small_matrix import (
+    PIVOT_TOLERANCE,
+    UNROLL_LIMIT,
+    congruence,
+    rounding,
+    runs_last,
+)
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.second_order import SecondOrder
+
+OFF_SUPPORT = 1e-6  # standard deviations, and
+OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
+
+
+def innovation(z: Float[Array, " m"], expected: Float[Array, " m"], covariance: Float[Array, "m m"]) -> Innovation:
+    """z - expected and its Gaussian log-likelihood; NaN where a component did not arrive."""
+    present = ~jnp.isnan(z)
+    value, both = jnp.asarray(z - expected), present[:, None] & present
+    likelihood = log_density(value, jnp.asarray(covariance), jnp.abs(z) + jnp.abs(expected))
+    return Innovation(value, jnp.where(both, covariance, jnp.nan), likelihood)
+
+
+def no_innovation() -> Innovation:
+    """Of a filter that does not listen."""
+    return Innovation(jnp.zeros(0), jnp.zeros((0, 0)), jnp.zeros(()))
+
+
+def innovation_covariance(signal: Signal, channel: SecondOrder) -> Float[Array, "m m"]:
+    """M Cov(y) M' + E[((G - M) y + n - b)(...)'] under the nominal law, for the signal y as the filter sees it."""
+    return _innovation_covariance(signal, channel)
+
+
+@runs_last
+def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
+    second = homogeneous(signal.second, signal.mean, 1.0)
+    everything = jnp.ones((len(channel.gain), *second.shape[2:]), dtype=bool)
+    return congruence(channel.gain, signal.covariance) + channel.nominal(second, everything)
+
+
+@runs_last
+def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
+    """log N(value; 0, covariance) of the components that are not NaN, 0 if none is.
+
+    Component after component given those before it: sum_j -(d_j^2 / s_j + log(2 pi s_j)) / 2, s_j the pivots of the
+    covariance. A component that those before it determine (s_j = 0) adds nothing where it says what they say, and
+    -inf where it does not: the density is that of the components which are free. `size` (m,) is what value is a
+    difference of, for its rounding. An indefinite covariance gives NaN.
+    """
+    m = value.shape[0]
+    present = ~jnp.isnan(value)
+    rest = jnp.where(present, value, 0.0)
+    left = jnp.where(present[:, None] & present[None], covariance, 0.0)
+    rest = jnp.broadcast_to(rest, left.shape[1:])
+    variance = jnp.stack([left[j, j] for j in range(m)]) if m else rest
+    tolerance = rounding(PIVOT_TOLERANCE, value) * variance
+    reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
+
+    def condition(j: int | jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        rest, left, total = carry
+        pivot = left[j, j]
+        determined = jnp.abs(pivot) <= tolerance[j]
+        safe = jnp.where(determined, 1.0, pivot)
+        density = -(rest[j] ** 2 / safe + jnp.log(2 * np.pi * safe)) / 2
+        agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)
+        column = jnp.where(determined, 0.0, left[:, j] / safe)
+        after = rest - column * rest[j], left - column[:, None] * left[j][None]
+        return *after, total + jnp.where(determined, agrees, density)
+
+    carry: tuple[jax.Array, ...] = (rest, left, jnp.zeros_like(jnp.sum(left, axis=(0, 1))))
+    if m > UNROLL_LIMIT:
+        carry = jax.lax.fori_loop(0, m, condition, carry)
+        return carry[2]
+    for j in range(m):
+        carry = condition(j, carry)
+    return carry[2]

@@ -1,0 +1,152 @@
+"""A linear filter computed before any data: where nothing but its mean depends on what arrives."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.innovation import innovation
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import array
+from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.small_matrix import runs_last, times_vector
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
+
+
+class Plan(NamedTuple):
+    """One step: m- = F m + f, m = m- + K (z - C m- - c), with the innovation's covariance S for complete data.
+
+    Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m).
+    """
+
+    transition: jax.Array
+    drift: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    offset: jax.Array
+    innovation: jax.Array
+
+
+class PlannedMean(NamedTuple):
+    """The mean (N,), and the place of its covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k."""
+
+    mean: Float[jax.Array, " N"]
+    stage: Int[jax.Array, ""]
+
+
+class PlannedFilter(AbstractFilter):
+    """A filter whose gains and covariances are known for each step; only the mean is left to compute.
+
+    For the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built by
+    `planned` of a filter whose gains do not depend on data.
+
+    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); xhat = want m.
+    """
+
+    steps: OverTime
+    covariances: Array
+    start: Array
+    want: Array | None
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> PlannedMean:
+        """The mean at the start."""
+        return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
+
+    @prediction
+    def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
+        """F m + f; the input is in f."""
+        p: Plan = at(self.steps, k)
+        return PlannedMean(_affine(p.transition, state.mean, p.drift), _stage(state, 2 * k + 1))
+
+    @correction
+    def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
+        """m + K (z - C m - c)."""
+        p: Plan = at(self.steps, k)
+        expected = _affine(p.output, state.mean, p.offset)
+        mean = _affine(p.gain, jnp.asarray(z) - expected, state.mean)
+        return PlannedMean(mean, _stage(state, 2 * k + 2)), innovation(jnp.asarray(z), expected, p.innovation)
+
+    @in_float64
+    def estimate(self, state: PlannedMean) -> Estimate:
+        """The mean, with the covariance that was planned."""
+        return self._estimate(state.mean, state.stage)
+
+    def after_step(self, state: PlannedMean, k: Step) -> Estimate:
+        """The same, its place taken from the step: it is then common to all runs."""
+        return self._estimate(state.mean, 2 * k + 2)
+
+    def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
+        told = mean if self.want is None else _affine(self.want, mean, jnp.zeros(len(self.want)))
+        return Estimate(told, jnp.asarray(self.covariances)[stage], self.claim)
+
+
+@runs_last
+def _affine(matrix: Array, x: Array, offset: Array) -> jax.Array:
+    return times_vector(matrix, jnp.asarray(x)) + offset
+
+
+def _stage(state: PlannedMean, stage: Step) -> jax.Array:
+    return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
+
+
+def plan(item: AbstractFilter, inputs: Float[Array, "horizon inputs"], want: Array | None = None) -> PlannedFilter:
+    """Follow a filter over complete data and read its matrices off it; its state has a `mean` and a `covariance`.
+
+    Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
+
+    Raises:
+        ValueError: inputs of another number than the filter's.
+    """
+    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), want)
+
+
+@compiled
+def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFilter:
+    quiet = jnp.zeros(item.received)
+
+    def body(state: Any, row: tuple[jax.Array, jax.Array]) -> tuple[Any, tuple[Plan, jax.Array]]:
+        k, u = row
+        prior = item.predict(state, u, k)
+        after, heard = item.correct(prior, quiet, k)
+        none = jnp.zeros_like(state.mean)
+
+        def moved(mean: jax.Array) -> jax.Array:
+            return jnp.asarray(item.predict(state._replace(mean=mean), u, k).mean)
+
+        def listened(mean: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+            later, one = item.correct(prior._replace(mean=mean), z, k)
+            return later.mean, jnp.asarray(one.value)
+
+        _, output = jax.jacfwd(listened, 0)(none, quiet)
+        gain, _ = jax.jacfwd(listened, 1)(none, quiet)
+        offset = -listened(none, quiet)[1]
+        one = Plan(jax.jacfwd(moved)(none), moved(none), gain, -output, offset, jnp.asarray(heard.covariance))
+        return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
+
+    start = item.init()
+    start = jax.tree.map(jnp.asarray, start)
+    _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
+    each = covariances.reshape(-1, *covariances.shape[2:])
+    known = jnp.concatenate([_seen(start.covariance, want)[None], each])
+    return PlannedFilter(
+        steps=OverTime(steps),
+        covariances=known,
+        start=start.mean,
+        want=want,
+        claim=item.claim,
+        states=item.states,
+        inputs=item.inputs,
+        received=item.received,
+    )
+
+
+def _seen(covariance: jax.Array, want: Array | None) -> jax.Array:
+    return covariance if want is None else jnp.asarray(want) @ covariance @ jnp.asarray(want).T

@@ -1,0 +1,58 @@
+"""How likely a filter finds a run of data: the sum of what its corrections say."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
+
+
+def log_likelihood(filter: AbstractFilter, measurements: ArrayLike, inputs: ArrayLike | None = None) -> Scalar:
+    """log p(z_1, z_2, ...) as the filter sees it: the sum of its innovations' log-likelihoods, in nats.
+
+    Exact for the Kalman filter of a linear Gaussian system; nominal, and still what a fit can maximise, elsewhere. NaN
+    in the measurements did not arrive and counts nothing. `jax.grad` passes through it, with respect to any array of
+    the filter, in the precision of the trace (`jax.enable_x64`).
+
+    Shapes: measurements (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: measurements or inputs of the wrong shape, infinite values, more steps than the filter covers.
+    Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
+    """
+    z = _rows("measurements", measurements, None, filter.received, missing=True)
+    steps = len(z)
+    if not len(filter.inputs) and inputs is None:
+        inputs = np.zeros((steps, 0))
+    u = _rows("inputs", inputs, steps, len(filter.inputs), missing=False)
+    if filter.horizon is not None and steps > filter.horizon:
+        raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", steps)
+    total = _sum(filter, z, u)
+    return total if isinstance(total, jax.core.Tracer) else float(total)
+
+
+def _rows(name: str, value: ArrayLike | None, steps: int | None, length: int, missing: bool) -> Float[Array, "steps n"]:
+    """An array of `length` numbers a step; NaN where `missing` is allowed."""
+    if isinstance(value, jax.core.Tracer):
+        return value
+    try:
+        found = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise fail(name, "an array of numbers", repr(value)[:60]) from None
+    found = found[:, None] if found.ndim == 1 and length == 1 else found
+    gaps = np.isnan(found) & missing
+    return np.where(gaps, np.nan, array(name, np.where(gaps, 0.0, found), (steps, length)))
+
+
+@compiled
+def _sum(item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+        k, z_k, u_k = row
+        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
+        return after, jnp.asarray(heard.log_likelihood)
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    return jnp.sum(jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1])
