@@ -1,0 +1,19 @@
+"""The few types that signatures are written in; the tests check the shapes (a letter is one size within a call).
+
+A public input that becomes an array: `covariance: ArrayLike`, checked by numerics/check and its shape in the docstring.
+An array already, or returned: `def gain(p: Float[Array, "n n"], c: Float[Array, "m n"]) -> Float[Array, "n m"]`.
+A state or a description made of arrays: `state: PyTree`; one number, Python's or an array's: `Scalar`.
+"""
+
+from typing import TypeAlias
+
+import jax
+import numpy as np
+import numpy.typing
+from jaxtyping import Bool, Float, Int, Key, PyTree
+
+Array: TypeAlias = jax.Array | np.ndarray
+ArrayLike: TypeAlias = numpy.typing.ArrayLike | float | int  # a float is a complex to mypy, but not to beartype
+Scalar: TypeAlias = float | Float[Array, ""]
+
+__all__ = ["Array", "ArrayLike", "Bool", "Float", "Int", "Key", "PyTree", "Scalar"]
