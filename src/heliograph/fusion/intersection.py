@@ -1,6 +1,6 @@
 """Covariance intersection on arrays: the intersection itself, and the weights that make its trace smallest."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +19,7 @@ from heliograph.numerics.small_matrix import (
     trace,
     transpose,
 )
+from heliograph.numerics.types import Float
 
 GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding leaves about 1e-13
 LOOP = 1000  # units of rounding below which the certificate makes no progress
@@ -28,22 +29,24 @@ SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks t
 
 
 @runs_last
-def intersect(means: jax.Array, information: jax.Array, weights: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """(sum w J)^-1 sum w J x and (sum w J)^-1, from information matrices J (count, n, n)."""
+def intersect(
+    means: Float[jax.Array, "count n *#runs"],
+    information: Float[jax.Array, "count n n *#runs"],
+    weights: Float[jax.Array, "count *#runs"],
+) -> tuple[Float[jax.Array, "n *#runs"], Float[jax.Array, "n n *#runs"]]:
+    """(sum w J)^-1 sum w J x and (sum w J)^-1, from information matrices J."""
     count = means.shape[0]
-    bound = inverse(_weighted(weights, information))
+    covariance = inverse(_weighted(weights, information))
     vector = add([weights[k] * times_vector(information[k], means[k]) for k in range(count)])
-    return times_vector(bound, vector), bound
+    return times_vector(covariance, vector), covariance
 
 
 @runs_last
-def trace_optimal_weights(information: jax.Array) -> jax.Array:
+def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> Float[jax.Array, "count *#runs"]:
     """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
 
     The gradient is g_k = -tr(P J_k P), and max_k tr(P J_k P) - tr P bounds the excess over the minimum (convexity); the
     iteration stops when this certificate is below GAP tr P.
-
-    Shapes: (count, n, n) -> (count,).
     """
     count = information.shape[0]
     scaled = information / (add([trace(j) for j in information]) / count)
@@ -67,38 +70,44 @@ def trace_optimal_weights(information: jax.Array) -> jax.Array:
 
 
 class _Point(NamedTuple):
-    """Weights and their multipliers (count, ...); tr P, its gradient (count, ...) and Hessian (count, count, ...)."""
+    """Weights and their multipliers; tr P, its gradient and Hessian."""
 
-    weights: jax.Array
-    slack: jax.Array
-    trace: jax.Array
-    gradient: jax.Array
-    hessian: jax.Array
+    weights: Float[jax.Array, "count *#runs"]
+    slack: Float[jax.Array, "count *#runs"]
+    trace: Float[jax.Array, "*#runs"]
+    gradient: Float[jax.Array, "count *#runs"]
+    hessian: Float[jax.Array, "count count *#runs"]
 
 
-def relative_gap(information: jax.Array, weights: jax.Array) -> jax.Array:
+def relative_gap(
+    information: Float[jax.Array, "count n n"], weights: Float[jax.Array, "count"]
+) -> Float[jax.Array, ""]:
     """Certificate max_k tr(P J_k P) / tr P - 1 of how far tr P may be above its minimum, relative to itself."""
-    bound = inverse(jnp.tensordot(weights, information, axes=1))
-    square = bound @ bound
-    return jnp.max(jnp.einsum("kij,ij->k", information, square)) / jnp.trace(bound) - 1
+    covariance = inverse(jnp.tensordot(weights, information, axes=1))
+    square = covariance @ covariance
+    return jnp.max(jnp.einsum("kij,ij->k", information, square)) / jnp.trace(covariance) - 1
 
 
-def _trace_derivatives(information: jax.Array, w: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _trace_derivatives(
+    information: Float[jax.Array, "count n n *#runs"], w: Float[jax.Array, "count *#runs"]
+) -> tuple[Float[jax.Array, "*#runs"], Float[jax.Array, "count *#runs"], Float[jax.Array, "count count *#runs"]]:
     """tr P, its gradient -tr(P J_k P) and its Hessian 2 tr(P J_k P J_l P), with P = (sum w J)^-1."""
     count, n, rest = information.shape[0], information.shape[1], information.shape[3:]
-    bound = inverse(_weighted(w, information))
-    half = _product(information.reshape(count * n, n, *rest), bound).reshape(count, n, n, *rest)  # J_k P
-    full = _product(bound, jnp.swapaxes(half, 0, 1).reshape(n, count * n, *rest)).reshape(n, count, n, *rest)
+    p = inverse(_weighted(w, information))
+    half = _product(information.reshape(count * n, n, *rest), p).reshape(count, n, n, *rest)  # J_k P
+    full = _product(p, jnp.swapaxes(half, 0, 1).reshape(n, count * n, *rest)).reshape(n, count, n, *rest)
     gradient = jnp.stack([-trace(full[:, k]) for k in range(count)])
     upper = {(k, j): inner(half[k], transpose(full[:, j])) for k in range(count) for j in range(k, count)}
     hessian = jnp.stack([jnp.stack([upper[min(k, j), max(k, j)] for j in range(count)]) for k in range(count)])
-    return trace(bound), gradient, 2 * hessian
+    return trace(p), gradient, 2 * hessian
 
 
 _product = runs_last(times)
 
 
-def _weighted(w: jax.Array, information: jax.Array) -> jax.Array:
+def _weighted(
+    w: Float[jax.Array, "count *#runs"], information: Float[jax.Array, "count n n *#runs"]
+) -> Float[jax.Array, "n n *#runs"]:
     """sum_k w_k J_k."""
     return add([w[k] * information[k] for k in range(len(information))])
 
@@ -129,13 +138,17 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     return w / jnp.sum(w, axis=0), slack + length * slack_move
 
 
-def _longest(value: jax.Array, move: jax.Array) -> jax.Array:
+def _longest(
+    value: Float[jax.Array, "count *#runs"], move: Float[jax.Array, "count *#runs"]
+) -> Float[jax.Array, "*#runs"]:
     """Largest step, at most 1, that keeps value + step move positive."""
     reach = jnp.where(move < 0, -value / jnp.where(move < 0, move, -1.0), jnp.inf)
     return jnp.minimum(1.0, STEP_BACK * jnp.min(reach, axis=0))
 
 
-def intersect_inversely(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) -> tuple[jax.Array, jax.Array]:
+def intersect_inversely(
+    a: Float[jax.Array, "n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, "n"], q: Float[jax.Array, "n n"]
+) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
     """Inverse covariance intersection of (a, P) and (b, Q), with its weight by golden-section search."""
     p_information, q_information = inverse(p), inverse(q)
 
@@ -148,7 +161,7 @@ def intersect_inversely(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) 
 
     ratio = (np.sqrt(5) - 1) / 2
 
-    def shrink(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def shrink(_: jax.Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         left, right = high - ratio * (high - low), low + ratio * (high - low)
         better = cost(left) < cost(right)
@@ -157,18 +170,18 @@ def intersect_inversely(a: jax.Array, p: jax.Array, b: jax.Array, q: jax.Array) 
     low, high = jax.lax.fori_loop(0, SEARCH_STEPS, shrink, (jnp.asarray(0.0), jnp.asarray(1.0)))
     w = (low + high) / 2
     information, common = fused_information(w)
-    bound = inverse(information)
-    mean = bound @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
-    return mean, symmetric(bound)
+    covariance = inverse(information)
+    mean = covariance @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
+    return mean, symmetric(covariance)
 
 
 @runs_last
-def inverse(a: jax.Array) -> jax.Array:
+def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]:
     """A^-1 of a positive definite A."""
     n = a.shape[0]
     return symmetric(solve(a, jnp.eye(n).reshape(n, n, *[1] * (a.ndim - 2))))
 
 
-def inverses(bounds: jax.Array) -> jax.Array:
-    """Of each of several bounds (count, n, n)."""
-    return jax.vmap(inverse)(bounds)
+def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
+    """Of each of several."""
+    return jax.vmap(inverse)(matrices)

@@ -4,14 +4,13 @@ A filter has the level gamma on an output z = M x if its error obeys ||z - zhat|
 where ||.|| is the root of the summed (expected) energy over the horizon and w holds noises and initial errors.
 """
 
-from typing import Any
-
 import numpy as np
 
 from heliograph.numerics.check import array, fail, probabilities
+from heliograph.numerics.types import ArrayLike, Float
 
 
-def level_weights(levels: Any) -> np.ndarray:
+def level_weights(levels: ArrayLike) -> Float[np.ndarray, "N"]:
     """Weights c_i proportional to 1 / gamma_i^2, which minimise sum c_i^2 gamma_i^2 on the simplex.
 
     By Cauchy's inequality, 1 = (sum c g 1/g)^2 <= sum c^2 g^2 sum 1/g^2, equal there. The sharper `fused_level` is
@@ -22,11 +21,10 @@ def level_weights(levels: Any) -> np.ndarray:
     Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
     """
     inverse = _levels(levels) ** -2.0
-    result: np.ndarray = inverse / inverse.sum()
-    return result
+    return np.asarray(inverse / inverse.sum())
 
 
-def fused_level(levels: Any, weights: Any) -> float:
+def fused_level(levels: ArrayLike, weights: ArrayLike) -> float:
     """sum_i c_i gamma_i: the level of a weighted fusion without quantization, when all see disturbances of one norm.
 
     The error is sum c_i e_i, and a norm is convex (Minkowski); never above the largest local level.
@@ -39,7 +37,9 @@ def fused_level(levels: Any, weights: Any) -> float:
     return float(c @ gamma)
 
 
-def fused_error_norm(levels: Any, weights: Any, disturbances: Any, matrix: Any, errors: Any) -> float:
+def fused_error_norm(
+    levels: ArrayLike, weights: ArrayLike, disturbances: ArrayLike, matrix: ArrayLike, errors: ArrayLike
+) -> float:
     """Bound on ||z - zhat|| of a weighted fusion of quantized estimates, zhat = M sum_i c_i xq_i.
 
     sum_i c_i (gamma_i ||w_i|| + ||M|| ||D_i||), since z - zhat = sum c_i (M e_i - M mu_i) and |mu_i| <= D_i by
@@ -64,13 +64,13 @@ def fused_error_norm(levels: Any, weights: Any, disturbances: Any, matrix: Any, 
     return float(c @ (gamma * norms + quantization))
 
 
-def _levels(levels: Any) -> np.ndarray:
-    result: np.ndarray = array("levels", levels, (None,))
+def _levels(levels: ArrayLike) -> Float[np.ndarray, "N"]:
+    result = np.asarray(array("levels", levels, (None,)))
     if not len(result) or np.any(result <= 0):
         raise fail("levels", "positive numbers", result.tolist())
     return result
 
 
-def _levels_and_weights(levels: Any, weights: Any) -> tuple[np.ndarray, np.ndarray]:
+def _levels_and_weights(levels: ArrayLike, weights: ArrayLike) -> tuple[Float[np.ndarray, "N"], Float[np.ndarray, "N"]]:
     gamma = _levels(levels)
     return gamma, probabilities("fusion weights", weights, len(gamma))

@@ -1,7 +1,7 @@
 """Quantizers on the uplinks from filters to a fusion centre: what arrives, and how far it can be off."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,9 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
+
+Parameter = Float[Array, "..."]  # of all components, or of each
 
 
 class Quantized(NamedTuple):
@@ -19,28 +22,27 @@ class Quantized(NamedTuple):
 
     value; error, a guaranteed bound on |value - x| (to rounding), NaN where nothing is guaranteed; saturated, whether x
     was beyond the reach; symbols, how many were sent.
-
-    Shapes: each (n,).
     """
 
-    value: jax.Array | np.ndarray
-    error: jax.Array | np.ndarray
-    saturated: jax.Array | np.ndarray
-    symbols: jax.Array | np.ndarray
+    value: Float[Array, "*n"]
+    error: Float[Array, "*n"]
+    saturated: Bool[Array, "*n"]
+    symbols: Int[Array, "*n"]
 
 
 class AbstractQuantizer(eqx.Module):
     """A quantizer of vectors: `init(n)` gives the state before any value, `step` the next state and what arrives.
 
-    Deterministic. Parameters are numbers, or (n,) for each component its own. A value that is NaN arrives as NaN and
+    Deterministic, and by component: values of further axes (run, time) go through alike. Parameters are numbers, or
+    (n,) for each component its own. A value that is NaN arrives as NaN and
     leaves the state alone.
     """
 
-    def init(self, n: int) -> Any:
+    def init(self, n: int) -> PyTree:
         """State before the first value, for values of n components."""
         raise NotImplementedError
 
-    def step(self, state: Any, value: Any) -> tuple[Any, Quantized]:
+    def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Next state, and what arrives of a value (n,)."""
         raise NotImplementedError
 
@@ -69,20 +71,20 @@ class UniformQuantizer(AbstractQuantizer):
     Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
     """
 
-    levels: np.ndarray
-    amplitude: np.ndarray
-    scale: np.ndarray
+    levels: Float[Array, ""]
+    amplitude: Parameter
+    scale: Parameter
 
-    def __init__(self, levels: int, amplitude: Any, scale: Any = 1.0):
+    def __init__(self, levels: int, amplitude: ArrayLike, scale: ArrayLike = 1.0):
         self.levels = _levels(levels)
         self.amplitude, self.scale = _positive("amplitude", amplitude), _positive("scale", scale)
 
-    def init(self, n: int) -> Any:
+    def init(self, n: int) -> tuple[()]:
         """There is none."""
         return ()
 
     @in_float64
-    def step(self, state: Any, value: Any) -> tuple[Any, Quantized]:
+    def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the one amplitude."""
         return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
 
@@ -92,13 +94,10 @@ class UniformQuantizer(AbstractQuantizer):
 
 
 class Symbols(NamedTuple):
-    """What goes over the link: how many escapes, then the segment from 0; -1 says that there is no number.
+    """What goes over the uplink: how many escapes, then the segment from 0; -1 says that there is no number."""
 
-    Shapes: each (n,), whole numbers.
-    """
-
-    escapes: jax.Array | np.ndarray
-    segment: jax.Array | np.ndarray
+    escapes: Int[Array, "*n"]
+    segment: Int[Array, "*n"]
 
 
 class EscapeQuantizer(AbstractQuantizer):
@@ -113,13 +112,13 @@ class EscapeQuantizer(AbstractQuantizer):
             outside (0, 1), negative growth.
     """
 
-    levels: np.ndarray
-    amplitude: np.ndarray
-    decay: np.ndarray
-    growth: np.ndarray
-    smallest: np.ndarray
+    levels: Float[Array, ""]
+    amplitude: Parameter
+    decay: Parameter
+    growth: Parameter
+    smallest: Parameter
 
-    def __init__(self, levels: int, amplitude: Any, decay: Any, growth: Any, smallest: Any):
+    def __init__(self, levels: int, amplitude: ArrayLike, decay: ArrayLike, growth: ArrayLike, smallest: ArrayLike):
         self.levels = _levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
@@ -127,18 +126,18 @@ class EscapeQuantizer(AbstractQuantizer):
         self.decay, self.growth = _decay(decay), _growth(growth)
 
     @in_float64
-    def init(self, n: int) -> jax.Array:
-        """The first amplitude (n,), known to both ends."""
+    def init(self, n: int) -> Float[Array, "n"]:
+        """The first amplitude, known to both ends."""
         return jnp.broadcast_to(jnp.asarray(self.amplitude), (n,))
 
     @in_float64
-    def step(self, state: Any, value: Any) -> tuple[Any, Quantized]:
+    def step(self, state: Float[Array, "*n"], value: ArrayLike) -> tuple[Float[Array, "*n"], Quantized]:
         """What the receiver decodes of what the sender encodes."""
         return self.decode(state, self.encode(state, value))
 
     @in_float64
-    def encode(self, state: Any, value: Any) -> Symbols:
-        """The sender: symbols of a value (n,), from the amplitude (n,) that both ends know."""
+    def encode(self, state: Float[Array, "*n"], value: ArrayLike) -> Symbols:
+        """The sender: symbols of a value (n,), from the amplitude that both ends know."""
         x = jnp.asarray(value, dtype=float)
         (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(state)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
@@ -149,7 +148,7 @@ class EscapeQuantizer(AbstractQuantizer):
         return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int))
 
     @in_float64
-    def decode(self, state: Any, symbols: Symbols) -> tuple[Any, Quantized]:
+    def decode(self, state: Float[Array, "*n"], symbols: Symbols) -> tuple[Float[Array, "*n"], Quantized]:
         """The receiver: next amplitude and value, from the present amplitude and the symbols alone."""
         escapes, segment = jnp.asarray(symbols.escapes), jnp.asarray(symbols.segment)
         used, known = jnp.ldexp(state, escapes), segment >= 0
@@ -163,21 +162,21 @@ class EscapeQuantizer(AbstractQuantizer):
         return weakest([claim, "nominal"])
 
 
-def widen(bound: jax.Array, error: jax.Array) -> jax.Array:
-    """Bound on the covariance of x - q from one, P, of x - xhat, where |q - xhat| <= D by component.
+def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
+    """Bound on the covariance of x - q from that, P, of x - xhat (or a bound), where |q - xhat| <= D by component.
 
     With q - xhat = mu: mu mu' <= s diag(D), s = sum D (Cauchy), the smallest trace of all such diagonal bounds. So
     E[(x - q)(x - q)'] <= (1 + t) P + (1 + 1/t) s diag(D) for every t > 0, with the smallest trace (r + s)^2 at
     t = s / r, r = sqrt(tr P): then it is (1 + s / r) P + (r + s) diag(D). NaN where D is.
-
-    Shapes: (n, n), (n,) -> (n, n).
     """
-    s, r = jnp.sum(error), jnp.sqrt(jnp.trace(bound))
+    s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
     share = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
-    return (1 + share) * bound + (r + s) * jnp.diag(error)
+    return (1 + share) * covariance + (r + s) * jnp.diag(error)
 
 
-def _published(x: jax.Array, amplitude: Any, levels: Any, scale: Any) -> Quantized:
+def _published(
+    x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
+) -> Quantized:
     """Equations (10), (11) and (13), with d for values from d on and -d for values below -d."""
     scaled = x / scale
     inside = _midpoint(_segment(scaled, amplitude, levels), amplitude, levels)
@@ -187,42 +186,43 @@ def _published(x: jax.Array, amplitude: Any, levels: Any, scale: Any) -> Quantiz
     return Quantized(scale * value, error, saturated, jnp.ones(x.shape, dtype=int))
 
 
-def _segment(x: jax.Array, amplitude: Any, levels: Any) -> jax.Array:
+def _segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
     """Which of the equal segments of [-amplitude, amplitude] holds x, from 0."""
     return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
 
 
-def _midpoint(segment: jax.Array, amplitude: Any, levels: Any) -> jax.Array:
+def _midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
     """The middle of a segment; exactly zero for the middle one of an odd number."""
     return jnp.asarray((2 * segment + 1 - levels) * amplitude / levels)
 
 
-def _levels(value: Any) -> np.ndarray:
+def _levels(value: int) -> Float[np.ndarray, ""]:
     if check_count("levels", value) < 2:
         raise fail("levels", "at least 2", value)
     return np.asarray(value, dtype=np.float64)
 
 
-def _parameter(name: str, value: Any) -> Any:
+def _parameter(name: str, value: ArrayLike) -> Parameter:
     several = isinstance(value, Sequence) or np.ndim(value) > 0
-    return array(name, value, (None,) if several else ())
+    result: Parameter = array(name, value, (None,) if several else ())
+    return result
 
 
-def _positive(name: str, value: Any) -> Any:
+def _positive(name: str, value: ArrayLike) -> Parameter:
     result = _parameter(name, value)
     if not isinstance(result, jax.Array) and np.any(result <= 0):
         raise fail(name, "positive numbers", value)
     return result
 
 
-def _decay(value: Any) -> Any:
+def _decay(value: ArrayLike) -> Parameter:
     result = _parameter("decay", value)
     if not isinstance(result, jax.Array) and np.any((result <= 0) | (result >= 1)):
         raise fail("decay", "numbers between 0 and 1", value)
     return result
 
 
-def _growth(value: Any) -> Any:
+def _growth(value: ArrayLike) -> Parameter:
     result = _parameter("growth", value)
     if not isinstance(result, jax.Array) and np.any(result < 0):
         raise fail("growth", "no negative number", value)

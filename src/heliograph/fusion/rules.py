@@ -1,7 +1,6 @@
 """Fusion of estimates whose errors are correlated in unknown ways: covariance intersection and its relatives."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,6 +13,11 @@ from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.check import array, fail, probabilities
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+Means = Float[jax.Array, "count n"]
+Covariances = Float[jax.Array, "count n n"]
+Fused = tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]
 
 
 class AbstractFusion(eqx.Module):
@@ -29,8 +33,8 @@ class AbstractFusion(eqx.Module):
         """What the fused covariance claims, from what the inputs claim."""
         raise NotImplementedError
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Fused mean (n,) and covariance (n, n) of means (count, n) and bounds (count, n, n)."""
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Fused mean and covariance."""
         raise NotImplementedError
 
 
@@ -45,25 +49,26 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
     means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
-    bounds = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
-    mean, bound = _combine_all(rule, means, bounds)
-    return Estimate(mean, bound, rule.claim([e.claim for e in estimates]))
+    covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
+    return Estimate(*_combine_all(rule, means, covariances), rule.claim([e.claim for e in estimates]))
 
 
 @compiled
-def _combine_all(rule: AbstractFusion, means: Any, bounds: Any) -> tuple[Any, Any]:
+def _combine_all(
+    rule: AbstractFusion, means: Float[Array, "*batch count n"], covariances: Float[Array, "*batch count n n"]
+) -> tuple[Float[Array, "*batch n"], Float[Array, "*batch n n"]]:
     combine = rule.combine
     for _ in range(means.ndim - 2):
         combine = jax.vmap(combine)
-    return combine(means, bounds)
+    return combine(jnp.asarray(means), jnp.asarray(covariances))
 
 
 class CovarianceIntersection(AbstractFusion):
     """Covariance intersection with the weights that minimise the trace.
 
     P = (sum_i w_i P_i^-1)^-1 and x = P sum_i w_i P_i^-1 x_i, w on the simplex; tr P is convex in w. An upper bound for
-    any correlation if the inputs are and if weights do not depend on the data. Where bounds depend on the data, so do
-    the weights, and choosing the smallest can overstate: then the inputs are "nominal", and so is the result.
+    any correlation if the inputs are and if weights do not depend on the data. Where covariances depend on the data, so
+    do the weights, and choosing the smallest can overstate: then the inputs are "nominal", and so is the result.
 
     Source: Julier and Uhlmann (1997); cubature fusion under amplify-and-forward relays, equations (8) and (34).
     """
@@ -72,14 +77,14 @@ class CovarianceIntersection(AbstractFusion):
         """At most "upper"."""
         return _of_covariances(claims, "upper")
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Find the weights and intersect."""
-        information = inverses(bounds)
+        information = inverses(covariances)
         return intersect(means, information, trace_optimal_weights(information))
 
 
 class EqualIntersection(AbstractFusion):
-    """Covariance intersection with equal weights: nothing is chosen, so data-dependent bounds cannot mislead.
+    """Covariance intersection with equal weights: nothing is chosen, so data-dependent covariances cannot mislead.
 
     Source: cubature fusion under amplify-and-forward relays, equation (8) with w_i = 1 / M.
     """
@@ -88,10 +93,10 @@ class EqualIntersection(AbstractFusion):
         """At most "upper"."""
         return _of_covariances(claims, "upper")
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Intersect with equal weights."""
         count = means.shape[0]
-        return intersect(means, inverses(bounds), jnp.full(count, 1 / count))
+        return intersect(means, inverses(covariances), jnp.full(count, 1 / count))
 
 
 class FixedIntersection(AbstractFusion):
@@ -102,9 +107,9 @@ class FixedIntersection(AbstractFusion):
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
 
-    weights: np.ndarray
+    weights: Float[Array, "count"]
 
-    def __init__(self, weights: Any):
+    def __init__(self, weights: ArrayLike):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
@@ -115,9 +120,9 @@ class FixedIntersection(AbstractFusion):
         """At most "upper"."""
         return _of_covariances(claims, "upper")
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Intersect with the given weights."""
-        return intersect(means, inverses(bounds), jnp.asarray(self.weights))
+        return intersect(means, inverses(covariances), jnp.asarray(self.weights))
 
 
 class WeightedFusion(AbstractFusion):
@@ -131,9 +136,9 @@ class WeightedFusion(AbstractFusion):
     Source: H-infinity quantized fusion over amplify-and-forward relays, equation (15).
     """
 
-    weights: np.ndarray
+    weights: Float[Array, "count"]
 
-    def __init__(self, weights: Any):
+    def __init__(self, weights: ArrayLike):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
@@ -144,10 +149,10 @@ class WeightedFusion(AbstractFusion):
         """At most "upper"."""
         return weakest([*claims, "upper"])
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Sum with the given weights."""
         weights = jnp.asarray(self.weights)
-        return weights @ means, jnp.tensordot(weights, bounds, axes=1)
+        return weights @ means, jnp.tensordot(weights, covariances, axes=1)
 
 
 class InverseCovarianceIntersection(AbstractFusion):
@@ -163,12 +168,12 @@ class InverseCovarianceIntersection(AbstractFusion):
         """ "nominal": the assumed form of the correlation is not checked."""
         return _of_covariances(claims, "nominal")
 
-    def combine(self, means: jax.Array, bounds: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Fuse the first two, the result with the third, and so on."""
-        mean, bound = means[0], bounds[0]
-        for other_mean, other_bound in zip(means[1:], bounds[1:], strict=True):
-            mean, bound = intersect_inversely(mean, bound, other_mean, other_bound)
-        return mean, bound
+        mean, covariance = means[0], covariances[0]
+        for other, other_covariance in zip(means[1:], covariances[1:], strict=True):
+            mean, covariance = intersect_inversely(mean, covariance, other, other_covariance)
+        return mean, covariance
 
 
 def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
@@ -182,8 +187,8 @@ class Fusion(eqx.Module):
     """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which uplinks.
 
     `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each
-    node by its name, all of one kind. The local bound is widened by the quantizer's error. Covariances are taken to
-    arrive as they are: most are computed before any data.
+    node by its name, all of one kind. The local covariance is widened by the quantizer's error. Covariances are taken
+    to arrive as they are: most are computed before any data.
     """
 
     filter: str = eqx.field(static=True)
@@ -201,7 +206,7 @@ class Fusion(eqx.Module):
             first(item).check(n)
         self.uplinks(nodes)
 
-    def uplinks(self, nodes: Sequence[str]) -> Any:
+    def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
         """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
 
         Raises:

@@ -1,13 +1,14 @@
 """Whether gains, from anywhere, guarantee an H-infinity level: a check that shares nothing with the designs."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.h_infinity.growth_check import GrowthFinding
 from heliograph.h_infinity.growth_system import GrowthSystem
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.types import ArrayLike, Float
 
 ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix whose diagonal is -1
 
@@ -15,7 +16,7 @@ ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix wh
 class HInfinityCertificate(NamedTuple):
     """Whether the level is certified, and every number that this rests on.
 
-    largest_eigenvalues (steps,): of Theorem 1's matrix, which must be negative; steps_certified counts those from the
+    largest_eigenvalues: of Theorem 1's matrix, which must be negative; steps_certified counts those from the
     first on that are. initial: the smallest eigenvalue of level^2 W - P_0, which must be positive. margin: the smallest
     distance of all of them from failing, relative to the level squared. `reasons` lists what fails; `growth` what is
     known about the growth constants.
@@ -23,7 +24,7 @@ class HInfinityCertificate(NamedTuple):
 
     certified: bool
     level: float
-    largest_eigenvalues: np.ndarray
+    largest_eigenvalues: Float[np.ndarray, "steps"]
     steps_certified: int
     initial: float
     margin: float
@@ -33,9 +34,9 @@ class HInfinityCertificate(NamedTuple):
 
 def certify_level(
     system: GrowthSystem,
-    gains: Any,
-    weights: Any,
-    multipliers: Any,
+    gains: ArrayLike,
+    weights: ArrayLike,
+    multipliers: ArrayLike,
     level: float,
     growth: Sequence[GrowthFinding] = (),
 ) -> HInfinityCertificate:
@@ -72,12 +73,12 @@ def certify_level(
 def theorem_matrix(
     system: GrowthSystem,
     k: int,
-    gain: np.ndarray,
-    weight: np.ndarray,
-    following: np.ndarray,
-    multipliers: np.ndarray,
+    gain: Float[np.ndarray, "n m"],
+    weight: Float[np.ndarray, "n+n n+n"],
+    following: Float[np.ndarray, "n+n n+n"],
+    multipliers: Float[np.ndarray, "4"],
     level: float,
-) -> np.ndarray:
+) -> Float[np.ndarray, "q q"]:
     """Phi of step k over (x, e, f, f~, h, h~, v, rho): the level holds over the step if it is negative definite.
 
     The next (x, e) is R eta - [0; K] H V eta with H = [G, N] random, V eta = (C x + h + D v, rho) and R eta holding the
@@ -91,7 +92,7 @@ def theorem_matrix(
     at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
     q = 4 * n + 2 * y + v + r
 
-    def row(height: int, **blocks: np.ndarray) -> np.ndarray:
+    def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} {q}"]:
         result = np.zeros((height, q))
         for name, block in blocks.items():
             result[:, at[name] : at[name] + block.shape[1]] = block
@@ -118,29 +119,30 @@ def theorem_matrix(
     return _without_absent(phi, at, y, system)
 
 
-def _without_absent(phi: np.ndarray, at: dict[str, int], y: int, system: GrowthSystem) -> np.ndarray:
+def _without_absent(
+    phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
+) -> Float[np.ndarray, "kept kept"]:
     """Leave out f and f~, or h and h~, where the function is zero throughout."""
     kept = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
             kept = [i for i in kept if not at[name] <= i < at[name] + width]
-    result: np.ndarray = phi[np.ix_(kept, kept)]
-    return result
+    return np.asarray(phi[np.ix_(kept, kept)])
 
 
-def _multipliers(given: np.ndarray) -> np.ndarray:
-    """As (steps, 4) for f, f~, h, h~."""
+def _multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:
+    """For f, f~, h, h~."""
     if given.shape[1] not in (2, 4):
         raise fail("multipliers", "2 or 4 for each step", given.shape[1])
     return given if given.shape[1] == 4 else np.repeat(given, 2, axis=1)
 
 
-def _largest(phi: np.ndarray) -> float:
+def _largest(phi: Float[np.ndarray, "q q"]) -> float:
     """Largest eigenvalue."""
     return float(np.linalg.eigvalsh((phi + phi.T) / 2)[-1])
 
 
-def is_negative(phi: np.ndarray) -> bool:
+def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
     """Whether a symmetric matrix is negative definite beyond rounding, after scaling its diagonal to -1.
 
     Scaling keeps definiteness and lets weights of very different sizes stand in one matrix.

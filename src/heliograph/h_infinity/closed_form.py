@@ -1,13 +1,12 @@
 """H-infinity designs that need no solver: without measurements, and behind a channel whose gains are known."""
 
-from typing import Any
-
 import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.growth_system import GrowthSystem
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.types import ArrayLike, Float
 
 ACCURACY = 1e-10  # relative, of a level found by bisection
 SPARE = 0.05  # of the state's own weight at each step, so that its inequality is strict
@@ -40,7 +39,7 @@ def level_without_measurements(system: GrowthSystem) -> float:
     return high
 
 
-def _survives(system: GrowthSystem, scale: np.ndarray, level: float) -> bool:
+def _survives(system: GrowthSystem, scale: Float[np.ndarray, "steps _"], level: float) -> bool:
     n = system.states
     weight = level**2 * system.initial_weight
     for k in range(system.steps):
@@ -54,7 +53,7 @@ def _survives(system: GrowthSystem, scale: np.ndarray, level: float) -> bool:
     return True
 
 
-def known_channel_design(system: GrowthSystem, level: float, multipliers: Any = None) -> HInfinityDesign:
+def known_channel_design(system: GrowthSystem, level: float, multipliers: ArrayLike | None = None) -> HInfinityDesign:
     """The design at a level for a channel whose gains are certain: a Riccati recursion.
 
     With Q = P2 - M'M - (lambda_f~ a^2 + lambda_h~ b^2) I and the weighted input S = diag(Q, lambda_f~, lambda_h~,
@@ -77,7 +76,7 @@ def known_channel_design(system: GrowthSystem, level: float, multipliers: Any = 
     return _riccati(system, level, given)
 
 
-def _riccati(system: GrowthSystem, level: float, multipliers: np.ndarray) -> HInfinityDesign:
+def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, "steps 2"]) -> HInfinityDesign:
     n, m, steps = system.states, system.received, system.steps
     inner = level * (1 - SLACK)
     start = level**2 * float(np.linalg.eigvalsh(system.initial_weight)[0]) * (1 - SLACK)
@@ -99,8 +98,8 @@ def _riccati(system: GrowthSystem, level: float, multipliers: np.ndarray) -> HIn
 
 
 def _best_gain(
-    system: GrowthSystem, k: int, weight: np.ndarray, level: float, multipliers: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
+    system: GrowthSystem, k: int, weight: Float[np.ndarray, "n n"], level: float, multipliers: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "n m"], Float[np.ndarray, "n n"]] | None:
     """K* and P2+ = (E S E' - K* U S E')^-1, or None where Q is not positive."""
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]

@@ -5,7 +5,8 @@ sum_s E|M (x - xhat)|^2 < gamma^2 (sum_s |v|^2 + |rho|^2 + xi_0' W xi_0) with xi
 disturbances that are not zero. It is a guarantee as long as the growth constants are true (`check_growth`).
 """
 
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from heliograph.h_infinity.step import (
     step_matrices,
 )
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.types import ArrayLike, Float
 
 SEARCH_ACCURACY = 1e-4  # relative, of a level found by bisection
 SEARCH_LIMIT = 1e6  # times the first guess; a smallest level beyond is reported as none
@@ -35,18 +37,18 @@ SCREEN = 1e-9  # strictness left in a solution, relative to the level squared, b
 
 
 class HInfinityDesign(NamedTuple):
-    """Gains K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers that prove `level`.
+    """Gains K with weights P_0 ... and multipliers that prove `level`.
 
-    Multipliers: (steps, 2) for (f, f~) and (h, h~), or (steps, 4) for f, f~, h, h~; zero for a function that is zero.
+    Multipliers: 2 at each step for (f, f~) and (h, h~), or 4 for f, f~, h, h~; zero for a function that is zero.
 
     Where no gains were found, `feasible` is false, arrays are NaN from `failed_step` on, `status` says what happened,
     and `smallest_level` is the smallest level found to work with the same choices (None: not searched, or none found).
     """
 
     level: float
-    gains: np.ndarray
-    weights: np.ndarray
-    multipliers: np.ndarray
+    gains: Float[np.ndarray, "steps n m"]
+    weights: Float[np.ndarray, "steps+1 n+n n+n"]
+    multipliers: Float[np.ndarray, "steps count"]
     feasible: bool
     status: str
     failed_step: int | None = None
@@ -56,7 +58,7 @@ class HInfinityDesign(NamedTuple):
 def recursive_design(
     system: GrowthSystem,
     level: float,
-    initial: Any = None,
+    initial: ArrayLike | None = None,
     objective: Objective = "trace",
     solver: Solver = "clarabel",
     separate: bool = False,
@@ -91,7 +93,7 @@ def smallest_recursive_level(
     objective: Objective = "trace",
     solver: Solver = "clarabel",
     separate: bool = False,
-    initial: Any = None,
+    initial: ArrayLike | None = None,
 ) -> HInfinityDesign:
     """The recursive design at the smallest level at which it succeeds, to 1e-4 relative (bisection).
 
@@ -115,8 +117,8 @@ def smallest_recursive_level(
 def horizon_design(
     system: GrowthSystem,
     separate: bool = False,
-    gains: Any = None,
-    initial: Any = None,
+    gains: ArrayLike | None = None,
+    initial: ArrayLike | None = None,
     solver: Solver = "clarabel",
 ) -> HInfinityDesign:
     """The smallest level over the whole horizon, and gains that attain it: all steps as one convex problem.
@@ -166,7 +168,7 @@ class _Recursion:
         self.layout = Layout(system.states, system.received, len(self.steps[0].growth))
         self.compiled: tuple[StepMatrices, StepProblem] | None = None
 
-    def run(self, level: float, initial: np.ndarray | None) -> HInfinityDesign:
+    def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
         """Solve at one level, in units of the level squared."""
         system, n = self.system, self.system.states
         top = level**2 * system.initial_weight
@@ -192,7 +194,7 @@ class _Recursion:
         return self.compiled[1]
 
 
-def _holds(step: StepMatrices, found: Unknowns, fixed: np.ndarray, strictness: float) -> bool:
+def _holds(step: StepMatrices, found: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
     """Whether a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
     gain = _gain(found)
     exact = found._replace(product=found.error @ gain, spread=gain.T @ found.error @ gain)
@@ -200,18 +202,18 @@ def _holds(step: StepMatrices, found: Unknowns, fixed: np.ndarray, strictness: f
     return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
 
 
-def _gain(found: Unknowns) -> np.ndarray:
+def _gain(found: Unknowns) -> Float[np.ndarray, "n m"]:
     """K = P2^-1 Y."""
-    result: np.ndarray = np.linalg.solve(found.error, found.product)
-    return result
+    return np.asarray(np.linalg.solve(found.error, found.product))
 
 
-def _block(found: Unknowns) -> np.ndarray:
+def _block(found: Unknowns) -> Float[np.ndarray, "w w"]:
+    """diag(P1, P2)."""
     zero = np.zeros_like(found.state)
     return np.block([[found.state, zero], [zero, found.error]])
 
 
-def _diagonal_part(weight: np.ndarray, n: int) -> np.ndarray:
+def _diagonal_part(weight: Float[np.ndarray, "w w"], n: int) -> Float[np.ndarray, "w w"]:
     """The largest multiple of diag(W1, W2) below W."""
     part = weight.copy()
     part[:n, n:] = part[n:, :n] = 0.0
@@ -234,7 +236,7 @@ def _scale(system: GrowthSystem) -> float:
     return largest
 
 
-def _smallest(works: Any, guess: float) -> float | None:
+def _smallest(works: Callable[[float], bool], guess: float) -> float | None:
     """Smallest level that works, to SEARCH_ACCURACY, by doubling and bisection of its logarithm."""
     high = guess
     while not works(high):

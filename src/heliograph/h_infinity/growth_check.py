@@ -1,7 +1,7 @@
 """Whether a function obeys a growth constant: slopes over a stated region, and a search for a pair that breaks it."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +10,15 @@ from scipy.stats import qmc
 
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import ArrayLike, Float
 
 POINTS = 2**12  # of a low-discrepancy sequence, at which slopes are taken
 CLIMBERS, TRIALS, ROUNDS = 16, 32, 60  # steepest points kept, random moves from each, and times this is repeated
 SHRINK = 0.8  # of the moves' size from round to round: from half the region to 1e-6 of it
 NEARBY = 1e-4  # distance of a close pair, relative to the region's width; closer ones lose digits
 TOLERANCE = 1e-9  # relative excess over the constant that counts as rounding
+
+Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with jax.numpy
 
 
 class GrowthFinding(NamedTuple):
@@ -28,11 +31,11 @@ class GrowthFinding(NamedTuple):
 
     name: str
     constant: float
-    low: np.ndarray
-    high: np.ndarray
+    low: Float[np.ndarray, "n"]
+    high: Float[np.ndarray, "n"]
     slope: float
-    point: np.ndarray
-    pair: tuple[np.ndarray, np.ndarray]
+    point: Float[np.ndarray, "n"]
+    pair: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
     ratio: float
 
     @property
@@ -51,7 +54,7 @@ class GrowthFinding(NamedTuple):
 
 
 def check_growth(
-    function: Callable[[Any], Any], constant: float, low: Any, high: Any, name: str = "f", seed: int = 0
+    function: Function, constant: float, low: ArrayLike, high: ArrayLike, name: str = "f", seed: int = 0
 ) -> GrowthFinding:
     """Search the box from `low` to `high` (n,) for a function's largest slope, and for a pair that breaks `constant`.
 
@@ -63,20 +66,20 @@ def check_growth(
         ValueError: a negative constant, a box of the wrong shape or upside down.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
-    low, high = _check_box(constant, low, high)
-    tools, random = _Tools(function, float(np.linalg.norm(high - low))), np.random.default_rng(seed)
-    starts = low + (high - low) * qmc.Sobol(len(low), seed=seed).random(POINTS)
-    points = _climb(tools.slope, starts, low, high, random)
+    bottom, top = _check_box(constant, low, high)
+    tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
+    points = _climb(tools.slope, starts, bottom, top, random)
     move = tools.steepest(points) * NEARBY * tools.width / 2
-    close = np.concatenate([np.clip(points - move, low, high), np.clip(points + move, low, high)], axis=1)
-    far = low + (high - low) * random.random((POINTS, 2, len(low)))
+    close = np.concatenate([np.clip(points - move, bottom, top), np.clip(points + move, bottom, top)], axis=1)
+    far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
-    pairs = _climb(tools.ratio, starts, np.tile(low, 2), np.tile(high, 2), random)
-    return _finding(name, constant, low, high, tools, points, pairs)
+    pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
+    return _finding(name, constant, bottom, top, tools, points, pairs)
 
 
 def check_size(
-    function: Callable[[Any], Any], constant: float, low: Any, high: Any, name: str = "f", seed: int = 0
+    function: Function, constant: float, low: ArrayLike, high: ArrayLike, name: str = "f", seed: int = 0
 ) -> GrowthFinding:
     """Search the box for a point that breaks |f(x)| <= constant |x|, the weaker condition on f itself (pairs with 0).
 
@@ -84,46 +87,47 @@ def check_size(
         ValueError: a negative constant, a box of the wrong shape, upside down or without 0.
     Source: H-infinity fusion over amplify-and-forward relays, condition (2) with f(0) = 0.
     """
-    low, high = _check_box(constant, low, high)
-    if np.any(low > 0) or np.any(high < 0):
-        raise fail("region", "a box around 0", f"{low.tolist()} and {high.tolist()}")
-    tools, random = _Tools(function, float(np.linalg.norm(high - low))), np.random.default_rng(seed)
-    starts = low + (high - low) * qmc.Sobol(len(low), seed=seed).random(POINTS)
+    bottom, top = _check_box(constant, low, high)
+    if np.any(bottom > 0) or np.any(top < 0):
+        raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
+    tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
+    starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
 
     def from_zero(points: np.ndarray) -> np.ndarray:
         return tools.ratio(np.concatenate([points, np.zeros_like(points)], axis=1))
 
-    points = _climb(from_zero, starts, low, high, random)
-    return _finding(name, constant, low, high, tools, points, np.concatenate([points, np.zeros_like(points)], axis=1))
+    points = _climb(from_zero, starts, bottom, top, random)
+    return _finding(name, constant, bottom, top, tools, points, np.concatenate([points, np.zeros_like(points)], axis=1))
 
 
-def _check_box(constant: float, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
+def _check_box(
+    constant: float, low: ArrayLike, high: ArrayLike
+) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     scalar("growth constant", constant, 0.0)
-    low = array("low corner of the region", low, (None,))
-    high = array("high corner of the region", high, low.shape)
-    if np.any(high < low) or not np.any(high > low):
-        raise fail("region", "a low corner below the high one", f"{low.tolist()} and {high.tolist()}")
-    return low, high
+    bottom = np.asarray(array("low corner of the region", low, (None,)))
+    top = np.asarray(array("high corner of the region", high, bottom.shape))
+    if np.any(top < bottom) or not np.any(top > bottom):
+        raise fail("region", "a low corner below the high one", f"{bottom.tolist()} and {top.tolist()}")
+    return bottom, top
 
 
 class _Tools:
     """Slopes and ratios of a function at many points (count, n) or pairs (count, 2n), compiled once."""
 
-    def __init__(self, function: Callable[[Any], Any], width: float):
+    def __init__(self, function: Function, width: float):
         self.width = width
         self.jacobian = compiled(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
         self.values = compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
-    def slope(self, points: np.ndarray) -> np.ndarray:
+    def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian."""
-        result: np.ndarray = np.linalg.norm(self.jacobian(points), 2, axis=(-2, -1))
-        return result
+        return np.asarray(np.linalg.norm(self.jacobian(points), 2, axis=(-2, -1)))
 
-    def steepest(self, points: np.ndarray) -> np.ndarray:
+    def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Unit direction in which the function changes most."""
         return np.linalg.svd(self.jacobian(points))[2][:, 0]
 
-    def ratio(self, pairs: np.ndarray) -> np.ndarray:
+    def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
         """|f(x) - f(y)| / |x - y|, and 0 for points too close to tell."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
@@ -146,11 +150,11 @@ def _finding(
 
 def _climb(
     objective: Callable[[np.ndarray], np.ndarray],
-    starts: np.ndarray,
-    low: np.ndarray,
-    high: np.ndarray,
+    starts: Float[np.ndarray, "starts n"],
+    low: Float[np.ndarray, "n"],
+    high: Float[np.ndarray, "n"],
     random: np.random.Generator,
-) -> np.ndarray:
+) -> Float[np.ndarray, "climbers n"]:
     """The best starts, each moved to the best of random moves around it, again and again, inside the box."""
     best = starts[np.argsort(-objective(starts), kind="stable")[:CLIMBERS]]
     size = (high - low) / 2

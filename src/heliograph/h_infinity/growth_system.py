@@ -1,23 +1,23 @@
 """A system known by growth bounds only, seen through a channel over a finite horizon: what H-infinity designs read."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, unstack
 from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
+
+Varying = ArrayLike | OverTime  # the same at all steps, or one for each
 
 
 class Growth(NamedTuple):
-    """Growth constants of a function over the horizon: |f(x)| <= state |x| and |f(x) - f(xhat)| <= error |x - xhat|.
+    """Growth constants of a function over the horizon: |f(x)| <= state |x| and |f(x) - f(xhat)| <= error |x - xhat|."""
 
-    Shapes: (steps,) each.
-    """
-
-    state: np.ndarray
-    error: np.ndarray
+    state: Float[np.ndarray, "steps"]
+    error: Float[np.ndarray, "steps"]
 
     @property
     def absent(self) -> bool:
@@ -29,21 +29,18 @@ class GrowthSystem(NamedTuple):
     """x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x, and received = G y + N rho, at steps s = 0 ... steps - 1.
 
     f and h are known only by their growth, f(0) = h(0) = 0; v and rho are any sequences of finite energy; G and N are
-    random. `initial_weight` W of the stacked initial (x_0, e_0) makes the third disturbance.
-
-    Shapes: transition (steps, n, n), disturbance (steps, n, v), output (steps, y, n), feedthrough (steps, y, v),
-    wanted (steps, z, n), initial_weight (2n, 2n); channel: one for each step.
+    random. `initial_weight` W of the stacked initial (x_0, e_0) makes the third disturbance; a channel for each step.
     """
 
-    transition: np.ndarray
-    disturbance: np.ndarray
-    output: np.ndarray
-    feedthrough: np.ndarray
-    wanted: np.ndarray
+    transition: Float[np.ndarray, "steps n n"]
+    disturbance: Float[np.ndarray, "steps n v"]
+    output: Float[np.ndarray, "steps y n"]
+    feedthrough: Float[np.ndarray, "steps y v"]
+    wanted: Float[np.ndarray, "steps z n"]
     growth: Growth
     output_growth: Growth
     channel: tuple[DisturbedGain, ...]
-    initial_weight: np.ndarray
+    initial_weight: Float[np.ndarray, "n+n n+n"]
 
     @property
     def steps(self) -> int:
@@ -63,15 +60,15 @@ class GrowthSystem(NamedTuple):
 
 def growth_system(
     steps: int,
-    disturbance: Any,
-    feedthrough: Any,
-    wanted: Any,
+    disturbance: Varying,
+    feedthrough: Varying,
+    wanted: Varying,
     channel: Channel,
-    growth: Any,
-    output_growth: Any = 0.0,
-    transition: Any = None,
-    output: Any = None,
-    initial_weight: Any = 1.0,
+    growth: Varying | tuple[Varying, Varying],
+    output_growth: Varying | tuple[Varying, Varying] = 0.0,
+    transition: Varying | None = None,
+    output: Varying | None = None,
+    initial_weight: ArrayLike = 1.0,
 ) -> GrowthSystem:
     """Describe x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x behind a channel, for `steps` steps.
 
@@ -105,7 +102,7 @@ def growth_system(
     )
 
 
-def _over(steps: int, name: str, value: Any, shape: tuple[int | None, ...]) -> np.ndarray:
+def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) -> Float[np.ndarray, "steps ..."]:
     """One matrix for each step."""
     if not isinstance(value, OverTime):
         one: np.ndarray = array(name, value, shape)
@@ -127,7 +124,7 @@ def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
     return links
 
 
-def _growth(steps: int, name: str, value: Any) -> Growth:
+def _growth(steps: int, name: str, value: Varying | tuple[Varying, Varying]) -> Growth:
     pair = value if isinstance(value, tuple) else (value, value)
     if len(pair) != 2:
         raise fail(name, "a number, or a pair (of the function, of its differences)", value)
@@ -138,7 +135,7 @@ def _growth(steps: int, name: str, value: Any) -> Growth:
     return Growth(*constants)
 
 
-def _weight(value: Any, n: int) -> np.ndarray:
+def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     weight = np.asarray(value, dtype=np.float64) * np.eye(2 * n) if np.ndim(value) == 0 else value
     result: np.ndarray = array("initial weight", weight, (2 * n, 2 * n))
     if not np.allclose(result, result.T, rtol=1e-12) or np.linalg.eigvalsh(result)[0] <= 0:

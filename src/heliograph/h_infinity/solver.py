@@ -16,6 +16,7 @@ from heliograph.h_infinity.step import (
     weight_form,
 )
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 
 MARGIN = 1e-6  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
 Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
@@ -38,7 +39,7 @@ def solvers() -> Any:
     return cvxpy
 
 
-def check_choice(name: str, value: Any, choices: Any) -> None:
+def check_choice(name: str, value: str, choices: object) -> None:
     """Raise ValueError unless `value` is one of a Literal's choices."""
     if value not in get_args(choices):
         raise fail(name, f"one of {', '.join(get_args(choices))}", repr(value))
@@ -85,7 +86,7 @@ class StepProblem:
         goal, more = _goal(cp, objective, [weight[:n, :n], weight[n:, n:]])
         self.problem = cp.Problem(goal, constraints + more)
 
-    def solve(self, fixed: np.ndarray) -> tuple[str, Unknowns | None]:
+    def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
         """The status, and a solution if there is one; fixed = S - diag(P, 0) at level 1."""
         self.fixed.value = fixed
         status = run_solver(self.problem, self.solver)
@@ -115,7 +116,13 @@ class HorizonProblem:
     One vector holds them all, so that each inequality is one sparse matrix: cvxpy then has next to nothing to do.
     """
 
-    def __init__(self, steps: list[StepMatrices], layouts: list[Layout], weight: np.ndarray, initial: Any = None):
+    def __init__(
+        self,
+        steps: list[StepMatrices],
+        layouts: list[Layout],
+        weight: Float[np.ndarray, "w w"],
+        initial: Float[np.ndarray, "w w"] | None = None,
+    ):
         cp = solvers()
         self.layouts = layouts
         start = Layout(layouts[0].states, 0, 0)

@@ -15,28 +15,29 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.numerics.types import Float, Int
 
 
 class StepMatrices(NamedTuple):
-    """X, E (n, q), U (m, q), the U_j (count, m, q), M'M and I of S (q, q), and the diagonals of the N_i (count, q)."""
+    """X, E, U, the U_j, M'M and I of S, and the diagonals of the N_i."""
 
-    state: np.ndarray
-    error: np.ndarray
-    heard: np.ndarray
-    spreads: np.ndarray
-    wanted: np.ndarray
-    energy: np.ndarray
-    growth: np.ndarray
+    state: Float[np.ndarray, "n q"]
+    error: Float[np.ndarray, "n q"]
+    heard: Float[np.ndarray, "m q"]
+    spreads: Float[np.ndarray, "spreads m q"]
+    wanted: Float[np.ndarray, "q q"]
+    energy: Float[np.ndarray, "q q"]
+    growth: Float[np.ndarray, "multipliers q"]
 
 
 class Unknowns(NamedTuple):
-    """P1, P2 (n, n), Y (n, m), Z (m, m), lambda (multipliers,)."""
+    """P1, P2, Y, Z, lambda."""
 
-    state: np.ndarray
-    error: np.ndarray
-    product: np.ndarray
-    spread: np.ndarray
-    multipliers: np.ndarray
+    state: Float[np.ndarray, "n n"]
+    error: Float[np.ndarray, "n n"]
+    product: Float[np.ndarray, "n m"]
+    spread: Float[np.ndarray, "m m"]
+    multipliers: Float[np.ndarray, "multipliers"]
 
 
 def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
@@ -50,8 +51,10 @@ def step_matrices(system: GrowthSystem, separate: bool) -> list[StepMatrices]:
     return [_at(system, k, padded[k], separate) for k in range(system.steps)]
 
 
-def all_multipliers(system: GrowthSystem, given: np.ndarray, separate: bool) -> np.ndarray:
-    """Multipliers (..., count) with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
+def all_multipliers(
+    system: GrowthSystem, given: Float[np.ndarray, "*steps present"], separate: bool
+) -> Float[np.ndarray, "*steps count"]:
+    """Multipliers with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
     each = 2 if separate else 1
     present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(each)]
     result = np.zeros((*given.shape[:-1], len(present)))
@@ -59,7 +62,7 @@ def all_multipliers(system: GrowthSystem, given: np.ndarray, separate: bool) -> 
     return result
 
 
-def _at(system: GrowthSystem, k: int, spreads: np.ndarray, separate: bool) -> StepMatrices:
+def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"], separate: bool) -> StepMatrices:
     A, B, C, D, M = (getattr(system, name)[k] for name in GrowthSystem._fields[:5])
     link, n, y = system.channel[k], system.states, system.output.shape[1]
     w, h = 0 if system.growth.absent else n, 0 if system.output_growth.absent else y
@@ -85,7 +88,7 @@ def _at(system: GrowthSystem, k: int, spreads: np.ndarray, separate: bool) -> St
     return StepMatrices(state, error, heard, varied, wanted, energy, growth)
 
 
-def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> np.ndarray:
+def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
     """sum_i (a_i^2 |argument_i|^2 - |value_i|^2) as the diagonal of a quadratic form of eta."""
     diagonal = np.zeros(q)
     for value, argument, constant in parts:
@@ -94,8 +97,8 @@ def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> np.ndarray:
     return diagonal
 
 
-def next_energy(step: StepMatrices, unknowns: Unknowns) -> np.ndarray:
-    """The quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns; (q, q)."""
+def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
+    """The quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
     X, E, U = step.state, step.error, step.heard
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
@@ -113,7 +116,7 @@ class Layout(NamedTuple):
     states: int
     received: int
     multipliers: int
-    gain: np.ndarray | None = None
+    gain: Float[np.ndarray, "n m"] | None = None
 
     @property
     def size(self) -> int:
@@ -122,7 +125,7 @@ class Layout(NamedTuple):
         free = n * m + m * (m + 1) // 2 if self.gain is None else 0
         return n * (n + 1) + free + self.multipliers
 
-    def unpack(self, vector: np.ndarray) -> Unknowns:
+    def unpack(self, vector: Float[np.ndarray, "size"]) -> Unknowns:
         """The unknowns as matrices."""
         n, m = self.states, self.received
         triangle = n * (n + 1) // 2
@@ -135,7 +138,7 @@ class Layout(NamedTuple):
         return Unknowns(p1, p2, product, _symmetric(spread, m), vector[self.size - self.multipliers :])
 
 
-def _symmetric(entries: np.ndarray, n: int) -> np.ndarray:
+def _symmetric(entries: Float[np.ndarray, "triangle"], n: int) -> Float[np.ndarray, "{n} {n}"]:
     result = np.zeros((n, n))
     rows, columns = _triangle(n)
     result[rows, columns] = result[columns, rows] = entries
@@ -143,20 +146,19 @@ def _symmetric(entries: np.ndarray, n: int) -> np.ndarray:
 
 
 @cache
-def _triangle(n: int) -> tuple[np.ndarray, np.ndarray]:
+def _triangle(n: int) -> tuple[Int[np.ndarray, "triangle"], Int[np.ndarray, "triangle"]]:
     return np.tril_indices(n)
 
 
 class LinearForms(NamedTuple):
     """The inequalities of a step as linear maps of the vector of unknowns, each to a matrix written row by row.
 
-    next: Phi's part that is linear in the unknowns, (q q, size). positive: matrices that must be positive. weight:
-    diag(P1, P2), (4 n n, size).
+    next: Phi's part that is linear in the unknowns. positive: matrices that must be positive. weight: diag(P1, P2).
     """
 
-    next: np.ndarray
-    positive: tuple[np.ndarray, ...]
-    weight: np.ndarray
+    next: Float[np.ndarray, "qq size"]
+    positive: tuple[Float[np.ndarray, "_ size"], ...]
+    weight: Float[np.ndarray, "ww size"]
 
 
 def linear_forms(step: StepMatrices, layout: Layout) -> LinearForms:
@@ -171,14 +173,14 @@ def linear_forms(step: StepMatrices, layout: Layout) -> LinearForms:
     return LinearForms(forward, tuple(positive), weight_form(layout))
 
 
-def weight_form(layout: Layout) -> np.ndarray:
-    """diag(P1, P2) written row by row as a linear map of the vector of unknowns, (4 n n, size)."""
+def weight_form(layout: Layout) -> Float[np.ndarray, "ww size"]:
+    """diag(P1, P2) written row by row as a linear map of the vector of unknowns."""
     units = [layout.unpack(unit) for unit in np.eye(layout.size)]
     upper, lower = np.diag([1.0, 0.0]), np.diag([0.0, 1.0])
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
 
 
-def independent_parts(step: StepMatrices, forms: LinearForms) -> list[np.ndarray]:
+def independent_parts(step: StepMatrices, forms: LinearForms) -> list[Int[np.ndarray, "_"]]:
     """Index sets of eta that Phi never couples: a smaller inequality for each says the same."""
     q = len(step.energy)
     coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.wanted != 0) | (step.energy != 0)

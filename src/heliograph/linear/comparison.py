@@ -14,6 +14,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 from heliograph.random_affine.monomials import exponents
 
 SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
@@ -21,18 +22,18 @@ SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
 
 @dataclass(frozen=True)
 class GainOverLinear:
-    """What each degree would bring: error covariances (time, n, n) by degree, exact before any data.
+    """What each degree would bring: error covariances by degree, exact before any data.
 
     skewness: the largest standardised joint third central moment of (x_k, z_k) over all steps.
     after: the steps before it are left out of `gain`, as the start is.
     """
 
     states: tuple[str, ...]
-    covariance: dict[int, np.ndarray]
+    covariance: dict[int, Float[np.ndarray, "time n n"]]
     skewness: float
     after: int
 
-    def gain(self, degree: int) -> np.ndarray:
+    def gain(self, degree: int) -> Float[np.ndarray, "n"]:
         """Share of the linear filter's error variance that this degree removes, for each state: 1 - ratio of means."""
         mean = {d: np.diagonal(self.covariance[d][self.after :], axis1=1, axis2=2).mean(axis=0) for d in (1, degree)}
         return np.asarray(1 - mean[degree] / mean[1])

@@ -1,6 +1,7 @@
 """A linear model lifted to monomials: powers of the state and of the measurement as one linear system."""
 
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -11,6 +12,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
@@ -18,6 +20,8 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian
 from heliograph.random_affine.push import Tabulated, noise_vector, push, push_known, second_moments
+
+T = TypeVar("T")
 
 
 class Route(NamedTuple):
@@ -67,13 +71,15 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), mean, spread, linear_rows(n, degree), rounding)
 
 
-def affine(homogeneous: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def affine(
+    homogeneous: Float[np.ndarray, "m n"],
+) -> tuple[Float[np.ndarray, "m-1 n-1"], Float[np.ndarray, "m-1"]]:
     """Matrix and offset of a homogeneous matrix [[A, a], [0, 1]]."""
     return homogeneous[:-1, :-1], homogeneous[:-1, -1]
 
 
-def linear_rows(variables: int, degree: int, wanted: int | None = None) -> np.ndarray:
-    """Rows that read the first `wanted` variables off their monomials, (wanted, C(variables + degree, degree) - 1)."""
+def linear_rows(variables: int, degree: int, wanted: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
+    """Rows that read the first `wanted` variables off their C(variables + degree, degree) - 1 monomials."""
     places = {powers: i for i, powers in enumerate(exponents(variables + 1, degree))}
     rows = np.zeros((variables if wanted is None else wanted, len(places) - 1))
     for i, row in enumerate(rows):
@@ -81,7 +87,7 @@ def linear_rows(variables: int, degree: int, wanted: int | None = None) -> np.nd
     return rows
 
 
-def initial_moments(plant: LinearPlant, order: int) -> np.ndarray:
+def initial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomials"]:
     """E[mono_order(x_0)]."""
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
@@ -118,8 +124,8 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
-def _maps(items: list[Any], order: int) -> list[GainAndNoise]:
-    """A x + noise of each plant or sensor."""
+def _maps(items: Sequence[Any], order: int) -> list[GainAndNoise]:
+    """A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
     result: list[GainAndNoise] = []
     before, noise = None, Tabulated(items[0].noise, order)
     for item in items:
@@ -133,7 +139,7 @@ def _maps(items: list[Any], order: int) -> list[GainAndNoise]:
     return result
 
 
-def each_step(item: Any, horizon: int) -> list[Any]:
+def each_step(item: T | OverTime, horizon: int) -> list[T]:
     """A plant, sensor or channel at each of `horizon` steps.
 
     Raises:

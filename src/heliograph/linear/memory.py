@@ -17,6 +17,7 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
@@ -63,7 +64,7 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     return LinearSystem(steps, mean, spread, linear_rows(total, 2, n), rounding)
 
 
-def _homogeneous(matrix: np.ndarray, offset: np.ndarray) -> np.ndarray:
+def _homogeneous(matrix: Float[np.ndarray, "m n"], offset: Float[np.ndarray, "m"]) -> Float[np.ndarray, "m+1 n+1"]:
     return np.block([[matrix, offset[:, None]], [np.zeros((1, matrix.shape[1])), np.ones((1, 1))]])
 
 

@@ -9,20 +9,21 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
 DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which the design warns
 
 
 class Corrected(NamedTuple):
-    """One step of the covariance recursion: gain (N, m), error covariance before and after the measurement (N, N)."""
+    """One step of the covariance recursion: gain, error covariance before and after the measurement."""
 
-    gain: np.ndarray
-    predicted: np.ndarray
-    covariance: np.ndarray
+    gain: Float[np.ndarray, "N m"]
+    predicted: Float[np.ndarray, "N N"]
+    covariance: Float[np.ndarray, "N N"]
 
 
-def covariance_step(spread: np.ndarray, s: Steps) -> Corrected:
+def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
     """P- = A P A' + Cov(w), O = C P- C' + Cov(v), G = P- C' O^-1, P = P- - G C P-.
 
     O may be singular (products of a measurement with few values repeat): then directions it does not have are skipped.
@@ -34,19 +35,15 @@ def covariance_step(spread: np.ndarray, s: Steps) -> Corrected:
     return Corrected(gain, predicted, (after + after.T) / 2)
 
 
-def solve_innovation(innovation: np.ndarray, cross: np.ndarray) -> np.ndarray:
-    """O^+ C for a positive semidefinite O, by its correlation matrix, so that units do not matter.
-
-    Shapes: (m, m), (m, N) -> (m, N).
-    """
+def solve_innovation(innovation: Float[np.ndarray, "m m"], cross: Float[np.ndarray, "m N"]) -> Float[np.ndarray, "m N"]:
+    """O^+ C for a positive semidefinite O, by its correlation matrix, so that units do not matter."""
     deviation = np.sqrt(np.maximum(np.diag(innovation), 0.0))
     scale = np.divide(1.0, deviation, out=np.zeros_like(deviation), where=deviation > 0)
     values, vectors = np.linalg.eigh(scale[:, None] * innovation * scale)
     used = values > RANK_TOLERANCE * values[-1]
     inverse = np.divide(1.0, values, out=np.zeros_like(values), where=used)
     root = scale[:, None] * vectors
-    result: np.ndarray = (root * inverse) @ (root.T @ cross)
-    return result
+    return np.asarray((root * inverse) @ (root.T @ cross))
 
 
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
@@ -85,10 +82,10 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     return Schedule(Gains(*map(np.array, zip(*parts, strict=True))), system.mean, claim)
 
 
-def true_covariance(system: LinearSystem, schedule: Schedule) -> np.ndarray:
+def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:
     """E[(x - xhat)(x - xhat)'] of a schedule run on a system that it need not have been designed for.
 
-    Joint moments of (y, s) are propagated; nothing is assumed of the gains. Shapes: (time, q, q).
+    Joint moments of (y, s) are propagated; nothing is assumed of the gains.
 
     Raises:
         ValueError: a system and a schedule of different lengths or measurements.

@@ -1,44 +1,42 @@
 """A schedule of gains: a filter computed before any data, as arrays over time with the covariance it claims."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
 
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.types import ArrayLike, Float
 
 
 class Gains(NamedTuple):
-    """One row per step: s+ = F s + K z + c and xhat = L s + J z + d, with s the state before the step.
+    """s+ = F s + K z + c and xhat = L s + J z + d, s the state before the step; one row per step (one step: no axis).
 
-    `expected` (and `expected_offset`) say what z the filter expects, G s + g: it stands in for what did not arrive.
-    `covariance` is that of x - xhat, `predicted` that of x - L s - J (G s + g) - d, before z; `innovation` is that of
-    z - G s - g. NaN in the last two where nobody knows.
-    Shapes: transition F (time, N, N), gain K (time, N, m), offset c (time, N), output L (time, q, N), direct J
-    (time, q, m), output_offset d (time, q), expected G (time, m, N), expected_offset g (time, m), covariance
-    (time, q, q), predicted (time, q, q), innovation (time, m, m).
+    transition F, gain K, offset c, output L, direct J, output_offset d. `expected` G and `expected_offset` g say what z
+    the filter expects, G s + g: it stands in for what did not arrive. `covariance` is that of x - xhat, `predicted` that
+    of x - L s - J (G s + g) - d, before z; `innovation` is that of z - G s - g. NaN in the last two where nobody knows.
     """
 
-    transition: np.ndarray
-    gain: np.ndarray
-    offset: np.ndarray
-    output: np.ndarray
-    direct: np.ndarray
-    output_offset: np.ndarray
-    expected: np.ndarray
-    expected_offset: np.ndarray
-    covariance: np.ndarray
-    predicted: np.ndarray
-    innovation: np.ndarray
+    transition: Float[np.ndarray, "*time N N"]
+    gain: Float[np.ndarray, "*time N m"]
+    offset: Float[np.ndarray, "*time N"]
+    output: Float[np.ndarray, "*time q N"]
+    direct: Float[np.ndarray, "*time q m"]
+    output_offset: Float[np.ndarray, "*time q"]
+    expected: Float[np.ndarray, "*time m N"]
+    expected_offset: Float[np.ndarray, "*time m"]
+    covariance: Float[np.ndarray, "*time q q"]
+    predicted: Float[np.ndarray, "*time q q"]
+    innovation: Float[np.ndarray, "*time m m"]
 
 
 PERHAPS = ("predicted", "innovation")  # fields that may be unknown
 
 
 class Schedule(eqx.Module):
-    """A linear filter over time from the state `start` (N,); `covariance` is claimed for complete data.
+    """A linear filter over time from the state `start`; its covariance is claimed for complete data.
 
     Raises:
         ValueError: shapes that do not fit, numbers that are not finite (the last two fields may be NaN), an unknown
@@ -46,10 +44,10 @@ class Schedule(eqx.Module):
     """
 
     gains: Gains
-    start: np.ndarray
+    start: Float[np.ndarray, "N"]
     claim: Claim = eqx.field(static=True)
 
-    def __init__(self, gains: Gains, start: Any, claim: Claim):
+    def __init__(self, gains: Gains, start: ArrayLike, claim: Claim):
         self.start = array("start of the schedule", start, (None,))
         time, n, m = np.shape(gains.gain)
         q = np.shape(gains.output_offset)[-1]
@@ -99,5 +97,5 @@ def load_schedule(path: str | Path) -> Schedule:
     missing = sorted({*Gains._fields, "start", "claim"} - set(stored))
     if missing:
         raise fail(f"schedule {path}", "all arrays of a schedule", f"none for {missing}")
-    claim: Any = str(stored["claim"])
+    claim = cast(Claim, str(stored["claim"]))  # a Schedule checks it
     return Schedule(Gains(*(stored[field] for field in Gains._fields)), stored["start"], claim)

@@ -1,26 +1,26 @@
 """A linear system whose noises are white: what plant, relays and sensors become before gains are computed."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import array, covariance, fail
+from heliograph.numerics.types import ArrayLike, Float
 
 
 class Steps(NamedTuple):
-    """What happens at each step, every array with a leading time axis.
+    """What happens at each step, every array with a leading time axis (one step has none).
 
-    y+ = A y + a + w, z = C y+ + c + v. Shapes: transition A (time, N, N), drift a (time, N), process Cov(w)
-    (time, N, N), output C (time, m, N), offset c (time, m), noise Cov(v) (time, m, m).
+    y+ = A y + a + w, z = C y+ + c + v: transition A, drift a, process Cov(w), output C, offset c, noise Cov(v).
     """
 
-    transition: np.ndarray
-    drift: np.ndarray
-    process: np.ndarray
-    output: np.ndarray
-    offset: np.ndarray
-    noise: np.ndarray
+    transition: Float[np.ndarray, "*time N N"]
+    drift: Float[np.ndarray, "*time N"]
+    process: Float[np.ndarray, "*time N N"]
+    output: Float[np.ndarray, "*time m N"]
+    offset: Float[np.ndarray, "*time m"]
+    noise: Float[np.ndarray, "*time m m"]
 
 
 class LinearSystem(eqx.Module):
@@ -30,21 +30,22 @@ class LinearSystem(eqx.Module):
     C as their means, and as Cov(w), Cov(v) what is left over, E[(H - EH) y y' (H - EH)'] plus noise. A measurement
     that shares the step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
 
-    `rounding` (time, N) is an absolute rounding error of the diagonal of `process`, where it came out of a subtraction.
-
-    Shapes: mean (N,), covariance (N, N) of y before the first step, want W (q, N).
+    mean, covariance: of y before the first step. want: W. rounding: an absolute rounding error of the diagonal of
+    `process`, where it came out of a subtraction.
 
     Raises:
         ValueError: shapes that do not fit, or a start that has no covariance.
     """
 
     steps: Steps
-    mean: np.ndarray
-    covariance: np.ndarray
-    want: np.ndarray
-    rounding: np.ndarray
+    mean: Float[np.ndarray, "N"]
+    covariance: Float[np.ndarray, "N N"]
+    want: Float[np.ndarray, "q N"]
+    rounding: Float[np.ndarray, "time N"]
 
-    def __init__(self, steps: Steps, mean: Any, covariance_: Any, want: Any, rounding: Any = None):
+    def __init__(
+        self, steps: Steps, mean: ArrayLike, covariance_: ArrayLike, want: ArrayLike, rounding: ArrayLike | None = None
+    ):
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
         one_step: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
@@ -67,17 +68,14 @@ class LinearSystem(eqx.Module):
 
 
 class StateMoments(NamedTuple):
-    """Mean (time + 1, N) and covariance (time + 1, N, N) of y itself; entry 0 is the start."""
+    """Mean and covariance of y itself; entry 0 is the start."""
 
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: Float[np.ndarray, "time+1 N"]
+    covariance: Float[np.ndarray, "time+1 N N"]
 
 
 def state_moments(system: LinearSystem) -> StateMoments:
-    """Moments of y before any data: X+ = A X A' + Cov(w). No best filter's error exceeds them, P_k <= X_k.
-
-    Raises: nothing; a LinearSystem is checked when it is made.
-    """
+    """Moments of y before any data: X+ = A X A' + Cov(w). No best filter's error exceeds them, P_k <= X_k."""
     mean, spread = system.mean, system.covariance
     means, spreads = [mean], [spread]
     for k in range(system.horizon):

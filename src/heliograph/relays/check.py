@@ -11,28 +11,29 @@ import numpy as np
 from heliograph.model.over_time import OverTime, unstack
 from heliograph.model.relays import SENSOR, RelayNetwork, link_at
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import second_moment_tensor
 from heliograph.relays.design import GainsByFilter
 
 
 class Recomputed(NamedTuple):
-    """covariance[filter] (steps + 1, n, n), state covariance (steps + 1, n, n), and how far gains are from greedy.
+    """Error covariance[filter] and state covariance at k = 0 .. steps, and how far gains are from greedy.
 
-    correlation[filter] (steps,): largest correlation of a component of the error after the step with a component of
+    correlation[filter]: largest correlation of a component of the error after the step with a component of
     the innovation; zero if and only if the gain minimises the filter's own next error.
     """
 
-    covariance: dict[str, np.ndarray]
-    state: np.ndarray
-    correlation: dict[str, np.ndarray]
+    covariance: dict[str, Float[np.ndarray, "steps+1 n n"]]
+    state: Float[np.ndarray, "steps+1 n n"]
+    correlation: dict[str, Float[np.ndarray, "steps"]]
 
 
 class _Heard(NamedTuple):
-    """What one filter hears: mean map (p, sent + 1) and E z z' = raw_ij : (sent, 1)(sent, 1)'."""
+    """What one filter hears: mean map and E z z' = raw_ij : (sent, 1)(sent, 1)'."""
 
-    mean: np.ndarray
-    raw: np.ndarray
+    mean: Float[np.ndarray, "p sent+1"]
+    raw: Float[np.ndarray, "p p sent+1 sent+1"]
 
 
 def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
@@ -51,8 +52,9 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     for f in range(len(filters)):
         errors[f, :, 1 : 1 + n], errors[f, :, 1 + (1 + f) * n : 1 + (2 + f) * n] = np.eye(n), -np.eye(n)
     history, correlation = [raw], []
-    for k in range(len(np.asarray(gains[filters[0]]))):
-        raw, found = _step(network, k, raw, [np.asarray(gains[name][k]) for name in filters], errors)
+    by_filter = [np.asarray(gains[name], dtype=np.float64) for name in filters]
+    for k in range(len(by_filter[0])):
+        raw, found = _step(network, k, raw, [gain[k] for gain in by_filter], errors)
         history.append(raw)
         correlation.append(found)
     moments = np.array(history)

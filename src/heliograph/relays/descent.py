@@ -4,6 +4,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from heliograph.numerics.types import Float
+
 Function = Callable[[np.ndarray], tuple[float, np.ndarray]]
 
 DECREASE = 1e-4  # Armijo: least part of the predicted decrease that a step must give
@@ -12,7 +14,9 @@ SHORTEST = 1e-14
 PATIENCE = 5  # steps in a row that gain nothing
 
 
-def bfgs(function: Function, start: np.ndarray, iterations: int = 300, tolerance: float = 1e-12) -> np.ndarray:
+def bfgs(
+    function: Function, start: Float[np.ndarray, "n"], iterations: int = 300, tolerance: float = 1e-12
+) -> Float[np.ndarray, "n"]:
     """Follow value and gradient down from `start`, where the value is finite; a step to an infinite value is shortened.
 
     Stops after PATIENCE steps that gain less than `tolerance`, or where no step goes down any more.
@@ -50,7 +54,9 @@ def _backtrack(
     return None
 
 
-def _update(inverse: np.ndarray, s: np.ndarray, y: np.ndarray, first: bool) -> np.ndarray:
+def _update(
+    inverse: Float[np.ndarray, "n n"], s: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"], first: bool
+) -> Float[np.ndarray, "n n"]:
     """H+ = (I - s y'/s'y) H (I - y s'/s'y) + s s'/s'y, skipped where the curvature s'y is not positive."""
     curvature = float(s @ y)
     if curvature <= 1e-14 * np.linalg.norm(s) * np.linalg.norm(y):
@@ -58,5 +64,4 @@ def _update(inverse: np.ndarray, s: np.ndarray, y: np.ndarray, first: bool) -> n
     if first:
         inverse = np.eye(len(s)) * curvature / float(y @ y)
     left = np.eye(len(s)) - np.outer(s, y) / curvature
-    result: np.ndarray = left @ inverse @ left.T + np.outer(s, s) / curvature
-    return result
+    return np.asarray(left @ inverse @ left.T + np.outer(s, s) / curvature)

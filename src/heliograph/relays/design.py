@@ -1,7 +1,6 @@
 """What a design of a relay network gives: gains, exact error covariances, power; and its filters as schedules."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,35 +10,32 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
 
-GainsByFilter = Mapping[str, Any]
+GainsByFilter = Mapping[str, ArrayLike]  # by name, each (steps, n, received)
 
 
 class RelayDesign(eqx.Module):
     """Gains of every filter for each step, computed before any data, and what they give.
 
-    covariance[filter] (steps + 1, n, n): E (x - s)(x - s)' at k = 0 .. steps, exact. power[relay] (steps,): mean
-    square E |C s|^2 of what it sends, zero where nobody listens. moments (steps + 1, d, d): covariance of
+    gains[filter]: zero where the filter hears nothing. covariance[filter]: E (x - s)(x - s)' at k = 0 .. steps, exact.
+    power[relay]: mean square E |C s|^2 of what it sends, zero where nobody listens. moments: covariance of
     (x, e_1 .. e_F), the receiver's error last. For a periodic design `steps` is the period and entry 0 equals the last.
-
-    Shapes: gains[filter] (steps, n, received), zero where the filter hears nothing.
     """
 
-    gains: dict[str, np.ndarray]
-    covariance: dict[str, np.ndarray]
-    power: dict[str, np.ndarray]
-    moments: np.ndarray
+    gains: dict[str, Float[np.ndarray, "steps n _"]]
+    covariance: dict[str, Float[np.ndarray, "steps+1 n n"]]
+    power: dict[str, Float[np.ndarray, "steps"]]
+    moments: Float[np.ndarray, "steps+1 d d"]
 
-    def trace(self, name: str) -> np.ndarray:
+    def trace(self, name: str) -> Float[np.ndarray, "time"]:
         """Trace of one filter's error covariance at k = 0 .. steps."""
-        result: np.ndarray = np.trace(self.covariance[name], axis1=1, axis2=2)
-        return result
+        return np.asarray(np.trace(self.covariance[name], axis1=1, axis2=2))
 
-    def total_power(self) -> np.ndarray:
-        """Power that the relays send together at each step, (steps,)."""
-        total: np.ndarray = np.sum([np.zeros(len(self.moments) - 1), *self.power.values()], axis=0)
-        return total
+    def total_power(self) -> Float[np.ndarray, "steps"]:
+        """Power that the relays send together at each step."""
+        return np.asarray(np.sum([np.zeros(len(self.moments) - 1), *self.power.values()], axis=0))
 
 
 def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
@@ -56,13 +52,13 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
 _propagate = compiled(propagate)
 
 
-def start_moments(network: RelayNetwork) -> np.ndarray:
+def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
     """Covariance of (x_0, e_1 .. e_F)."""
     return initial_moments(network.initial()[1], len(network.filters))
 
 
-def join_gains(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
-    """Gains by filter as one block matrix for each step, (steps, F n, R)."""
+def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
+    """Gains by filter as one block matrix for each step."""
     if set(gains) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, length = len(network.states), len(np.asarray(gains[network.filters[0]]))
@@ -74,8 +70,10 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
     return joined
 
 
-def split_gains(network: RelayNetwork, joined: np.ndarray) -> dict[str, np.ndarray]:
-    """Gains by filter from block matrices (steps, F n, R)."""
+def split_gains(
+    network: RelayNetwork, joined: Float[np.ndarray, "steps Fn R"]
+) -> dict[str, Float[np.ndarray, "steps n _"]]:
+    """Gains by filter from block matrices."""
     n, ends = len(network.states), np.cumsum(network.received)
     return {
         name: np.asarray(joined)[:, f * n : (f + 1) * n, end - heard : end]
@@ -133,14 +131,13 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
 
 
 @compiled
-def _before_correction(steps: Steps, moments: Any) -> jax.Array:
-    """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, (time, d + R, d + R)."""
-    result: jax.Array = jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
-    return result
+def _before_correction(steps: Steps, moments: Float[Array, "time d d"]) -> Float[Array, "time z z"]:
+    """Covariance of (x, e_1 .. e_F before corrections, innovations) at each step, z = d + R."""
+    return jax.vmap(lambda p, m: step_moments(p, m)[0])(steps, moments)
 
 
-def expected_maps(steps: Steps) -> tuple[np.ndarray, np.ndarray]:
-    """What each row expects to hear, B s + b, from the estimate s of its filter: (time, R, n) and (time, R)."""
+def expected_maps(steps: Steps) -> tuple[Float[np.ndarray, "time R n"], Float[np.ndarray, "time R"]]:
+    """What each row expects to hear, B s + b, from the estimate s of its filter."""
     relays = len(steps.received) - 1
     predicted = [steps.sensing @ steps.transition, *[steps.sensing] * relays]
     constant = np.einsum("kmn,kn->km", steps.sensing, steps.drift) + steps.sensor_offset
@@ -151,8 +148,8 @@ def expected_maps(steps: Steps) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def receiver_weight(weights: np.ndarray, filters: int, n: int) -> np.ndarray:
-    """Matrices C_k with <C_k, moments_k> = weights_k tr P_k, (steps, d, d)."""
+def receiver_weight(weights: Float[np.ndarray, "steps"], filters: int, n: int) -> Float[np.ndarray, "steps d d"]:
+    """Matrices C_k with <C_k, moments_k> = weights_k tr P_k."""
     d = (1 + filters) * n
     result = np.zeros((len(weights), d, d))
     result[:, d - n :, d - n :] = np.asarray(weights)[:, None, None] * np.eye(n)

@@ -1,7 +1,6 @@
 """The periodic steady state of a relay network: slots in turn, for ever."""
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,8 +11,9 @@ from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, Bool, Float, Int
 from heliograph.relays.design import GainsByFilter, RelayDesign, as_design, join_gains, start_moments
-from heliograph.relays.receiver import relay_gains, relay_side
+from heliograph.relays.receiver import RelaySide, relay_gains, relay_side
 from heliograph.relays.second_moments import Propagated, propagate, propagate_own
 
 CONVERGED = 1e-13  # relative change of the moments over a period
@@ -21,6 +21,8 @@ PERIODS = 100_000
 HELD = 1e-9  # the same for a covariance that only gives gains: their error enters it squared
 TINY = float(np.finfo(np.float64).tiny)
 INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
+
+Settling = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
 
 
 def periodic_steps(network: RelayNetwork) -> Steps:
@@ -68,10 +70,10 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     return as_design(network, result)
 
 
-def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
+def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "slots n n"]:
     """Steady error covariance of the best linear receiver behind given relays, at the end of each slot.
 
-    Shapes: gains[relay] (slots, n, received), result (slots, n, n).
+    Shapes: gains[relay] (slots, n, received).
 
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
@@ -84,20 +86,22 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> np.nd
     return np.asarray(_steady_behind(steps, joined))[:, :n, :n]
 
 
-def _period(network: RelayNetwork, gains: np.ndarray) -> np.ndarray:
+def _period(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
     if len(gains) != len(network.slots):
         raise fail("periodic gains", f"one for each of the {len(network.slots)} slots", len(gains))
     return gains
 
 
-def fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> jax.Array:
+def fixed_point(step: Callable[[jax.Array], jax.Array], d: int) -> Float[jax.Array, "{d} {d}"]:
     """M = step(M) for an affine map of symmetric (d, d) matrices, solved over the d (d + 1) / 2 entries."""
     linear, constant, (i, j) = _entries(step, d)
     entries = jnp.linalg.solve(jnp.eye(len(i)) - linear, constant)
     return jnp.zeros((d, d)).at[i, j].set(entries).at[j, i].set(entries)
 
 
-def _entries(step: Callable[[jax.Array], jax.Array], d: int) -> tuple[jax.Array, jax.Array, Any]:
+def _entries(
+    step: Callable[[jax.Array], jax.Array], d: int
+) -> tuple[Float[jax.Array, "e e"], Float[jax.Array, "e"], tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]]:
     """The affine map on the upper triangle: linear part, constant, and the triangle's indices."""
     i, j = np.triu_indices(d)
     basis = np.zeros((len(i), d, d))
@@ -107,52 +111,51 @@ def _entries(step: Callable[[jax.Array], jax.Array], d: int) -> tuple[jax.Array,
     return images[:, i, j].T, constant[i, j], (i, j)
 
 
-def steady(steps: Steps, gains: Any) -> Propagated:
+def steady(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Propagated:
     """Moments over a period that ends as it begins; differentiable in the gains. Meaningful if `is_covariance`."""
     d = gains.shape[1] + steps.transition.shape[-1]
     return propagate(steps, fixed_point(lambda m: propagate(steps, m, gains).moments[-1], d), gains)
 
 
-def is_covariance(moments: jax.Array) -> jax.Array:
-    """Whether all of (..., d, d) are positive semidefinite to rounding: the fixed point is then the limit."""
+def is_covariance(moments: Float[Array, "... d d"]) -> Bool[jax.Array, ""]:
+    """Whether all are positive semidefinite to rounding: the fixed point is then the limit."""
     fixed = jax.lax.stop_gradient(moments)
     smallest: jax.Array = jnp.min(jnp.linalg.eigvalsh(fixed))
     return smallest > -INDEFINITE * jnp.max(jnp.abs(fixed))
 
 
-def steady_behind(steps: Steps, gains: Any) -> jax.Array:
-    """Steady error covariances (slots, d', d') of the best linear estimate of (x, e_relays) from the receiver's data.
+def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, "slots d d"]:
+    """Steady error covariances of the best linear estimate of (x, e_relays) from the receiver's data.
 
     The receiver's gains are held while differentiating: they minimise the error, so their change has no first-order
     effect, and the fixed point with given gains is affine.
     """
     moments = steady(steps, gains).moments[:-1]
-    a, c, white = jax.vmap(relay_side)(steps, moments, gains)
-    d = a.shape[-1]
+    side = jax.vmap(relay_side)(steps, moments, gains)
+    d = side.transition.shape[-1]
 
-    def predict(spread: jax.Array, item: Any) -> jax.Array:
-        both = jnp.concatenate([item[0], item[1]])
-        moved: jax.Array = both @ spread @ both.T + item[2]
-        return moved
+    def predict(spread: jax.Array, item: RelaySide) -> jax.Array:
+        both = jnp.concatenate([item.transition, item.output])
+        return both @ spread @ both.T + item.noise
 
-    def best(spread: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+    def best(spread: jax.Array, item: RelaySide) -> tuple[jax.Array, jax.Array]:
         z = predict(spread, item)
         gain = jnp.linalg.solve(z[d:, d:], z[d:, :d]).T
         after = z[:d, :d] - gain @ z[d:, :d]
         return (after + after.T) / 2, gain
 
-    held = jax.lax.stop_gradient((a, c, white))
+    held = jax.lax.stop_gradient(side)
     settled = _settle(lambda e: jax.lax.scan(best, e, held)[0], jax.lax.stop_gradient(moments[0][:d, :d]), HELD)[0]
     best_gains = jax.lax.stop_gradient(jax.lax.scan(best, settled, held)[1])
 
-    def given(spread: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+    def given(spread: jax.Array, item: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         part, gain = item
         close = jnp.concatenate([jnp.eye(d), -gain], axis=1)
         after = close @ predict(spread, part) @ close.T
         return after, after
 
     def period(spread: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return jax.lax.scan(given, spread, ((a, c, white), best_gains))
+        return jax.lax.scan(given, spread, (side, best_gains))
 
     return jnp.asarray(period(fixed_point(lambda e: period(e)[0], d))[1])
 
@@ -162,12 +165,12 @@ _steady_behind = compiled(steady_behind)
 
 
 @compiled
-def _growth(steps: Steps, gains: Any) -> jax.Array:
+def _growth(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array, ""]:
     """Spectral radius of the linear part of one period of the second moments, by repeated squaring."""
     d = gains.shape[1] + steps.transition.shape[-1]
     linear, _, _ = _entries(lambda m: propagate(steps, m, gains).moments[-1], d)
 
-    def double(_: Any, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def double(_: Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         power, log_scale = carry
         size = jnp.maximum(jnp.linalg.norm(power), TINY)
         return (power / size) @ (power / size), 2 * (log_scale + jnp.log(size))
@@ -178,7 +181,7 @@ def _growth(steps: Steps, gains: Any) -> jax.Array:
 
 
 @compiled
-def _settle_own(steps: Steps, start: Any) -> tuple[Propagated, jax.Array]:
+def _settle_own(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
     moments, change = _settle(lambda m: propagate_own(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
@@ -190,13 +193,13 @@ def _settle(
 ) -> tuple[jax.Array, jax.Array]:
     """Repeat until the relative change is below `tolerance`; returns the last value and its change."""
 
-    def again(carry: Any) -> Any:
+    def again(carry: Settling) -> Settling:
         value, _, count = carry
         after = period(value)
         return after, jnp.max(jnp.abs(after - value)) / jnp.max(jnp.abs(after)), count + 1
 
-    def going(carry: Any) -> Any:
+    def going(carry: Settling) -> jax.Array:
         return (carry[1] > tolerance) & (carry[2] < PERIODS)
 
-    value, change, _ = jax.lax.while_loop(going, again, (start, jnp.asarray(jnp.inf), 0))
+    value, change, _ = jax.lax.while_loop(going, again, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))
     return value, change

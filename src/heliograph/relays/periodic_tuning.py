@@ -1,7 +1,6 @@
 """Gains tuned for the periodic steady state by descent through its fixed point; power may be bounded."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +9,7 @@ import numpy as np
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
 from heliograph.relays.design import GainsByFilter, RelayDesign, join_gains, split_gains
 from heliograph.relays.periodic import (
@@ -28,9 +28,12 @@ MARGIN = 1e-5  # the search aims this much below a limit, so that what is left o
 ROUNDS = 10  # of the multipliers
 STIFFNESS = 1000.0  # of the augmented Lagrangian, against a cost that is a logarithm
 
+# value, gradient and power of gains base + x unit at `where`, from x, steps, base, where, unit, limit, multipliers
+Cost = Callable[[Array, Steps, Array, tuple[Array, ...], Array, Array, Array], tuple[Array, Array, Array]]
+
 
 def periodic_receiver_error_design(
-    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: Any = None
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: ArrayLike | None = None
 ) -> RelayDesign:
     """Gains of relays and receiver that together make the steady sum over the slots of tr P small.
 
@@ -48,12 +51,11 @@ def periodic_receiver_error_design(
 
 
 def periodic_relays_for_best_receiver(
-    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: Any = None
-) -> dict[str, np.ndarray]:
+    network: RelayNetwork, start: GainsByFilter | None = None, power_limit: ArrayLike | None = None
+) -> dict[str, Float[np.ndarray, "slots n _"]]:
     """Relay gains with which the best linear receiver behind them has a small steady sum over the slots of tr P.
 
-    As `periodic_receiver_error_design`, but the receiver is `periodic_behind_relays`. Returns {relay: (slots, n,
-    received)}.
+    As `periodic_receiver_error_design`, but the receiver is `periodic_behind_relays`. Returns {relay: gains}.
 
     Raises:
         ValueError: as for `periodic_receiver_error_design`; no relays.
@@ -63,7 +65,9 @@ def periodic_relays_for_best_receiver(
     return {name: gain for name, gain in tuned.items() if name != RECEIVER}
 
 
-def _tune(network: RelayNetwork, start: np.ndarray, cost: Callable[..., Any], power_limit: Any) -> np.ndarray:
+def _tune(
+    network: RelayNetwork, start: Float[np.ndarray, "slots Fn R"], cost: Cost, power_limit: ArrayLike | None
+) -> Float[np.ndarray, "slots Fn R"]:
     """Descend over the free entries of the gains, each filter's in units of its largest."""
     steps = periodic_steps(network)
     if len(start) != len(network.slots):
@@ -83,10 +87,10 @@ def _tune(network: RelayNetwork, start: np.ndarray, cost: Callable[..., Any], po
 
         def function(x: np.ndarray, multipliers: np.ndarray = multipliers) -> tuple[float, np.ndarray]:
             value, gradient, _ = cost(x, steps, start, where, unit, limit * (1 - MARGIN), multipliers)
-            return float(value), gradient
+            return float(value), np.asarray(gradient)
 
         x = bfgs(function, x)
-        power = cost(x, steps, start, where, unit, limit, multipliers)[2]
+        power = np.asarray(cost(x, steps, start, where, unit, limit, multipliers)[2])
         if _settled(power / (limit * (1 - MARGIN)) - 1, multipliers):
             break
         multipliers = np.maximum(0.0, multipliers + STIFFNESS * (power / (limit * (1 - MARGIN)) - 1))
@@ -97,12 +101,12 @@ def _tune(network: RelayNetwork, start: np.ndarray, cost: Callable[..., Any], po
     return tuned
 
 
-def _settled(excess: np.ndarray, multipliers: np.ndarray) -> bool:
+def _settled(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
     """Whether no slot is above its limit, and those with a multiplier are at it."""
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
 
-def _units(network: RelayNetwork, gains: np.ndarray) -> np.ndarray:
+def _units(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Float[np.ndarray, "slots Fn R"]:
     """The largest entry of each filter's gain in each slot, at every entry of that gain."""
     largest = {name: np.max(np.abs(gain), axis=(1, 2)) for name, gain in split_gains(network, gains).items()}
     floor = 1e-3 * max(float(np.max(value)) for value in largest.values())
@@ -115,7 +119,13 @@ def _units(network: RelayNetwork, gains: np.ndarray) -> np.ndarray:
     )
 
 
-def _penalised(traces: jax.Array, sound: jax.Array, power: jax.Array, limit: jax.Array, multipliers: jax.Array) -> Any:
+def _penalised(
+    traces: Float[jax.Array, "slots"],
+    sound: Bool[jax.Array, ""],
+    power: Float[jax.Array, "slots"],
+    limit: Float[Array, "slots"],
+    multipliers: Float[Array, "slots"],
+) -> Float[jax.Array, ""]:
     """log sum of traces plus sum_k max(0, lambda_k + c g_k)^2 / 2c, g the relative excess; infinite where unsound."""
     total = jnp.sum(traces)
     sound = sound & (total > 0)
@@ -124,12 +134,12 @@ def _penalised(traces: jax.Array, sound: jax.Array, power: jax.Array, limit: jax
     return jnp.where(sound, jnp.log(jnp.where(sound, total, 1.0)) + penalty, jnp.inf)
 
 
-def _value(
-    traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]],
-) -> Callable[..., tuple[jax.Array, jax.Array, jax.Array]]:
+def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.Array]]) -> Cost:
     """Value, gradient and power of a cost given by its traces, soundness and power."""
 
-    def value(x: Any, steps: Steps, base: Any, where: Any, unit: Any, limit: Any, multipliers: Any) -> Any:
+    def value(
+        x: Array, steps: Steps, base: Array, where: tuple[Array, ...], unit: Array, limit: Array, multipliers: Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         def inner(x: jax.Array) -> tuple[jax.Array, jax.Array]:
             trace, sound, power = traces(steps, jnp.asarray(base).at[where].add(x * unit))
             return _penalised(trace, sound, power, limit, multipliers), power

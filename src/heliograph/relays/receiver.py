@@ -1,6 +1,6 @@
 """The best linear receiver behind relays whose gains are given: it also estimates what the relays do not know."""
 
-from typing import Any
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +13,7 @@ from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, Float
 from heliograph.relays.design import GainsByFilter, expected_maps, join_gains, start_moments
 from heliograph.relays.second_moments import correct, linear_maps, step_moments
 
@@ -30,7 +31,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     """
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    known, heard, white = _system(steps, start_moments(network), joined)
+    known, heard, white = _sides(steps, start_moments(network), joined)
     d, r = known.shape[-1], heard.shape[1]
     none = np.zeros((len(known), d + r, r))
     drift = np.zeros((len(known), d + r))
@@ -48,8 +49,8 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     return lmmse(LinearSystem(system, mean, covariance, np.eye(n, d + r)))
 
 
-def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
-    """Block matrices (steps, F n, R) of the relays' gains, zero for the receiver.
+def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
+    """Block matrices of the relays' gains, zero for the receiver.
 
     Raises:
         ValueError: a relay without gains, gains of the wrong shape, no relays.
@@ -57,17 +58,25 @@ def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> np.ndarray:
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:
         raise fail("relay gains", f"those of {list(network.relays)}", f"none for {missing}" if missing else "no relays")
-    relays: dict[str, Any] = {name: gains[name] for name in network.relays}
+    relays = {name: gains[name] for name in network.relays}
     n, length = len(network.states), len(np.asarray(relays[network.relays[0]]))
     return join_gains(network, relays | {RECEIVER: np.zeros((length, n, network.received[-1]))})
 
 
-def relay_side(p: Steps, moments: jax.Array, gain: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+class RelaySide(NamedTuple):
     """Relays closed with their gains, seen from the receiver: zeta+ = A zeta + a, z = C zeta + c, zeta = (x, e_relays).
 
-    Returns A (d', d'), C (r, d') and the joint covariance (d' + r, d' + r) of (a, c): white, and uncorrelated with
-    zeta, since what a random gain adds has mean zero given the past.
+    transition A, output C, and the joint covariance of (a, c): white, and uncorrelated with zeta, since what a random
+    gain adds has mean zero given the past. Over time each has a leading axis.
     """
+
+    transition: Float[jax.Array, "*time d d"]
+    output: Float[jax.Array, "*time r d"]
+    noise: Float[jax.Array, "*time d+r d+r"]
+
+
+def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"]) -> RelaySide:
+    """What the receiver has to do with in one step."""
     n, r = p.transition.shape[-1], p.received[-1]
     maps, d = linear_maps(p), moments.shape[0]
     known, rows = d - n, p.gain.shape[0] - r  # all but the receiver's error, all but what the receiver hears
@@ -81,16 +90,15 @@ def relay_side(p: Steps, moments: jax.Array, gain: jax.Array) -> tuple[jax.Array
     _, sent = step_moments(p, moments)
     random = jnp.einsum("ijab,ab->ij", p.spread, sent.second)
     white = moved[:, d:] @ noise @ moved[:, d:].T + close[:, known:] @ random @ close[:, known:].T
-    return moved[:known, :known], moved[known:, :known], white
+    return RelaySide(moved[:known, :known], moved[known:, :known], white)
 
 
 @compiled
-def _system(steps: Steps, start: Any, gains: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _sides(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """`relay_side` at each step."""
 
-    def one(moments: jax.Array, item: Any) -> tuple[jax.Array, Any]:
+    def one(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         p, gain = item
         return correct(step_moments(p, moments)[0], gain * p.live), relay_side(p, moments, gain)
 
-    _, (known, heard, white) = jax.lax.scan(one, jnp.asarray(start), (steps, gains))
-    return known, heard, white
+    return jax.lax.scan(one, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

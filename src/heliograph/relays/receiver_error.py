@@ -1,6 +1,6 @@
 """Relays and receiver tuned together, over a horizon, so that the receiver's error is small; power may be bounded."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.relays.design import (
     RelayDesign,
     given_design,
@@ -30,12 +31,16 @@ BISECTIONS = 40  # halvings of a multiplier's logarithm over 18 decades
 class PowerLimit(NamedTuple):
     """Each step's gains must keep <form_k, moments after the step> within limit_k: the power of the next step."""
 
-    form: Any
-    limit: Any
+    form: Float[Array, "*time d d"]
+    limit: Float[Array, "*time"]
 
 
 def receiver_error_design(
-    network: RelayNetwork, horizon: int, weights: Any = None, power_limit: Any = None, sweeps: int = 200
+    network: RelayNetwork,
+    horizon: int,
+    weights: ArrayLike | None = None,
+    power_limit: ArrayLike | None = None,
+    sweeps: int = 200,
 ) -> RelayDesign:
     """Gains of relays and receiver that together make sum_k weight_k tr P_k small, P_k the receiver's error covariance.
 
@@ -62,10 +67,10 @@ def receiver_error_design(
     gains, best = _sweeps(steps, start, cost, limit, first, np.arange(sweeps))
     if not np.isfinite(best):
         raise fail("power limit", "one that some design meets", "one for which none was found")
-    return given_design(network, split_gains(network, gains))
+    return given_design(network, split_gains(network, np.asarray(gains)))
 
 
-def _limit(steps: Steps, own: RelayDesign, power_limit: Any) -> PowerLimit | None:
+def _limit(steps: Steps, own: RelayDesign, power_limit: ArrayLike | None) -> PowerLimit | None:
     """Limits on the moments after each step; the last step's gains send nothing."""
     if power_limit is None:
         return None
@@ -83,8 +88,8 @@ def _limit(steps: Steps, own: RelayDesign, power_limit: Any) -> PowerLimit | Non
     return PowerLimit(np.concatenate([forms[1:], np.zeros((1, d, d))]), np.append((value - fixed)[1:], 1.0))
 
 
-def power_forms(steps: Steps, d: int) -> np.ndarray:
-    """Matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r), (time, d, d)."""
+def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
+    """Matrices with <form_k, moments before step k> = sum over talking relays of tr Cov(C s_r)."""
     time, n = steps.state_mean.shape
     forms = np.zeros((time, d, d))
     for r in range(len(steps.received) - 1):
@@ -95,8 +100,10 @@ def power_forms(steps: Steps, d: int) -> np.ndarray:
     return forms
 
 
-def best_gain(z: jax.Array, ahead: jax.Array, old: jax.Array, p: Steps) -> jax.Array:
-    """argmin over gains K (F n, R) of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
+def best_gain(
+    z: Float[Array, "z z"], ahead: Float[Array, "d d"], old: Float[Array, "Fn R"], p: Steps
+) -> Float[jax.Array, "Fn R"]:
+    """argmin over gains K of tr Lam [I -(0; K)] Z [I -(0; K)]', nearly; all filters together.
 
     (Lam_ee K Z_ii)_ab = (Lam_e. Z_.i)_ab for each free entry ab: a linear system of the size of the gains.
     """
@@ -112,7 +119,7 @@ def best_gain(z: jax.Array, ahead: jax.Array, old: jax.Array, p: Steps) -> jax.A
     return jnp.zeros_like(old).at[rows, columns].set(jnp.linalg.solve(normal, right))
 
 
-def pull_back(p: Steps, gain: jax.Array, ahead: jax.Array) -> jax.Array:
+def pull_back(p: Steps, gain: Float[Array, "Fn R"], ahead: Float[Array, "d d"]) -> Float[jax.Array, "d d"]:
     """Gradient of <Lam, moments after the step> with respect to the moments before it (an affine map)."""
     _, pull = jax.vjp(lambda m: correct(step_moments(p, m)[0], gain), jnp.zeros_like(ahead))
     return symmetrize(pull(ahead)[0])
@@ -130,7 +137,7 @@ def _bounded_gain(z: jax.Array, ahead: jax.Array, old: jax.Array, p: Steps, limi
         power: jax.Array = jnp.sum(limit.form * correct(z, gain(multiplier)))
         return jnp.greater(power, limit.limit)
 
-    def halve(_: Any, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+    def halve(_: Array, ends: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         low, high = ends
         middle = (low + high) / 2
         more = over(scale * jnp.exp(middle))
@@ -145,48 +152,60 @@ def _bounded_gain(z: jax.Array, ahead: jax.Array, old: jax.Array, p: Steps, limi
 class Search(NamedTuple):
     """Gains and power multipliers of the sweep, and the best gains that meet the limit with their cost."""
 
-    gains: jax.Array
-    multipliers: jax.Array
-    best: jax.Array
-    cost: jax.Array
+    gains: Float[jax.Array, "time Fn R"]
+    multipliers: Float[jax.Array, "time"]
+    best: Float[jax.Array, "time Fn R"]
+    cost: Float[jax.Array, ""]
 
 
-def _backward(steps: Steps, start: jax.Array, cost: Any, limit: PowerLimit | None, search: Search) -> jax.Array:
+def _backward(
+    steps: Steps, start: Array, cost: Float[Array, "time d d"], limit: PowerLimit | None, search: Search
+) -> Float[jax.Array, "time d d"]:
     """Gradient of cost plus multipliers times power with respect to the moments after each step, gains improved."""
 
-    def ahead_of(moments: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+    def ahead_of(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain = item
         z, _ = step_moments(p, moments)
         return correct(z, gain), z
 
-    def back(ahead: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+    def back(ahead: jax.Array, item: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain, z_k, cost_k = item
         ahead = ahead + cost_k
         return pull_back(p, best_gain(z_k, ahead, gain, p), ahead), ahead
 
+    slope = jnp.asarray(cost)
     if limit is not None:
-        cost = cost + search.multipliers[:, None, None] * limit.form
-    _, z = jax.lax.scan(ahead_of, start, (steps, search.gains))
-    _, ahead = jax.lax.scan(back, jnp.zeros_like(start), (steps, search.gains, z, cost), reverse=True)
-    return jnp.asarray(ahead)
+        slope = slope + search.multipliers[:, None, None] * limit.form
+    _, z = jax.lax.scan(ahead_of, jnp.asarray(start), (steps, search.gains))
+    return jax.lax.scan(back, jnp.zeros_like(start), (steps, search.gains, z, slope), reverse=True)[1]
 
 
-def _forward(steps: Steps, start: jax.Array, limit: PowerLimit | None, gains: jax.Array, ahead: jax.Array) -> Any:
+def _forward(
+    steps: Steps, start: Array, limit: PowerLimit | None, gains: Array, ahead: jax.Array
+) -> tuple[jax.Array, jax.Array]:
     """Best gains step by step, within the limit if there is one, and the moments after each step."""
 
-    def one(moments: jax.Array, item: Any) -> tuple[jax.Array, Any]:
+    def one(
+        moments: jax.Array, item: tuple[Steps, jax.Array, jax.Array, PowerLimit | None]
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         p, gain, ahead_k, limit_k = item
         z, _ = step_moments(p, moments)
         gain = best_gain(z, ahead_k, gain, p) if limit_k is None else _bounded_gain(z, ahead_k, gain, p, limit_k)
         after = correct(z, gain)
         return after, (gain, after)
 
-    _, result = jax.lax.scan(one, start, (steps, gains, ahead, limit))
-    return result
+    return jax.lax.scan(one, jnp.asarray(start), (steps, jnp.asarray(gains), ahead, limit))[1]
 
 
 @compiled
-def _sweeps(steps: Steps, start: Any, cost: Any, limit: PowerLimit | None, own: Any, count: Any) -> Any:
+def _sweeps(
+    steps: Steps,
+    start: Float[Array, "d d"],
+    cost: Float[Array, "time d d"],
+    limit: PowerLimit | None,
+    own: Float[Array, "time Fn R"],
+    count: Int[Array, "sweeps"],
+) -> tuple[Float[Array, "time Fn R"], Float[Array, ""]]:
     """Sweeps from the own-error gains: the best gains that meet the limit and their cost, infinite if there are none.
 
     With a limit, every sweep ends with a second forward pass that enforces it step by step, so that a design is kept
@@ -199,7 +218,7 @@ def _sweeps(steps: Steps, start: Any, cost: Any, limit: PowerLimit | None, own: 
         better = (value < search.cost) & jnp.all(power <= bound * (1 + POWER_TOLERANCE))
         return search._replace(best=jnp.where(better, gains, search.best), cost=jnp.where(better, value, search.cost))
 
-    def sweep(search: Search, _: Any) -> tuple[Search, None]:
+    def sweep(search: Search, _: jax.Array) -> tuple[Search, None]:
         ahead = _backward(steps, start, cost, limit, search)
         gains, moments = _forward(steps, start, None, search.gains, ahead)
         excess = jnp.sum(form * moments, axis=(1, 2)) / bound
@@ -208,13 +227,14 @@ def _sweeps(steps: Steps, start: Any, cost: Any, limit: PowerLimit | None, own: 
         kept = (gains, moments) if limit is None else _forward(steps, start, limit, gains, ahead)
         return keep(search._replace(gains=gains, multipliers=multipliers), *kept), None
 
-    def given(moments: jax.Array, item: Any) -> tuple[jax.Array, jax.Array]:
+    def given(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain = item
         after = correct(step_moments(p, moments)[0], gain)
         return after, after
 
-    _, moments = jax.lax.scan(given, start, (steps, own))
+    first = jnp.asarray(own)
+    _, moments = jax.lax.scan(given, jnp.asarray(start), (steps, first))
     initial = 1e-2 * jnp.sum(cost * moments) / (bound * len(cost))
-    search = keep(Search(own, initial, own, jnp.asarray(jnp.inf)), own, moments)
-    search, _ = jax.lax.scan(sweep, search, count)
+    search = keep(Search(first, initial, first, jnp.asarray(jnp.inf)), first, moments)
+    search, _ = jax.lax.scan(sweep, search, jnp.asarray(count))
     return search.best, search.cost

@@ -6,7 +6,7 @@ Every i_f is a known linear map of eta and noises plus (G - E G) sent + n - E n,
 So the moments of (eta+ before corrections, i) follow exactly, and every gain acts on them as a known matrix.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,27 +14,27 @@ import numpy as np
 
 from heliograph.model.relays import Steps
 from heliograph.numerics.linalg import psd_solve, symmetrize
+from heliograph.numerics.types import Array, Bool, Float
 
 
 class Sent(NamedTuple):
-    """W = E (sent, 1)(sent, 1)' (T + 1, T + 1) and each sender's power E |signal|^2 (senders,), zero if silent."""
+    """W = E (sent, 1)(sent, 1)' and each sender's power E |signal|^2, zero if silent."""
 
-    second: jax.Array
-    power: jax.Array
+    second: Float[jax.Array, "T+1 T+1"]
+    power: Float[jax.Array, "senders"]
 
 
 class LinearMaps(NamedTuple):
-    """Rows over (x, e_1 .. e_F, w, v): eta+ before corrections (d, .), innovations (R, .), sent signals (T, .)."""
+    """Rows over (x, e_1 .. e_F, w, v): eta+ before corrections, innovations, sent signals."""
 
-    moved: jax.Array
-    innovation: jax.Array
-    sent: jax.Array
+    moved: Float[jax.Array, "d sources"]
+    innovation: Float[jax.Array, "R sources"]
+    sent: Float[jax.Array, "T sources"]
 
 
-def initial_moments(covariance: np.ndarray, filters: int) -> np.ndarray:
+def initial_moments(covariance: Float[np.ndarray, "n n"], filters: int) -> Float[np.ndarray, "d d"]:
     """Covariance of (x, e_1 .. e_F) where every filter starts at the mean: each e_f is x - E x."""
-    result: np.ndarray = np.kron(np.ones((1 + filters, 1 + filters)), covariance)
-    return result
+    return np.asarray(np.kron(np.ones((1 + filters, 1 + filters)), covariance))
 
 
 def linear_maps(p: Steps) -> LinearMaps:
@@ -56,17 +56,17 @@ def linear_maps(p: Steps) -> LinearMaps:
     return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - own, sent)
 
 
-def sent_mean(p: Steps) -> jax.Array:
+def sent_mean(p: Steps) -> Float[jax.Array, "sent"]:
     """E (sent, 1): every estimate is unbiased, so it does not depend on the gains."""
     y = p.sensing @ (p.transition @ p.state_mean + p.drift) + p.sensor_offset
     relayed = p.sensing @ p.state_mean
     return jnp.concatenate([y, *[relayed] * (len(p.received) - 1), jnp.ones(1)])
 
 
-def step_moments(p: Steps, moments: jax.Array) -> tuple[jax.Array, Sent]:
+def step_moments(p: Steps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Array, "z z"], Sent]:
     """Z = covariance of (eta+ before corrections, innovations), and what is sent, from the covariance of eta.
 
-    Shapes: moments (d, d), Z (d + R, d + R) with d = (1 + F) n.
+    d = (1 + F) n, z = d + R.
     """
     maps, mean = linear_maps(p), sent_mean(p)
     sources = jax.scipy.linalg.block_diag(moments, p.process, p.sensor_noise)
@@ -79,22 +79,21 @@ def step_moments(p: Steps, moments: jax.Array) -> tuple[jax.Array, Sent]:
     return z, Sent(second, power)
 
 
-def correct(z: jax.Array, gain: jax.Array) -> jax.Array:
-    """Covariance of eta+ = eta+ before corrections - (0; K) innovations; gain K of shape (F n, R)."""
+def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
+    """Covariance of eta+ = eta+ before corrections - (0; K) innovations."""
     rows, heard = gain.shape
     d = z.shape[0] - heard
     full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, heard)), -gain])], axis=1)
     return symmetrize(full @ z @ full.T)
 
 
-def gain_mask(p: Steps) -> np.ndarray:
-    """Where a gain (F n, R) may differ from zero: each filter uses what it hears itself."""
+def gain_mask(p: Steps) -> Bool[np.ndarray, "Fn R"]:
+    """Where a gain may differ from zero: each filter uses what it hears itself."""
     n = p.transition.shape[-1]
-    result: np.ndarray = np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner
-    return result
+    return np.asarray(np.repeat(np.arange(len(p.received)), n)[:, None] == p.owner)
 
 
-def own_gain(z: jax.Array, p: Steps) -> jax.Array:
+def own_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
     """K_f = Z_(e_f, i_f) Z_(i_f, i_f)^-1, which minimises each filter's own next tr E e_f e_f'.
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
@@ -112,14 +111,14 @@ def own_gain(z: jax.Array, p: Steps) -> jax.Array:
 
 
 class Propagated(NamedTuple):
-    """gains (time, F n, R), covariance of eta (time + 1, d, d), power of each sender (time, 1 + relays)."""
+    """Gains, the covariance of eta before and after each step, and the power of each sender."""
 
-    gains: jax.Array
-    moments: jax.Array
-    power: jax.Array
+    gains: Float[Array, "time Fn R"]
+    moments: Float[Array, "time+1 d d"]
+    power: Float[Array, "time senders"]
 
 
-def propagate_own(steps: Steps, start: Any) -> Propagated:
+def propagate_own(steps: Steps, start: Float[Array, "d d"]) -> Propagated:
     """Each filter minimises its own next error; start is the covariance of eta at 0."""
 
     def one(moments: jax.Array, p: Steps) -> tuple[jax.Array, tuple[jax.Array, ...]]:
@@ -133,8 +132,8 @@ def propagate_own(steps: Steps, start: Any) -> Propagated:
     return Propagated(gains, jnp.concatenate([start[None], moments]), power)
 
 
-def propagate(steps: Steps, start: Any, gains: Any) -> Propagated:
-    """Given gains, (time, F n, R); entries of rows that hear nothing are not used."""
+def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> Propagated:
+    """Given gains; entries of rows that hear nothing are not used."""
 
     def one(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = item

@@ -86,7 +86,7 @@ def replay(outcome: Outcome) -> Replayed:
         error.append(np.asarray(sent.value) - x)
         astray = max(astray, float(np.max(np.abs(own - d) / d)))
         received = np.asarray(quantizer.step(own, x)[1].value)
-        d, own = np.asarray(following), quantizer.decay * own + quantizer.growth * received**2
+        d, own = np.asarray(following), np.asarray(quantizer.decay * own + quantizer.growth * received**2)
     d, mu = np.stack(amplitude, axis=2), np.stack(error, axis=2)
     return Replayed(d, mu, float(np.max(np.abs(mu) * setting.SEGMENTS / d)), astray, *_broken(outcome, d, mu))
 

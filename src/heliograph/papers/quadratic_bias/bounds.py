@@ -2,13 +2,14 @@
 
 from dataclasses import dataclass
 from decimal import Decimal, localcontext
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import LinearSystem, state_moments
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
 
 SINGULAR = 1e-12  # smallest eigenvalue relative to the largest below which a matrix is singular up to rounding
 DIGITS = 200  # the Gramian's eigenvalues span more than 64 decades, so it is inverted in decimal arithmetic
@@ -86,11 +87,11 @@ def boundedness(system: LinearSystem, window: int | None = None) -> Boundedness:
 def _constants(system: LinearSystem) -> Constants:
     s = system.steps
 
-    def low(a: np.ndarray) -> float:
+    def low(a: Float[np.ndarray, "time n n"]) -> float:
         values = np.linalg.eigvalsh(a)
         return float(np.where(values[:, 0] > SINGULAR * values[:, -1], values[:, 0], 0.0).min())
 
-    def high(a: np.ndarray) -> float:
+    def high(a: Float[np.ndarray, "time n n"]) -> float:
         return float(np.linalg.eigvalsh(a)[:, -1].max())
 
     square = np.swapaxes(s.transition, 1, 2) @ s.transition
@@ -154,11 +155,12 @@ def _gramian_bound(system: LinearSystem, zeta: float, window: int) -> float | No
         return float(scale * Decimal(float(np.linalg.eigvalsh((inverse / scale).astype(np.float64))[-1])))
 
 
-def _exact(a: np.ndarray) -> Any:
+def _exact(a: np.ndarray) -> np.ndarray:
+    """The same numbers as decimals."""
     return np.array([[Decimal(float(v)) for v in row] for row in a], dtype=object).reshape(a.shape)
 
 
-def _inverse(a: Any) -> Any:
+def _inverse(a: np.ndarray) -> np.ndarray | None:
     """Gauss-Jordan with pivoting on decimals; None if a pivot vanishes to half the digits carried."""
     n = len(a)
     work = np.concatenate([a, _exact(np.eye(n))], axis=1)

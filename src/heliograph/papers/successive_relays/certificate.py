@@ -1,10 +1,12 @@
 """Which published bounds on a relay network's errors apply to a design, and whether they hold; checked on their own."""
 
-from typing import Any, NamedTuple
+from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_at, link_moments
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.relays.check import Recomputed, recompute
 from heliograph.relays.design import GainsByFilter
 
@@ -29,7 +31,7 @@ class Bound(NamedTuple):
     name: str
     source: str
     assumptions: tuple[Assumption, ...]
-    values: np.ndarray | None
+    values: Float[np.ndarray, "steps+1"] | None
     holds: bool | None
 
     @property
@@ -105,13 +107,12 @@ def _state_bound(steps: Steps, found: Recomputed, greedy: Assumption) -> Bound:
 def _constants(network: RelayNetwork, steps: Steps) -> dict[str, float]:
     """The scalars of Assumption 1; NaN where the network is not of the published kind."""
 
-    def extremes(matrices: Any) -> tuple[float, float]:
+    def extremes(matrices: ArrayLike) -> tuple[float, float]:
         values = np.linalg.eigvalsh(np.asarray(matrices))
         return float(values.min()), float(values.max())
 
-    def gram(a: np.ndarray) -> np.ndarray:
-        product: np.ndarray = a @ np.swapaxes(a, 1, 2)
-        return product
+    def gram(a: Float[np.ndarray, "time n m"]) -> Float[np.ndarray, "time n n"]:
+        return np.asarray(a @ np.swapaxes(a, 1, 2))
 
     tau, f, w = extremes(gram(steps.transition)), extremes(gram(steps.sensing)), extremes(steps.process)
     p0, v = extremes(network.initial()[1][None]), extremes(steps.sensor_noise)
@@ -170,7 +171,7 @@ def _positive(c: dict[str, float]) -> tuple[Assumption, ...]:
     return tuple(Assumption(text, f"smallest eigenvalue {c[name]:.3g}", c[name] > 0) for name, text in wanted.items())
 
 
-def _recursion(start: float, factors: np.ndarray, constant: float) -> np.ndarray:
+def _recursion(start: float, factors: Float[np.ndarray, "steps"], constant: float) -> Float[np.ndarray, "steps+1"]:
     """b_k = a_(k-1) b_(k-1) + c."""
     values = [start]
     for factor in factors:
@@ -178,18 +179,32 @@ def _recursion(start: float, factors: np.ndarray, constant: float) -> np.ndarray
     return np.array(values)
 
 
-def _above(name: str, source: str, assumptions: Any, values: np.ndarray, eigenvalues: np.ndarray) -> Bound:
+def _above(
+    name: str,
+    source: str,
+    assumptions: Iterable[Assumption],
+    values: Float[np.ndarray, "time"],
+    eigenvalues: np.ndarray,
+) -> Bound:
     holds = bool(np.all(eigenvalues[..., -1] <= values * (1 + ROUNDING)))
     return Bound(name, source, tuple(assumptions), values, holds)
 
 
-def _below(name: str, source: str, assumptions: Any, values: np.ndarray, eigenvalues: np.ndarray) -> Bound:
+def _below(
+    name: str,
+    source: str,
+    assumptions: Iterable[Assumption],
+    values: Float[np.ndarray, "time"],
+    eigenvalues: np.ndarray,
+) -> Bound:
     slack = ROUNDING * eigenvalues[..., -1]
     holds = bool(np.all(eigenvalues[..., 0] >= values - slack))
     return Bound(name, source, tuple(assumptions), values, holds)
 
 
-def _lower_condition(c: dict[str, float], upper: Any) -> tuple[Any, Any, Any, float]:
+def _lower_condition(
+    c: dict[str, float], upper: Float[np.ndarray, "steps"]
+) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"], Float[np.ndarray, "steps"], float]:
     """n - c m / s and n + c m of the lower bound, the printed n - c m mu^2 / phi, and the part of w that is left."""
     mu, phi = c["mu_upper"], c["phi_lower"]
     s = phi / (2 * mu**2)
@@ -236,7 +251,7 @@ def _uniform(
     if not contracting.met or not structure.met:
         return [Bound(name, "(49) and (64)", needs, None, None) for name, _ in (*names, *lower_names)]
     top = max(c["p0_upper"], c["w_upper"] / (1 - tau))
-    above, below, _, left = _lower_condition(c, top)
+    (above,), (below,), _, left = _lower_condition(c, np.array([top]))
     rho = c["tau_lower"] * above / below
     alpha = c["tau_lower"] * c["o_lower"] / (c["o_lower"] + 4 * c["mu_upper"] ** 2 * c["f_upper"] * top)
     condition = Assumption("n - c mbar / s > 0", f"{above:.4g}", bool(above > 0))
