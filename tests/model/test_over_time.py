@@ -16,6 +16,14 @@ def test_a_marked_array_is_read_at_its_step():
     assert steps_covered({"a": hg.OverTime(values)}) == 3
 
 
+@pytest.mark.parametrize("k", [1, np.int64(1)])
+def test_a_number_over_time_is_an_array_at_its_step(k):
+    """So that what is read can be stacked again: a NumPy number is no array."""
+    read = at(hg.OverTime(np.arange(3.0)), k)
+    assert isinstance(read, np.ndarray) and read.shape == () and read == 1.0
+    assert np.array_equal(hg.over_time(unstack(hg.over_time([read, read + 1]))).values, [1.0, 2.0])
+
+
 def test_objects_over_time_come_back_as_given():
     channels = [hg.hop(hg.Rayleigh(s), 0.1) for s in (0.5, 1.0, 2.0)]
     moved = hg.over_time(channels)

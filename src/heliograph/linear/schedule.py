@@ -15,8 +15,8 @@ class Gains(NamedTuple):
     """s+ = F s + K z + c and xhat = L s + J z + d, s the state before the step; one row per step (one step: no axis).
 
     transition F, gain K, offset c, output L, direct J, output_offset d. `expected` G and `expected_offset` g say what z
-    the filter expects, G s + g: it stands in for what did not arrive. `covariance` is that of x - xhat; `predicted` that of
-    x - L s - J (G s + g) - d, before z; `innovation` that of z - G s - g. NaN in the last two where nobody knows.
+    the filter expects, G s + g: it stands in for what did not arrive. `covariance` is that of x - xhat; `predicted` of
+    x - L s - J (G s + g) - d, before z; `innovation` of z - G s - g. NaN in the last two where nobody knows.
     """
 
     transition: Float[np.ndarray, "*time N N"]

@@ -83,15 +83,22 @@ def over_time(items: Sequence[Any]) -> OverTime:
 
 
 def at(tree: Any, k: int | np.integer | np.ndarray | Int[Array, ""]) -> Any:
-    """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values."""
+    """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values.
+
+    NumPy arrays stay NumPy arrays unless k is traced.
+    """
 
     def read(leaf: Any) -> Any:
         if not isinstance(leaf, OverTime):
             return leaf
         values, rest = eqx.partition(leaf.values, eqx.is_array)
-        return eqx.combine(jax.tree.map(lambda v: jnp.asarray(v)[k], values), rest)
+        return eqx.combine(jax.tree.map(lambda v: _entry(v, k), values), rest)
 
     return jax.tree.map(read, tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+
+
+def _entry(values: Any, k: Any) -> Any:
+    return jnp.asarray(values)[k] if isinstance(k, jax.Array) else values[k, ...]  # the dots keep a number an array
 
 
 def steps_covered(tree: Any) -> int | None:
@@ -103,14 +110,9 @@ def steps_covered(tree: Any) -> int | None:
 
 def unstack(stacked: OverTime) -> list[Any]:
     """The objects of each step, as they were given to `over_time`."""
-    return [_item(stacked, i) for i in range(stacked.steps)]
-
-
-def _item(stacked: OverTime, i: int) -> Any:
-    arrays, rest = eqx.partition(stacked.values, eqx.is_array)
-    return eqx.combine(jax.tree.map(lambda v: v[i], arrays), rest)
+    return [at(stacked, i) for i in range(stacked.steps)]
 
 
 def first(item: Any) -> Any:
     """A plant, sensor or channel at its first step."""
-    return _item(item, 0) if isinstance(item, OverTime) else item
+    return at(item, 0) if isinstance(item, OverTime) else item

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, first, steps_covered, unstack
+from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import fail
@@ -76,7 +76,7 @@ class RelayNetwork(eqx.Module):
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n,) and covariance (n, n) of x_0."""
-        plant = _first_step(self.plant)
+        plant = first(self.plant)
         return np.asarray(plant.initial_mean), np.asarray(plant.initial_covariance)
 
     def check_horizon(self, horizon: int) -> None:
@@ -173,12 +173,6 @@ def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np
     return mean[:, :-1], mean[:, -1], raw - (product + product.swapaxes(2, 3)) / 2
 
 
-def link_at(link: Channel, k: int) -> AbstractRandomAffine:
-    """The link at step k."""
-    result: AbstractRandomAffine = unstack(link)[k] if isinstance(link, OverTime) else link
-    return result
-
-
 def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray, ...]:
     """Gain, offset, spread, live rows and talking senders of one slot, as `Steps` has them."""
     m, senders = len(first(network.sensor).outputs), (SENSOR, *network.relays)
@@ -188,7 +182,7 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     spread, talks = np.zeros((rows, rows, columns + 1, columns + 1)), np.zeros(len(senders))
     for listener, links in slot.items():
         for sender, link in links.items():
-            own_gain, own_offset, own_spread = link_moments(link_at(link, k))
+            own_gain, own_offset, own_spread = link_moments(at(link, k))
             heard = starts[listener] + np.arange(len(own_offset))
             sent = m * senders.index(sender) + np.arange(m)
             gain[np.ix_(heard, sent)] = own_gain
@@ -205,10 +199,6 @@ def _tile(item: Any, horizon: int, read: Callable[[Any], Any], dimensions: int) 
     if value.ndim == dimensions + 1:
         return value[:horizon]
     return np.broadcast_to(value, (horizon, *value.shape))
-
-
-def _first_step(item: Any) -> Any:
-    return unstack(item)[0] if isinstance(item, OverTime) else item
 
 
 def _check_linear(plant: Any, sensor: Any) -> None:

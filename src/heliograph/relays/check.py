@@ -4,12 +4,12 @@ It shares no step with `second_moments`: it follows E q q' of q = (1, x, s_1, ..
 each link's second moments, and it asks nothing of the gains. Designs are certified with it.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.over_time import OverTime, unstack
-from heliograph.model.relays import SENSOR, RelayNetwork, link_at
+from heliograph.model.over_time import at
+from heliograph.model.relays import SENSOR, RelayNetwork
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -71,7 +71,7 @@ def _step(
 ) -> tuple[np.ndarray, list[float]]:
     """E q+ q+' from E q q', and each filter's largest correlation of error and innovation."""
     n, size = len(network.states), len(raw)
-    plant, sensor = (_at(item, k) for item in (network.plant, network.sensor))
+    plant, sensor = (at(item, k) for item in (network.plant, network.sensor))
     c, m = sensor.matrix, len(sensor.matrix)
     move = np.eye(size)  # (1, x, s) -> (1, x+, s)
     move[1 : 1 + n, 0], move[1 : 1 + n, 1 : 1 + n] = plant.noise.mean, plant.matrix
@@ -126,7 +126,7 @@ def _hear(network: RelayNetwork, name: str, k: int, sent: int) -> _Heard:
     size = network.received[network.filters.index(name)]
     total, raw = np.zeros((size, sent)), np.zeros((size, size, sent, sent))
     for sender, link in slot.get(name, {}).items():
-        item: AbstractRandomAffine = link_at(link, k)
+        item: AbstractRandomAffine = at(link, k)
         moments = item.moments(2)
         columns = np.append((SENSOR, *network.relays).index(sender) * item.inputs + np.arange(item.inputs), sent - 1)
         mean = np.zeros((size, sent))
@@ -146,7 +146,3 @@ def _correlation(error: np.ndarray, innovation: np.ndarray, joint: np.ndarray, h
     cross = error @ joint @ innovation.T
     e, i = np.diag(error @ joint @ error.T), np.diag(innovation @ joint @ innovation.T)
     return float(np.max(np.abs(cross) / np.sqrt(np.outer(e, i))))
-
-
-def _at(item: Any, k: int) -> Any:
-    return unstack(item)[k] if isinstance(item, OverTime) else item

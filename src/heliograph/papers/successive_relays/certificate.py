@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_at, link_moments
+from heliograph.model.over_time import at
+from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork, Steps, link_moments
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.relays.check import Recomputed, recompute
 from heliograph.relays.design import GainsByFilter
@@ -141,7 +142,7 @@ def _link_constants(
             if not published or (SENSOR in senders) != (listener != RECEIVER):
                 return nothing
             for link in links.values():
-                gain, offset, spread = link_moments(link_at(link, k))
+                gain, offset, spread = link_moments(at(link, k))
                 m = len(offset)
                 mean, variance = gain[0, 0], spread[0, 0, 0, 0]
                 shape = np.einsum("ia,jb->ijab", np.eye(m), np.eye(m))
