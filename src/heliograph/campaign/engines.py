@@ -145,7 +145,7 @@ def on_cluster(campaign: str, store: Path, address: str) -> Iterator[Engine]:
 def _submit(client: Any, campaign: str, store: str, waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
     from distributed import as_completed
 
-    jobs: dict[Any, Job] = {}
+    jobs: dict[object, Job] = {}
     collect: Any = as_completed
     flying = collect(loop=client.loop)
     while waiting or jobs:

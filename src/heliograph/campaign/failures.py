@@ -5,9 +5,9 @@ import os
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypedDict
 
-from heliograph.campaign.plan import Campaign
+from heliograph.campaign.plan import Campaign, Setting
 from heliograph.campaign.work import Job, Reply
 
 FAILURES = "failures.json"
@@ -21,7 +21,7 @@ class Failure:
     """
 
     setting: int
-    parameters: dict[str, Any]
+    parameters: Setting
     chunk: int | None
     runs: tuple[int, int]
     key: tuple[int, int, int]
@@ -32,6 +32,26 @@ class Failure:
         """One line that says what failed and why."""
         values = ", ".join(f"{name}={value!r}" for name, value in self.parameters.items())
         return f"setting {self.setting} ({values}), runs {self.runs[0]} to {self.runs[1]}: {self.error}"
+
+
+class Entry(TypedDict):
+    """A failure as failures.json holds it, with the command that runs it again alone."""
+
+    setting: int
+    parameters: Setting
+    chunk: int | None
+    runs: tuple[int, int]
+    key: tuple[int, int, int]
+    error: str
+    traceback: str
+    command: str
+
+
+def read_failures(out: Path) -> list[Entry]:
+    """What failures.json beside the store holds; nothing where there is none."""
+    path = out / FAILURES
+    entries: list[Entry] = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
+    return entries
 
 
 def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
@@ -53,9 +73,8 @@ def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried
     """Write failures.json beside the store: these, and the earlier ones of what was not tried now; none, no file."""
     path = out / FAILURES
     jobs = {*tried, *(Job(job.setting) for job in tried)}
-    earlier = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else []
-    left = [entry for entry in earlier if Job(entry["setting"], entry["chunk"]) not in jobs]
-    entries = left + [asdict(item) | {"command": command(campaign, out, item)} for item in failures]
+    left = [entry for entry in read_failures(out) if Job(entry["setting"], entry["chunk"]) not in jobs]
+    entries = [*left, *(asdict(item) | {"command": command(campaign, out, item)} for item in failures)]
     if not entries:
         path.unlink(missing_ok=True)
         return

@@ -2,14 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.campaign.plan import Campaign, canonical
+from heliograph.campaign.plan import Campaign, Setting, canonical
 from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import Score
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, STYLE, VERMILION, WIDTH
@@ -53,7 +52,7 @@ def _is_axis(campaign: Campaign, name: str) -> bool:
     return len(set(rests)) < len(rests)
 
 
-def _rest(setting: Mapping[str, Any], name: str) -> dict[str, Any]:
+def _rest(setting: Setting, name: str) -> Setting:
     return {key: value for key, value in setting.items() if key != name}
 
 
@@ -63,6 +62,7 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
 
     One panel for each node and each choice of the other parameters.
     """
+    values = parameter_values(campaign, parameter)
     panels: dict[str, list[Score]] = {}
     for score in scores:
         rest = _rest(campaign.settings[score.setting], parameter)
@@ -74,13 +74,13 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
     for axes, (title, part) in zip(grid, shown.items(), strict=False):
         for name in dict.fromkeys(score.filter for score in part):
             own = [score for score in part if score.filter == name]
-            own.sort(key=lambda score: campaign.settings[score.setting][parameter])
-            x = [campaign.settings[score.setting][parameter] for score in own]
+            own.sort(key=lambda score: float(values[score.setting]))
+            x = [values[score.setting] for score in own]
             y, error = _columns(own, quantity)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=name)
         axes.set_title(title)
     drawn = [score for part in shown.values() for score in part]
-    _scale(grid[0], [campaign.settings[score.setting][parameter] for score in drawn], "x")
+    _scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(parameter, fontsize=10, color=INK)
     _finish(figure, grid, drawn, quantity, colours)
     return figure

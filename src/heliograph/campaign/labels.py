@@ -1,8 +1,8 @@
 """The names that the settings of a campaign share: what the axes of its store are called."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
+from typing import TypedDict
 
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
@@ -20,22 +20,37 @@ class Labels:
     received: int
 
 
-def describe(network: Network) -> dict[str, Any]:
+class Table(TypedDict):
+    """Labels as JSON can hold them."""
+
+    states: Sequence[str]
+    nodes: Sequence[str]
+    filters: Sequence[str]
+    received: int
+
+
+class Description(TypedDict):
     """The labels of one network, and its claims by node and filter, as JSON can hold them."""
-    claims = network.claims()
-    labels = Labels(
+
+    labels: Table
+    claims: Claims
+
+
+def describe(network: Network) -> Description:
+    """Labels and claims of one network."""
+    claims: Claims = {node: dict(filters) for node, filters in network.claims().items()}
+    labels = Table(
         states=network.states,
         nodes=tuple(claims),
         filters=tuple(dict.fromkeys(name for filters in claims.values() for name in filters)),
         received=max(node.received for node in network.nodes.values()),
     )
-    return {"labels": asdict(labels), "claims": claims}
+    return {"labels": labels, "claims": claims}
 
 
-def labels_from(table: dict[str, Any]) -> Labels:
+def labels_from(table: Table) -> Labels:
     """The labels that `describe` gave, after their way through JSON."""
-    states, nodes, filters = (tuple(table[axis]) for axis in ("states", "nodes", "filters"))
-    return Labels(states, nodes, filters, int(table["received"]))
+    return Labels(tuple(table["states"]), tuple(table["nodes"]), tuple(table["filters"]), table["received"])
 
 
 def join(parts: Mapping[int, Labels]) -> Labels:

@@ -1,11 +1,9 @@
 """The report of a campaign: one self-contained page."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from heliograph.campaign.failures import FAILURES
+from heliograph.campaign.failures import FAILURES, Entry, read_failures
 from heliograph.campaign.figures import PANELS, campaign_figures
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.show import score_headers, score_row
@@ -21,12 +19,11 @@ REPORTED = 20  # failures on the page
 def write_report(campaign: Campaign, scores: Sequence[Score], out: Path) -> Path:
     """Write the page beside the store; returns where it is."""
     path = out / REPORT
-    entries = json.loads((out / FAILURES).read_text(encoding="utf-8")) if (out / FAILURES).is_file() else []
-    path.write_text(campaign_page(campaign, scores, entries).html(), encoding="utf-8")
+    path.write_text(campaign_page(campaign, scores, read_failures(out)).html(), encoding="utf-8")
     return path
 
 
-def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[dict[str, Any]]) -> Page:
+def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequence[Entry]) -> Page:
     """The page of a campaign with its scores and what failed."""
     name = Path(campaign.path).name
     there = sum({score.setting: score.runs for score in scores}.values())
@@ -46,11 +43,11 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
     )
 
 
-def _failed(failures: Sequence[dict[str, Any]]) -> str:
+def _failed(failures: Sequence[Entry]) -> str:
     return f"{len(failures)} pieces of work failed and are missing here." if failures else "Nothing failed."
 
 
-def _failures(failures: Sequence[dict[str, Any]]) -> Section:
+def _failures(failures: Sequence[Entry]) -> Section:
     points = [
         f"setting {entry['setting']} {entry['parameters']}, runs {entry['runs'][0]} to {entry['runs'][1]}: "
         f"{entry['error']}"

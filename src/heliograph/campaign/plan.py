@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -17,6 +16,9 @@ from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
 BITWISE = ("heliograph", "jax", "jaxlib", "equinox", "numpy", "zarr")  # packages that decide about the store's bytes
+
+
+Setting = dict[str, object]  # keyword arguments of the network's function, as JSON can hold them
 
 
 @dataclass(frozen=True)
@@ -47,7 +49,7 @@ class Campaign:
     chunk: int
     keep: str
     inputs: dict[str, float | list[float]]
-    settings: list[dict[str, Any]]
+    settings: list[Setting]
     versions: dict[str, str]
 
     @property
@@ -91,7 +93,7 @@ class Campaign:
         return json.dumps(asdict(self))
 
 
-def canonical(setting: dict[str, Any]) -> str:
+def canonical(setting: Setting) -> str:
     """A setting as text that does not depend on the order of its keys."""
     return json.dumps(setting, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 

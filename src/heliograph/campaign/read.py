@@ -7,9 +7,8 @@ from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from itertools import product
 from pathlib import Path
-from typing import Any
 
-from heliograph.campaign.plan import DIMENSIONS, Campaign, canonical, versions
+from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
 from heliograph.numerics.check import check_count, fail
 from heliograph.simulation.lanes import BLOCK
 
@@ -79,14 +78,14 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
     )
 
 
-def _parse(text: str, name: str) -> dict[str, Any]:
+def _parse(text: str, name: str) -> dict[str, object]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise fail(f"campaign {name}", "TOML", str(error)) from None
 
 
-def _network(table: Mapping[str, Any], name: str) -> str:
+def _network(table: Mapping[str, object], name: str) -> str:
     value = table.get("network")
     file, _, function = value.rpartition(":") if isinstance(value, str) else ("", "", "")
     if not file.endswith(".py") or not function.isidentifier():
@@ -94,33 +93,34 @@ def _network(table: Mapping[str, Any], name: str) -> str:
     return str(value)
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return "none" if value is None else repr(value)
 
 
-def _count(table: Mapping[str, Any], key: str, name: str) -> int:
+def _count(table: Mapping[str, object], key: str, name: str) -> int:
     return check_count(f"{name}, {key}", table.get(key, "none"))
 
 
-def _seed(value: Any, name: str) -> int:
+def _seed(value: object, name: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
         raise fail(f"{name}, seed", "a whole number from 0 to 4294967295", _shown(value))
     return value
 
 
-def _chunk(value: Any, name: str) -> int:
-    if check_count(f"{name}, chunk", value) % BLOCK:
-        raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", value)
-    return int(value)
+def _chunk(value: object, name: str) -> int:
+    count = check_count(f"{name}, chunk", value)
+    if count % BLOCK:
+        raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", count)
+    return count
 
 
-def _one_of(value: Any, choices: Sequence[str], name: str) -> str:
+def _one_of(value: object, choices: Sequence[str], name: str) -> str:
     if value not in choices:
         raise fail(name, " or ".join(map(repr, choices)), repr(value))
     return str(value)
 
 
-def _inputs(table: Any, horizon: int, name: str) -> dict[str, float | list[float]]:
+def _inputs(table: object, horizon: int, name: str) -> dict[str, float | list[float]]:
     if not isinstance(table, dict):
         raise fail(f"{name}, inputs", "a table of numbers by the input's name", repr(table))
     for key, value in table.items():
@@ -130,15 +130,15 @@ def _inputs(table: Any, horizon: int, name: str) -> dict[str, float | list[float
     return dict(table)
 
 
-def _is_number(value: Any) -> bool:
+def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-def _short(value: Any) -> str:
+def _short(value: object) -> str:
     return f"{len(value)} values" if isinstance(value, list) else repr(value)
 
 
-def _settings(table: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
+def _settings(table: Mapping[str, object], name: str) -> list[Setting]:
     if ("grid" in table) == ("settings" in table):
         raise fail(f"campaign {name}", "either [grid] or [[settings]]", "both" if "grid" in table else "neither")
     settings = _grid(table["grid"], name) if "grid" in table else _listed(table["settings"], name)
@@ -158,7 +158,7 @@ def _settings(table: Mapping[str, Any], name: str) -> list[dict[str, Any]]:
     return settings
 
 
-def _grid(grid: Any, name: str) -> list[dict[str, Any]]:
+def _grid(grid: object, name: str) -> list[Setting]:
     if not isinstance(grid, dict) or not grid:
         raise fail(f"{name}, grid", "a table of lists of values by parameter", _shown(grid))
     for key, values in grid.items():
@@ -167,13 +167,13 @@ def _grid(grid: Any, name: str) -> list[dict[str, Any]]:
     return [dict(zip(grid, values, strict=True)) for values in product(*grid.values())]
 
 
-def _listed(settings: Any, name: str) -> list[dict[str, Any]]:
+def _listed(settings: object, name: str) -> list[Setting]:
     if not isinstance(settings, list) or not settings or not all(isinstance(s, dict) for s in settings):
         raise fail(f"{name}, settings", "tables [[settings]]", repr(settings))
     return settings
 
 
-def _check_value(value: Any, name: str) -> None:
+def _check_value(value: object, name: str) -> None:
     """Only what JSON can hold without loss."""
     if isinstance(value, dict | list):
         for item in value.values() if isinstance(value, dict) else value:

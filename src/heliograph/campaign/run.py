@@ -4,11 +4,10 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from heliograph.campaign.engines import Engine, start_engine
 from heliograph.campaign.failures import Failure, failure, write_failures
-from heliograph.campaign.labels import check_within, join, labels_from
+from heliograph.campaign.labels import Description, check_within, join, labels_from
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import (
     STORE,
@@ -28,6 +27,7 @@ from heliograph.numerics.check import fail
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]
+Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, and how many are done
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def run_campaign(
     remove_unmade(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     wanted = _wanted(campaign, only)
-    done: set[tuple[int, int]] = set()
+    done: set[tuple[int, ...]] = set()
     if store.is_dir():
         check_same(store, campaign)
         done = done_chunks(store, campaign)
@@ -124,9 +124,11 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
     """Make the store if it is not there, and write the claims it lacks; returns the settings that cannot be built."""
     new = not store.is_dir()
     lacking = range(len(campaign.settings)) if new else sorted(settings - described(store))
-    jobs, found = [Job(setting) for setting in lacking], {}
+    jobs = [Job(setting) for setting in lacking]
+    found: dict[int, Description] = {}
 
-    def accept(job: Job, value: Any, done: int) -> None:
+    def accept(job: Job, value: Description | None, done: int) -> None:
+        assert value is not None  # these jobs only describe
         found[job.setting] = value
         tell("building", done, len(jobs))
 
@@ -143,7 +145,9 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
     return failed
 
 
-def _try(engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Any, int], None]) -> dict[Job, Reply]:
+def _try(
+    engine: Engine, jobs: Iterable[Job], accept: Callable[[Job, Description | None, int], None]
+) -> dict[Job, Reply]:
     """Have jobs done, accept(job, value, how many are done) the good replies; return the last of those that failed."""
     done, left = 0, {job: Reply() for job in jobs}
     for _ in range(TRIES):

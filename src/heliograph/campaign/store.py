@@ -90,7 +90,7 @@ def parameter_values(campaign: Campaign, name: str) -> np.ndarray:
     return np.array([_text(value) for value in values])
 
 
-def _text(value: Any) -> str:
+def _text(value: object) -> str:
     if value is None or isinstance(value, str):
         return value or ""
     return json.dumps(value, sort_keys=True, ensure_ascii=False)
@@ -108,9 +108,9 @@ def _create(
     axes: tuple[str, ...],
     shape: tuple[int, ...],
     chunks: tuple[int, ...],
-    fill: Any,
+    fill: str | float | np.generic,
     attributes: Mapping[str, str],
-    kind: Any = np.float64,
+    kind: np.dtype | type = np.float64,
 ) -> None:
     text = isinstance(fill, str)
     group.create_array(
@@ -126,7 +126,7 @@ def _create(
     )
 
 
-def _open(group: zarr.Group, name: str) -> Any:
+def _open(group: zarr.Group, name: str) -> zarr.Array[Any]:
     """An array that writes a chunk's file even if nothing but fill values are in it: the file says that it is done."""
     array = group[name]
     assert isinstance(array, zarr.Array)
@@ -147,7 +147,7 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
     _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
 
 
-def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, int]]:
+def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """(setting, chunk) of the chunks whose files are all there."""
     return set.intersection(*(_written(path / name, 2) for name in variables(campaign)))
 
@@ -157,7 +157,7 @@ def described(path: Path) -> set[int]:
     return {setting for (setting,) in _written(path / CLAIM, 1)}
 
 
-def _written(folder: Path, indices: int) -> set[Any]:
+def _written(folder: Path, indices: int) -> set[tuple[int, ...]]:
     files = (name.split(".") for name in os.listdir(folder) if name.startswith("c."))
     return {tuple(int(part) for part in parts[1 : 1 + indices]) for parts in files if all(map(str.isdigit, parts[1:]))}
 

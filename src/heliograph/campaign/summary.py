@@ -4,7 +4,7 @@ import csv
 import os
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import TYPE_CHECKING, get_type_hints
 
 import numpy as np
 import zarr
@@ -13,10 +13,13 @@ from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
 from heliograph.numerics.check import fail
 
+if TYPE_CHECKING:
+    import xarray
+
 SUMMARY = "summary.csv"
 
 
-def open_results(out: str | Path) -> Any:
+def open_results(out: str | Path) -> "xarray.Dataset":
     """The results of a campaign's folder as an xarray.Dataset, read when used.
 
     error and variance (setting, run, time, node, filter, state), nees_per_dimension (setting, run, time, node, filter),
@@ -33,7 +36,7 @@ def open_results(out: str | Path) -> Any:
     path = Path(out) / STORE
     if not path.is_dir():
         raise fail(f"results folder {out}", f"a folder with {STORE}", "none")
-    results = xarray.open_zarr(path)
+    results: xarray.Dataset = xarray.open_zarr(path)
     return results.assign_coords({name: values.compute() for name, values in results.coords.items()})
 
 

@@ -4,17 +4,17 @@ import traceback
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
 
 from heliograph.campaign.keep import Errors
-from heliograph.campaign.labels import Labels, check_within, describe, labels_from
+from heliograph.campaign.labels import Description, Labels, check_within, describe, labels_from
 from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
 from heliograph.campaign.store import stored_labels, write_chunk
 from heliograph.model.over_time import alike
 from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.simulate import monte_carlo
 
@@ -31,9 +31,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a job: a value as JSON can hold it, or an error in one line with its traceback."""
+    """What came of a job: a description if it was asked for, or an error in one line with its traceback."""
 
-    value: Any = None
+    value: Description | None = None
     error: str = ""
     traceback: str = ""
 
@@ -119,7 +119,7 @@ def _bound_memory(network: Network) -> None:
     _seen.append(network)
 
 
-def _arrays(kept: Any, labels: Labels) -> dict[str, np.ndarray]:
+def _arrays(kept: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     """What the reducer kept on the store's axes, (run, time, ...); NaN where a node lacks a filter."""
     estimates = kept["estimates"]
     example = next(iter(next(iter(e for e in estimates.values() if e)).values()))

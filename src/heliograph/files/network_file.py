@@ -11,7 +11,7 @@ from functools import wraps
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
@@ -62,7 +62,7 @@ def load_function(path: Path, source: str, name: str) -> Callable[..., Network]:
         raise fail(f"network {place}", "a function that returns a heliograph.Network", came)
 
     @wraps(function)
-    def build(*args: Any, **kwargs: Any) -> Network:
+    def build(*args: object, **kwargs: object) -> Network:
         with _importing_from(path.parent):
             network = _guarded(lambda: function(*args, **kwargs), place, path)
         if not isinstance(network, Network):

@@ -1,7 +1,9 @@
 """The semidefinite programmes of H-infinity design, written for cvxpy; the only file that imports it."""
 
 import warnings
-from typing import Any, Literal, get_args
+from collections.abc import Callable
+from types import ModuleType
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -18,6 +20,9 @@ from heliograph.h_infinity.step import (
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 
+if TYPE_CHECKING:
+    from cvxpy import Constraint, Expression, Maximize, Minimize, Problem
+
 MARGIN = 1e-6  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
 Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
 Solver = Literal["clarabel", "scs"]
@@ -25,7 +30,7 @@ SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
 
 
-def solvers() -> Any:
+def solvers() -> ModuleType:
     """cvxpy, or an error that says how to get it.
 
     Raises:
@@ -45,17 +50,18 @@ def check_choice(name: str, value: str, choices: object) -> None:
         raise fail(name, f"one of {', '.join(get_args(choices))}", repr(value))
 
 
-def run_solver(problem: Any, solver: Solver) -> str:
+def run_solver(problem: "Problem", solver: Solver) -> str:
     """Solve, and return the solver's status; a solver that gives up or is not sure of its answer is a status too."""
     cp = solvers()
+    solve: Callable[..., object] = problem.solve  # it has no types
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Solution may be inaccurate")
         try:
             if solver == "scs":
                 accuracy = {"eps_abs": SCS_ACCURACY, "eps_rel": SCS_ACCURACY, "max_iters": SCS_ITERATIONS}
-                problem.solve(solver=cp.SCS, **accuracy)
+                solve(solver=cp.SCS, **accuracy)
             else:
-                problem.solve(solver=cp.CLARABEL)
+                solve(solver=cp.CLARABEL)
         except cp.SolverError:
             return "solver_error"
     return str(problem.status)
@@ -95,7 +101,9 @@ class StepProblem:
         return status, self.layout.unpack(np.asarray(self.unknowns.value))
 
 
-def _goal(cp: Any, objective: Objective, weights: list[Any]) -> tuple[Any, list[Any]]:
+def _goal(
+    cp: ModuleType, objective: Objective, weights: list["Expression"]
+) -> tuple["Minimize | Maximize", list["Constraint"]]:
     """The objective on L = P+^-1 and the constraints that express it."""
     if objective == "none":
         return cp.Minimize(0), []
@@ -129,7 +137,7 @@ class HorizonProblem:
         sizes = [1, start.size, *(layout.size for layout in layouts)]
         self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
-        self.constraints: list[Any] = []
+        self.constraints: list[Constraint] = []
         present, eye = weight_form(start), np.eye(weight.shape[0])
         self._require({0: (1 - MARGIN) * weight.ravel()[:, None], 1: -present}, 0 * eye)
         if initial is not None:

@@ -2,21 +2,23 @@
 
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.types import PyTree
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
-def to_numpy(tree: Any) -> Any:
+def to_numpy(tree: PyTree) -> PyTree:
     """Turn every concrete numeric JAX array of a pytree into a NumPy array; leave keys and traced values alone."""
 
-    def convert(leaf: Any) -> Any:
+    def convert(leaf: object) -> object:
         if isinstance(leaf, jax.core.Tracer) or not isinstance(leaf, jax.Array):
             return leaf
         return leaf if jnp.issubdtype(leaf.dtype, jax.dtypes.extended) else np.asarray(leaf)
@@ -61,9 +63,9 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     return call
 
 
-def _traced(tree: Any) -> bool:
+def _traced(tree: PyTree) -> bool:
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(tree))
 
 
-def _as_array(leaf: Any) -> Any:
+def _as_array(leaf: object) -> object:
     return np.asarray(leaf) if isinstance(leaf, int | float) else leaf

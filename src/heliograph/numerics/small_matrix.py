@@ -7,13 +7,15 @@ feed a kernel like that. Larger matrices go to the library.
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any, ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 from jax.scipy.linalg import cho_solve
+
+from heliograph.numerics.types import Array, PyTree
 
 UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
 PIVOT_TOLERANCE = 1e-14  # relative to the largest diagonal entry: a pivot this small is zero up to rounding
@@ -28,7 +30,7 @@ def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
     batched = custom_vmap(lambda *args: jax.lax.platform_dependent(*args, cpu=_alone(traced), default=traced))
 
     @batched.def_vmap
-    def rule(size: int, is_batched: Any, *args: Any) -> Any:
+    def rule(size: int, is_batched: PyTree, *args: PyTree) -> tuple[PyTree, PyTree]:
         moved = jax.tree.map(_to_last, args, tuple(is_batched))
         results = jax.tree.map(lambda x: _to_first(x, size), batched(*moved))
         return results, jax.tree.map(lambda _: True, results)
@@ -38,14 +40,14 @@ def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
     return wraps(kernel)(differentiable)
 
 
-def _alone(kernel: Callable[..., Any]) -> Callable[..., Any]:
+def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The kernel as the branch of a conditional that is always taken, since the compiler fuses nothing across it.
 
     Without it (barriers are dropped for processors) a covariance is computed again inside each of its uses. The
     condition hangs on the data, or the compiler would see through it: a number's bits with the last one set are not 0.
     """
 
-    def call(*args: Any) -> Any:
+    def call(*args: PyTree) -> PyTree:
         number = next(leaf for leaf in jax.tree.leaves(args) if jnp.issubdtype(jnp.result_type(leaf), jnp.floating))
         taken = jnp.any((jnp.ravel(number)[:1].view(jnp.uint32) | 1) != 0)
         shapes = jax.eval_shape(kernel, *args)
@@ -56,7 +58,7 @@ def _alone(kernel: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _to_last(x: Any, is_batched: bool) -> jax.Array:
+def _to_last(x: Array, is_batched: bool) -> jax.Array:
     return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
 
 
@@ -64,7 +66,7 @@ def _to_first(x: jax.Array, size: int) -> jax.Array:
     return jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], size)), -1, 0)
 
 
-def transpose(a: jax.Array | np.ndarray) -> jax.Array:
+def transpose(a: Array) -> jax.Array:
     """A', (n, m, ...)."""
     return jnp.swapaxes(a, 0, 1)
 
@@ -74,13 +76,12 @@ def symmetric(a: jax.Array) -> jax.Array:
     return (a + transpose(a)) / 2
 
 
-def add(terms: Sequence[Any]) -> jax.Array:
+def add(terms: Sequence[Array]) -> jax.Array:
     """Sum of terms one by one: a library reduction over a short axis costs more than all its additions."""
-    total: jax.Array = sum(terms[1:], terms[0])
-    return total
+    return jnp.asarray(sum(terms[1:], terms[0]))
 
 
-def times(a: jax.Array | np.ndarray, b: jax.Array) -> jax.Array:
+def times(a: Array, b: jax.Array) -> jax.Array:
     """A B, as a sum of columns of A times rows of B."""
     inner = b.shape[0]
     if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
@@ -88,12 +89,12 @@ def times(a: jax.Array | np.ndarray, b: jax.Array) -> jax.Array:
     return add([a[:, j, None] * b[None, j] for j in range(inner)])
 
 
-def times_vector(a: jax.Array | np.ndarray, x: jax.Array) -> jax.Array:
+def times_vector(a: Array, x: jax.Array) -> jax.Array:
     """A x."""
     return times(a, x[:, None])[:, 0]
 
 
-def congruence(a: jax.Array | np.ndarray, p: jax.Array) -> jax.Array:
+def congruence(a: Array, p: jax.Array) -> jax.Array:
     """A P A'."""
     return times(times(a, p), transpose(a))
 
@@ -161,7 +162,7 @@ def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax
     return function(a, b)
 
 
-def contract(tensor: jax.Array | np.ndarray, matrix: jax.Array) -> jax.Array:
+def contract(tensor: Array, matrix: jax.Array) -> jax.Array:
     """sum_ab T_ijab W_ab."""
     n = matrix.shape[0]
     if n > UNROLL_LIMIT // 2:
