@@ -210,10 +210,6 @@ from .relays.certificate import (
     RelayCertificate as RelayCertificate,
     certify_relays as certify_relays,
 )
-from .simulation.simulate_relays import (
-    initial_states as initial_states,
-    simulate_relays as simulate_relays,
-)
 from .simulation.network import (
     Network as Network,
     Node as Node,

@@ -23,3 +23,7 @@ class AbstractFilter(eqx.Module):
     def step(self, state: Any, z: Any, u: Any = (), k: Any = 0) -> tuple[Any, Estimate]:
         """Predict over step k with the input u, then use the measurement z of shape (m,)."""
         raise NotImplementedError
+
+    def planned(self, inputs: Any) -> "AbstractFilter":
+        """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
+        return self

@@ -30,7 +30,7 @@ class ScheduledFilter(AbstractFilter):
 
     The claimed covariance is the schedule's, and it is computed for complete data. A component that did not arrive
     counts as what the filter expected, and from then on the bound is NaN: no covariance is known any more, and the
-    record says so. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains.
+    record says so; what the gains of a step do not use cannot be missed. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains.
     """
 
     gains: OverTime
@@ -52,7 +52,8 @@ class ScheduledFilter(AbstractFilter):
         z = jnp.asarray(z, dtype=float)
         s, present = state.value, ~jnp.isnan(z)
         heard = jnp.where(present, z, g.expected @ s + g.expected_offset)
-        complete = state.complete & jnp.all(present)
+        unused = jnp.all(g.gain == 0, axis=0) & jnp.all(g.direct == 0, axis=0)  # a planned silence is no gap
+        complete = state.complete & jnp.all(present | unused)
         estimate = g.output @ s + g.direct @ heard + g.output_offset
         following = g.transition @ s + g.gain @ heard + g.offset
         bound = jnp.where(complete, g.covariance, jnp.nan)
