@@ -196,10 +196,6 @@ from .relays.periodic_tuning import (
     periodic_receiver_error_design as periodic_receiver_error_design,
     periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
 )
-from .simulation.simulate_relays import (
-    initial_states as initial_states,
-    simulate_relays as simulate_relays,
-)
 from .simulation.network import (
     Network as Network,
     Node as Node,

@@ -7,12 +7,12 @@ from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 def statistics(errors, bound, claim="exact"):
     """ErrorStatistics of errors (run, time, n) with one claimed covariance."""
     deal = (np.arange(len(errors))[:, None] % BATCHES == np.arange(BATCHES)).astype(float)
-    bounds = np.broadcast_to(bound, (*errors.shape, errors.shape[-1]))
+    i, j = np.triu_indices(errors.shape[-1])
     nees = np.einsum("rti,ij,rtj->rt", errors, np.linalg.inv(bound), errors)
     return ErrorStatistics(
         deal.sum(axis=0),
-        np.einsum("rb,rti,rtj->btij", deal, errors, errors),
-        np.einsum("rb,rtij->btij", deal, bounds),
+        np.einsum("rb,rti->bti", deal, errors[..., i] * errors[..., j]),
+        np.broadcast_to(bound[i, j], (BATCHES, errors.shape[1], len(i))),
         deal.T @ nees,
         claim,
     )

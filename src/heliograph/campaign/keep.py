@@ -5,13 +5,13 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.linalg import psd_solve
+from heliograph.numerics.small_matrix import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import AbstractReducer
+from heliograph.simulation.record import AbstractReducer, by_name, measurements_of
 
 
-class Errors(AbstractReducer):
+class Errors(AbstractReducer[dict[str, PyTree]]):
     """Keep each run's errors, claimed variances and NEES per dimension; with `world` its truth and measurements too.
 
     Gives a dictionary: "estimates" by node and filter, each with error and variance (run, time, n) and
@@ -27,29 +27,37 @@ class Errors(AbstractReducer):
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
         """Collect the block's errors."""
         kept = {
-            "estimates": jax.tree.map(
+            part: jax.tree.map(
                 lambda estimate: _errors(batch["truth"], estimate),
-                batch["estimates"],
+                batch[part],
                 is_leaf=lambda leaf: isinstance(leaf, Estimate),
             )
+            for part in ("estimates", "fused")
         }
         if self.world:
             kept |= {name: batch[name] for name in ("truth", "measurements")}
         return carry, kept
 
-    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> PyTree:
-        """What was collected."""
-        return collected
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
+        """What was collected, by name."""
+        axes = {"error": -3, "variance": -3, "nees_per_dimension": -2}
+        found = {
+            part: by_name(network, collected, lambda kept, part=part: kept[part], axis) for part, axis in axes.items()
+        }
+        estimates = {
+            node: {name: {part: found[part][node][name] for part in axes} for name in names}
+            for node, names in network.claims().items()
+        }
+        if not self.world:
+            return {"estimates": estimates}
+        measurements = measurements_of(network, collected["measurements"])
+        return {"estimates": estimates, "truth": collected["truth"], "measurements": measurements}
 
 
 def _errors(truth: jax.Array, estimate: Estimate) -> dict[str, jax.Array]:
-    error, covariance = truth - estimate.mean, jnp.asarray(estimate.covariance)
-
-    def squared_distance(p: jax.Array, e: jax.Array) -> jax.Array:
-        return e @ psd_solve(p, e[:, None])[:, 0]
-
-    return {
-        "error": error,
-        "variance": jnp.diagonal(covariance, axis1=-2, axis2=-1),
-        "nees_per_dimension": jax.vmap(jax.vmap(squared_distance))(covariance, error) / error.shape[-1],
-    }
+    mean, covariance = jnp.asarray(estimate.mean), jnp.asarray(estimate.covariance)
+    error = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), -1) - mean
+    variance = jnp.broadcast_to(jnp.diagonal(covariance, axis1=-2, axis2=-1), error.shape)
+    matrix, e = jnp.moveaxis(covariance, (-2, -1), (0, 1)), jnp.moveaxis(error, -1, 0)
+    nees = squared_distance(matrix.transpose(0, 1, *range(3, matrix.ndim), 2), e.transpose(0, *range(2, e.ndim), 1))
+    return {"error": error, "variance": variance, "nees_per_dimension": jnp.moveaxis(nees, -1, 0) / error.shape[-1]}

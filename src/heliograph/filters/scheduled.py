@@ -42,7 +42,7 @@ class ScheduledFilter(AbstractFilter):
     Predicted is what follows if what the schedule expects arrives, e = G s + g; a correction adds K (z - e) and
     J (z - e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not
     arrive counts as what the filter expected, and from then on the covariance is NaN: none is known any more, and the
-    record says so. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains. Before its first
+    record says so; what no gain of the step uses cannot be missed (a planned silence). Where data have gaps, use `LinearSystemFilter`, which recomputes its gains. Before its first
     prediction a schedule estimates nothing (NaN).
 
     Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
@@ -91,11 +91,12 @@ class ScheduledFilter(AbstractFilter):
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
         heard = jnp.where(present, z - state.expected, 0.0)
+        unused = jnp.all(g.gain == 0, axis=0) & jnp.all(g.direct == 0, axis=0)
         after = ScheduleState(
             state.value + g.gain @ heard,
             state.mean + g.direct @ heard,
             state.expected,
-            state.complete & jnp.all(present),
+            state.complete & jnp.all(present | unused),
             jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
         )
         return after, innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))

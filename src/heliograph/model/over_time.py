@@ -1,6 +1,6 @@
 """The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -48,21 +48,23 @@ def stack(items: Sequence[T]) -> T:
     Raises:
         ValueError: the objects differ in structure, in array shapes, or in anything that is not an array.
     """
-    if not all(alike(item, items[0]) for item in items):
+    if len({structure(item) for item in items}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
-    rest = eqx.filter(items[0], eqx.is_array, inverse=True)
-    arrays = jax.tree.map(_stack_leaves, *(eqx.filter(item, eqx.is_array) for item in items))
-    result: T = eqx.combine(arrays, rest)
+    leaves = zip(*(jax.tree.leaves(item) for item in items), strict=True)
+    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in leaves]
+    result: T = jax.tree.unflatten(jax.tree.structure(items[0]), stacked)
     return result
+
+
+def structure(item: Any) -> Hashable:
+    """What two model objects share that differ in nothing but the values of their arrays."""
+    leaves, tree = jax.tree.flatten(item)
+    return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
 def alike(a: Any, b: Any) -> bool:
     """Whether two model objects differ in nothing but the values of their arrays."""
-
-    def shape(leaf: Any) -> Any:
-        return leaf.shape if eqx.is_array(leaf) else leaf
-
-    return bool(eqx.tree_equal(jax.tree.map(shape, a), jax.tree.map(shape, b)))
+    return structure(a) == structure(b)
 
 
 def _stack_leaves(*leaves: Any) -> Any:

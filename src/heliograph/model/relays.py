@@ -74,6 +74,11 @@ class RelayNetwork(eqx.Module):
         names: tuple[str, ...] = first(self.plant).states
         return names
 
+    def hears_always(self, name: str) -> bool:
+        """Whether some hop leads to this listener in every slot, and none of them erases."""
+        heard = [slot.get(name, {}) for slot in self.slots]
+        return all(heard) and not any(first(hop).erases for hops in heard for hop in hops.values())
+
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n,) and covariance (n, n) of x_0."""
         plant = first(self.plant)

@@ -153,6 +153,19 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.stack(backward)
 
 
+def squared_distance(a: jax.Array, x: jax.Array) -> jax.Array:
+    """x' A^-1 x = |L^-1 x|^2 for a positive definite A = L L'; NaN for any other."""
+    n = a.shape[0]
+    if n > UNROLL_LIMIT:
+        return add(list(x * solve(a, x[:, None])[:, 0]))
+    columns, scales = factor(a)
+    forward: list[jax.Array] = []
+    for i in range(n):  # L y = x
+        scale = jnp.where(scales[i] == 0, jnp.nan, scales[i])
+        forward.append(add([x[i], *(-columns[j][i] * forward[j] for j in range(i))]) * scale)
+    return add([y * y for y in forward])
+
+
 def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
     """A function of two single matrices, for each of the further axes."""
     shape = jnp.broadcast_shapes(a.shape[2:], b.shape[2:])

@@ -7,11 +7,11 @@ chunks nor cores change a bit of a result. Several devices share the lanes by JA
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
 
 from heliograph.numerics.float64 import to_numpy
 
@@ -19,7 +19,7 @@ BLOCK = 32  # runs simulated side by side: wide enough for vector units, small e
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 
-Advance = Callable[[np.ndarray, Any], tuple[Any, Any]]  # blocks of runs and a carry -> carry, what is kept
+Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs and a carry -> carry, what is kept
 
 
 class Lanes:
@@ -28,12 +28,12 @@ class Lanes:
     `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
     """
 
-    def __init__(self, alone: Advance, together: Advance, start: Any, first_run: int):
-        self.alone, self.together, self.first_run = alone, together, first_run
+    def __init__(self, alone: Advance, together: Advance, start: Callable[[], PyTree], first_run: int):
+        self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
         devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
         self.wide = devices > 1 or not processor
         self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
-        self.carries: Any = [start] * self.count
+        self.carries: PyTree = [None] * self.count  # until a lane is used
         self.pool: ThreadPoolExecutor | None = None
 
     def blocks_of(self, runs: int) -> int:
@@ -43,7 +43,7 @@ class Lanes:
             return blocks
         return self.count * -(-blocks // self.count)
 
-    def advance(self, start: int, blocks: int) -> Any:
+    def advance(self, start: int, blocks: int) -> PyTree:
         """Simulate `blocks` blocks from number `start` on; returns what is kept of them, run by run, on the host."""
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
@@ -52,32 +52,34 @@ class Lanes:
         used = np.concatenate(lanes)
         return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *kept)
 
-    def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[Any]:
-        def go(lane: int) -> Any:
+    def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+        def go(lane: int) -> PyTree:
             with jax.enable_x64(True):
-                self.carries[lane], kept = self.alone(runs[lanes[lane]], self.carries[lane])
+                carry = self.start() if self.carries[lane] is None else self.carries[lane]
+                self.carries[lane], kept = self.alone(runs[lanes[lane]], carry)
                 return to_numpy(kept)
 
         if self.pool is None:
             self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
         return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
 
-    def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[Any]:
+    def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
         if isinstance(self.carries, list):
-            stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *self.carries)
-            self.carries = jax.device_put(stacked, shared)
+            every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
+            self.carries = jax.device_put(every, shared)
         dealt = jax.device_put(np.stack([runs[mine] for mine in lanes]), shared)
         self.carries, kept = self.together(dealt, self.carries)
         on_host = to_numpy(kept)
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
-    def total(self) -> Any:
+    def total(self) -> PyTree:
         """The lanes' carries added up, in their order."""
         if self.pool is not None:
             self.pool.shutdown()
         if isinstance(self.carries, list):
-            return jax.tree.map(lambda *leaves: _sum([np.asarray(leaf) for leaf in leaves]), *self.carries)
+            used = [carry for carry in self.carries if carry is not None]
+            return jax.tree.map(lambda *leaves: _sum([np.asarray(leaf) for leaf in leaves]), *used)
         return jax.tree.map(lambda leaf: _sum(list(np.asarray(leaf))), self.carries)
 
 

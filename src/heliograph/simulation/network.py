@@ -1,22 +1,26 @@
-"""A network: one plant, and nodes that each have a sensor, a channel and the filters that listen to it."""
+"""A network: one plant, and nodes that hear something of it, with the filters that listen there."""
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
 from zlib import crc32
 
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.scheduled import ScheduledFilter
 from heliograph.fusion.rules import Fusion
+from heliograph.linear.schedule import Schedule
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim
-from heliograph.model.over_time import first, steps_covered
+from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine
 
 FUSED = "fused"  # the name under which results of several nodes stand
+OWN = "own"  # a relay's one filter
 
 
 class Node(eqx.Module):
@@ -34,14 +38,41 @@ class Node(eqx.Module):
         self.sensor, self.channel, self.filters = sensor, channel, dict(filters)
         _check_type("sensor", first(sensor), AbstractSensor)
         _check_type("channel", first(channel), AbstractRandomAffine)
-        for name, item in self.filters.items():
-            _check_type(f"filter {name!r}", item, AbstractFilter)
-            _check_received(f"filter {name!r}", item, self.received)
+        _check_filters(self.filters, self.received)
 
     @property
     def received(self) -> int:
         """Length of the measurement that reaches the filters."""
         return int(first(self.channel).outputs)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what is sent to the node."""
+        return tuple(first(self.sensor).outputs)
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything arrives, always."""
+        return not first(self.channel).erases
+
+
+class Listener(eqx.Module):
+    """A place in a network of relays, which hears one of them or the sensor, and the filters there.
+
+    `received` numbers named after `outputs` are heard, always all of them if it is `complete`.
+    """
+
+    filters: dict[str, AbstractFilter]
+    received: int = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    complete: bool = eqx.field(static=True)
+
+
+class Kind(NamedTuple):
+    """Filters that differ in numbers alone: `filters` of the nodes of one group."""
+
+    group: int
+    filters: tuple[str, ...]
 
 
 class Network(eqx.Module):
@@ -51,32 +82,51 @@ class Network(eqx.Module):
     central filter that receives all measurements, joined in the order of the nodes. In results these stand under the
     node name "fused".
 
+    `Network.of_relays` makes the network of relays that filter and forward. Nodes that share a structure form a group,
+    their filters that share one a kind: each is one array axis from here to the results, where names come back.
+
     Raises:
         ValueError: no nodes, a node that does not fit the plant, or a fusion of a filter that no node has.
     """
 
     plant: AnyPlant
-    nodes: dict[str, Node]
+    nodes: dict[str, Node | Listener]
     fused: dict[str, Fusion | AbstractFilter]
+    relays: RelayNetwork | None
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
+    groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    kinds: tuple[Kind, ...] = eqx.field(static=True)
 
     def __init__(
-        self, plant: AnyPlant, nodes: Mapping[str, Node], fused: Mapping[str, Fusion | AbstractFilter] | None = None
+        self,
+        plant: AnyPlant,
+        nodes: Mapping[str, Node | Listener],
+        fused: Mapping[str, Fusion | AbstractFilter] | None = None,
+        relays: RelayNetwork | None = None,
     ):
-        self.plant, self.nodes, self.fused = plant, dict(nodes), dict(fused or {})
+        self.plant, self.nodes, self.fused, self.relays = plant, dict(nodes), dict(fused or {}), relays
         self.names = tuple(self.nodes)
         _check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
         for name, node in self.nodes.items():
-            _check_type(f"node {name!r}", node, Node)
-            check_link(first(node.sensor), first(node.channel), len(self.states))
+            _check_type(f"node {name!r}", node, Node if relays is None else Listener)
             for filter_, one in node.filters.items():
                 self._check_sizes(f"filter {filter_!r} of node {name!r}", one)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
             raise fail("node names", f"no node called {FUSED!r}, which stands for fused results", list(self.nodes))
+        self.groups = _grouped((name, (_world(n), n.filters)) for name, n in self.nodes.items())
+        self.kinds = tuple(
+            Kind(g, alike)
+            for g, names in enumerate(self.groups)
+            for alike in _grouped(self.nodes[names[0]].filters.items())
+        )
+        for names in self.groups:
+            node = self.nodes[names[0]]
+            if isinstance(node, Node):
+                check_link(first(node.sensor), first(node.channel), len(self.states))
         for name, item in self.fused.items():
             if isinstance(item, Fusion):
                 item.check(self.nodes_with(item.filter), len(self.states))
@@ -91,6 +141,51 @@ class Network(eqx.Module):
             if len(own) != len(theirs):
                 raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
 
+    @staticmethod
+    def of_relays(
+        relays: RelayNetwork, schedules: Mapping[str, Schedule], receivers: Mapping[str, AbstractFilter]
+    ) -> "Network":
+        """Relays that run their schedules in the world, and the receiver with its filters, which all hear the same.
+
+        At each step the relays send C s_r, with s_r their estimates at the step before, through hops that are drawn
+        anew; every filter then hears the sum of its hops, NaN where nobody transmits to it by plan. The nodes are the
+        relays, each with the one filter "own", and "receiver". A recording may leave out what a relay heard.
+
+        Raises:
+            ValueError: relays without a schedule, schedules of the wrong shape.
+        """
+        if set(schedules) != set(relays.relays):
+            raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
+        filters: dict[str, dict[str, AbstractFilter]] = {}
+        n = len(relays.states)
+        for name, heard in zip(relays.relays, relays.received, strict=False):
+            shape = schedules[name].gains.direct.shape[1:]
+            if shape != (n, heard):
+                raise fail(f"schedule of {name!r}", f"gains of shape {(n, heard)}", f"shape {shape}")
+            filters[name] = {OWN: ScheduledFilter(schedules[name])}
+        filters[RECEIVER] = dict(receivers)
+        _check_filters(filters[RECEIVER], relays.received[-1])
+        outputs = tuple(first(relays.sensor).outputs)
+        nodes = {
+            name: Listener(filters[name], heard, outputs, relays.hears_always(name))
+            for name, heard in zip(relays.filters, relays.received, strict=True)
+        }
+        return Network(relays.plant, nodes, relays=relays)
+
+    def restricted_to(self, names: Iterable[str]) -> "Network":
+        """The network of a recording that lacks what some relays heard: without the filters of these.
+
+        Raises:
+            ValueError: a node that is not a relay is lacking, or there is one too many.
+        """
+        known, optional = set(names), set() if self.relays is None else set(self.relays.relays)
+        unknown = sorted((known ^ set(self.nodes)) - (optional - known))
+        if unknown:
+            raise fail("measurements", f"arrays for the nodes {sorted(self.nodes)}", f"a mismatch in {unknown}")
+        if len(known) == len(self.nodes):
+            return self
+        return Network(self.plant, {n: v for n, v in self.nodes.items() if n in known}, relays=self.relays)
+
     def nodes_with(self, name: str) -> list[str]:
         """Names of the nodes that have the filter `name`, in the given order.
 
@@ -102,6 +197,15 @@ class Network(eqx.Module):
             known = sorted({f for node in self.nodes.values() for f in node.filters})
             raise fail("fusion", f"a filter that some node has {known}", repr(name))
         return found
+
+    def places(self) -> dict[tuple[str, str], tuple[int, int, int]]:
+        """Where the estimate of a node's filter stands, as (kind, filter, node), by node and filter."""
+        return {
+            (node, name): (k, f, i)
+            for k, kind in enumerate(self.kinds)
+            for f, name in enumerate(kind.filters)
+            for i, node in enumerate(self.groups[kind.group])
+        }
 
     @property
     def states(self) -> tuple[str, ...]:
@@ -139,6 +243,26 @@ def _check_received(name: str, item: AbstractFilter, received: int) -> None:
         raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
 
 
-def _check_type(name: str, value: Any, expected: type) -> None:
+def _world(node: Node | Listener) -> object:
+    """What decides how a node hears."""
+    return (node.sensor, node.channel) if isinstance(node, Node) else (node.received, node.complete)
+
+
+def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
+    """Names of what shares a structure, in order of first appearance."""
+    found: dict[object, list[str]] = {}
+    for name, item in items:
+        found.setdefault(structure(item), []).append(name)
+    return tuple(tuple(names) for names in found.values())
+
+
+def _check_filters(filters: Mapping[str, object], received: int) -> None:
+    for name, item in filters.items():
+        _check_type(f"filter {name!r}", item, AbstractFilter)
+        if isinstance(item, AbstractFilter):
+            _check_received(f"filter {name!r}", item, received)
+
+
+def _check_type(name: str, value: object, expected: type) -> None:
     if not isinstance(value, expected):
         raise fail(name, f"a {expected.__name__}", type(value).__name__)

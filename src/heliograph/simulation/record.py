@@ -1,16 +1,21 @@
 """What a run leaves behind: trajectories with their claims, or running statistics of the errors."""
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import FUSED, Network
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -98,51 +103,88 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     return result
 
 
-class AbstractReducer(eqx.Module):
-    """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected."""
+class AbstractReducer(eqx.Module, Generic[Result]):
+    """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
 
-    def initial(self, shapes: Any) -> Any:
-        """The carry before the first block; `shapes` are those of a block's trajectories."""
+    A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes, "estimates":
+    of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name, "uplinks"}, as
+    `Network` has groups and kinds. What all runs share, such as a covariance, has length 1 along the runs.
+    """
+
+    def initial(self, shapes: PyTree) -> PyTree:
+        """The carry before the first block; `shapes` are those of a block."""
         raise NotImplementedError
 
-    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
         """Next carry and collected part of a block, inside the compiled scan; runs that are not valid are padding."""
         raise NotImplementedError
 
-    def finish(self, carry: Any, collected: Any, network: Network) -> Any:
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
         """Make the result; collected parts are joined along the run axis, without padding."""
         raise NotImplementedError
 
 
-class Trajectories(AbstractReducer):
+class Trajectories(AbstractReducer[Record]):
     """Keep everything; memory grows with the number of runs."""
 
-    def initial(self, shapes: Any) -> Any:
+    def initial(self, shapes: PyTree) -> PyTree:
         """Nothing is summed."""
         return ()
 
-    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
-        """Collect the block."""
-        return carry, batch
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
+        """Collect the block; each run gets its copy of what they share."""
+        return carry, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), batch)
 
-    def finish(self, carry: Any, collected: Any, network: Network) -> Record:
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Record:
         """Make the record; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
 
 
-def trajectories_record(network: Network, batch: Any, time: np.ndarray) -> Record:
+def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Record from the scan's output; nodes in the network's order."""
-    measurements = {name: np.asarray(batch["measurements"][name]) for name in network.nodes}
-    found = batch["estimates"]
-    estimates = {node: {name: found[node][name] for name in claims} for node, claims in network.claims().items()}
-    return Record(
-        time, network.states, batch["truth"], measurements, estimates, uplinks_of(network, batch.get("uplinks", {}))
+    measurements = measurements_of(network, batch["measurements"])
+    mean, covariance = (
+        by_name(network, batch, lambda e, part=part: np.asarray(getattr(e, part)), axis)
+        for part, axis in (("mean", -3), ("covariance", -4))
     )
+    estimates = {
+        node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
+        for node, claims in network.claims().items()
+    }
+    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks_of(network, batch["uplinks"]))
+
+
+def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Measurements by node, in the given order, from those of the groups (..., node, received)."""
+    heard = {
+        name: np.asarray(z)[..., i, :]
+        for names, z in zip(network.groups, groups, strict=True)
+        for i, name in enumerate(names)
+    }
+    return {name: heard[name] for name in network.names}
+
+
+def by_name(
+    network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """What `read` gives of each kind's part, split at its axes (filter, node), the first being `axis`; by node and filter.
+
+    `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
+    """
+    result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
+    for (group, filters), part in zip(network.kinds, batch["estimates"], strict=True):
+        values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
+        for name, rows in zip(filters, values, strict=True):
+            for node, row in zip(network.groups[group], rows, strict=True):
+                result[node][name] = row
+    if network.fused:
+        result[FUSED] = {name: read(part) for name, part in batch["fused"].items()}
+    return result
 
 
 def uplinks_of(network: Network, found: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
-    """Links by the fusion's name, from arrays whose last axes are (node, n)."""
+    """Uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
     result = {}
     for name, fusion in network.fused.items() if found else ():
         if isinstance(fusion, Fusion) and name in found:

@@ -8,21 +8,21 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from heliograph.model.over_time import at
+from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, fail
-from heliograph.numerics.float64 import compiled, to_numpy
-from heliograph.random_affine.base import apply
+from heliograph.numerics.float64 import compiled
+from heliograph.simulation.air import AbstractAir, air_of
+from heliograph.simulation.by_run import trajectories
+from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.lanes import BLOCK, Lanes
 from heliograph.simulation.network import Network
 from heliograph.simulation.record import AbstractReducer, Record, Trajectories, trajectories_record
-from heliograph.simulation.stepping import AllFilters, Group, groups
+from heliograph.simulation.stepping import AllFilters, plan, plans
 
 Progress = Callable[[int, int], None]
-
-# What a key is for: folded in last, so that each use has its own stream.
-INITIAL, PROCESS, SENSOR, CHANNEL = range(4)
-WORLD = 0  # the plant's place among the node checksums
 
 Precision = Literal["float64", "float32"]
 
@@ -66,10 +66,17 @@ def monte_carlo(
     base = jax.random.key(key) if isinstance(key, int | np.integer) else key
     if precision not in get_args(Precision):
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", repr(precision))
-    job = _Job(network, u, base, np.asarray(first_run + runs), reducer, precision == "float32")
+    filters = AllFilters(network)
+    world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
+    job = _Job(world, u, base, np.asarray(first_run + runs), reducer, precision == "float32")
     parts = []
     with jax.enable_x64(True):
-        lanes = Lanes(partial(_lane, job), partial(_all_lanes, job), to_numpy(_initial(job)), first_run)
+        lanes = Lanes(
+            lambda blocks, carry: _lane((job, blocks), carry),
+            partial(_all_lanes, job),
+            partial(_initial, job),
+            first_run,
+        )
         blocks = lanes.blocks_of(min(chunk, runs))
         for start in range(0, -(-runs // BLOCK), blocks):
             begun, done = start * BLOCK, min((start + blocks) * BLOCK, runs)
@@ -88,9 +95,7 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
     """
-    unknown = sorted(set(measurements) ^ set(network.nodes))
-    if unknown:
-        raise fail("measurements", f"arrays for the nodes {sorted(network.nodes)}", f"a mismatch in {unknown}")
+    network = network.restricted_to(measurements)
     steps = len(next(iter(measurements.values())))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -105,25 +110,46 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
         raise fail(
             "time", "times that do not go backwards", f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
         )
-    found = _run_filters(network, z, u)
-    return trajectories_record(network, {"truth": None, "measurements": z, **found}, clock)
+    grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
+    found = _run_filters(AllFilters(network), grouped, u)
+    return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)
 
 
 @compiled
-def _run_filters(network: Network, z: dict[str, Any], u: Any) -> Any:
-    step = AllFilters(network, groups(network))
+def _run_filters(filters: AllFilters, z: tuple[Any, ...], u: Any) -> Any:
+    def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
+        k, u_k, z_k = row
+        return filters.step(states, z_k, u_k, k)
 
-    def body(states: Any, item: tuple[Any, ...]) -> tuple[Any, Any]:
-        k, u_k, z_k = item
-        return step(states, z_k, u_k, k)
+    return jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z))[1]
 
-    return jax.lax.scan(body, step.init(), (jnp.arange(u.shape[0]), u, z))[1]
+
+class World(eqx.Module):
+    """A network as it is simulated: the plant, what is between it and the nodes, and all filters."""
+
+    plant: AnyPlant
+    air: AbstractAir
+    filters: AllFilters
+
+    def init(self, key: jax.Array) -> PyTree:
+        """Before the first step of the run with this key."""
+        x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
+        return x, self.air.init(key), self.filters.init()
+
+    def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        """After step k with the input u, and what there is to see of it: truth (n,), measurements by group, estimates."""
+        (x, air, states), (k, u) = carry, row
+        plant = at(self.plant, k)
+        x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
+        air, z = self.air.hear(air, x, key, k)
+        states, found = self.filters.step(states, z, u, k)
+        return (x, self.air.told(air, found["estimates"]), states), {"truth": x, "measurements": z, **found}
 
 
 class _Job(eqx.Module):
     """What is simulated, up to which run, what is kept of it, and whether in single precision."""
 
-    network: Network
+    world: World
     inputs: Any
     key: jax.Array
     stop: np.ndarray
@@ -132,35 +158,39 @@ class _Job(eqx.Module):
 
 
 @eqx.filter_jit
-def _initial(job: _Job) -> Any:
+def _initial(job: _Job) -> PyTree:
     """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
     return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
 
 
-@eqx.filter_jit
-def _lane(job: _Job, blocks: Any, carry: Any) -> tuple[Any, Any]:
+@eqx.filter_jit(donate="all-except-first")
+def _lane(todo: tuple[_Job, Any], carry: PyTree) -> tuple[PyTree, PyTree]:
+    return _blocks(*todo, carry)
+
+
+def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
     """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
 
-    def body(carry: Any, runs: jax.Array) -> tuple[Any, Any]:
+    def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
         return job.reducer.reduce(carry, _block(job, runs), runs, runs < job.stop)
 
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
 
 
 @eqx.filter_jit
-def _all_lanes(job: _Job, blocks: Any, carries: Any) -> tuple[Any, Any]:
+def _all_lanes(job: _Job, blocks: Any, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Every lane's blocks, with a leading axis for the lanes."""
-    result: tuple[Any, Any] = jax.vmap(partial(_lane, job))(blocks, carries)
+    result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
     return result
 
 
-def _block(job: _Job, runs: jax.Array) -> Any:
-    """Trajectories (run, time, ...) of one block of runs."""
+def _block(job: _Job, runs: jax.Array) -> PyTree:
+    """Trajectories (run, time, ...) of one block of runs; (1, time, ...) of what all runs share."""
     if not job.single:
-        return _trajectories(job.network, job.inputs, job.key, runs)
+        return _trajectories(job.world, job.inputs, job.key, runs)
     with jax.enable_x64(False):
-        network, inputs = jax.tree.map(_single, (job.network, job.inputs))
-        found = _trajectories(network, inputs, job.key, runs)
+        world, inputs = jax.tree.map(_single, (job.world, job.inputs))
+        found = _trajectories(world, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
 
 
@@ -168,62 +198,9 @@ def _single(leaf: Any) -> Any:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _trajectories(network: Network, u: Any, key: jax.Array, runs: jax.Array) -> Any:
-    """The runs are the last axis of everything on the way."""
-    world = _World(network)
+def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
-    advance = jax.vmap(world.step, in_axes=(-1, 0, None, None), out_axes=-1)
-
-    def body(carry: Any, item: tuple[Any, ...]) -> tuple[Any, Any]:
-        result: tuple[Any, Any] = advance(carry, keys, *item)
-        return result
-
-    start = jax.vmap(world.init, out_axes=-1)(keys)
-    found = jax.lax.scan(body, start, (jnp.arange(u.shape[0]), u))[1]
-    return jax.tree.map(lambda leaf: jnp.moveaxis(leaf, -1, 0), found)
-
-
-class _World:
-    """One run of a network, step by step: the plant's state and those of all filters."""
-
-    def __init__(self, network: Network):
-        self.network, self.parts = network, groups(network)
-        self.filters = AllFilters(network, self.parts)
-
-    def init(self, key: jax.Array) -> tuple[jax.Array, Any]:
-        """Before the first step."""
-        return at(self.network.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL)), self.filters.init()
-
-    def step(self, carry: tuple[Any, Any], key: jax.Array, k: jax.Array, u: jax.Array) -> tuple[Any, Any]:
-        """After step k, and what there is to see of it: truth (n,), measurements and estimates by node, uplinks."""
-        x, states = carry
-        plant = at(self.network.plant, k)
-        x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
-        z: dict[str, jax.Array] = {}
-        for part in self.parts:
-            z |= dict(zip(part.names, _observe(part, x, key, k), strict=True))
-        states, found = self.filters(states, z, u, k)
-        return (x, states), {"truth": x, "measurements": z, **found}
-
-
-def _observe(part: Group, x: jax.Array, key: jax.Array, k: jax.Array) -> jax.Array:
-    """What reaches the filters of a group of nodes at step k: (node, received)."""
-
-    def one(node: Any, checksum: jax.Array) -> jax.Array:
-        sensor, channel = at(node.sensor, k), at(node.channel, k)
-        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum, SENSOR))
-        return apply(channel.sample(draw_key(key, k, checksum, CHANNEL)), y)
-
-    observe = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
-    received: jax.Array = observe(part.stacked, jnp.asarray(part.checksums))
-    return received
-
-
-def draw_key(run_key: jax.Array, k: Any, place: Any, purpose: int) -> jax.Array:
-    """Key of one draw: folded in by step, node and purpose, so no draw depends on how many others there are."""
-    for part in (k, place, purpose):
-        run_key = jax.random.fold_in(run_key, part)
-    return run_key
+    return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
 def _check_inputs(network: Network, inputs: Any, horizon: int) -> np.ndarray:

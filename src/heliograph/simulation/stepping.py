@@ -1,113 +1,176 @@
-"""Nodes of one structure run side by side: stacked along a leading axis and vmapped, under the scan over time."""
+"""Filters of one kind run side by side: stacked along axes of filters and nodes, and vmapped, under the scan over time."""
 
-from typing import Any, NamedTuple
-from zlib import crc32
+from collections.abc import Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.quantizer import Quantized, widen
-from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import alike, at, stack
-from heliograph.simulation.network import FUSED, Network, Node
+from heliograph.fusion.rules import AbstractFusion, Fusion
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at, stack
+from heliograph.numerics.float64 import compiled
+from heliograph.simulation.network import Network
 
 
-class Group(NamedTuple):
-    """Nodes that share structure and shapes, stacked; checksums of their names identify their random draws."""
+class Alike(eqx.Module):
+    """Filters that differ in numbers alone, stacked (filter, node), and the group of nodes that they belong to."""
 
-    names: tuple[str, ...]
-    stacked: Node
-    checksums: np.ndarray
+    filters: AbstractFilter
+    group: int = eqx.field(static=True)
 
+    def init(self) -> PyTree:
+        """States before the first step, (filter, node, ...)."""
+        return _over_both(_initial)(self.filters)
 
-def groups(network: Network) -> list[Group]:
-    """Group the network's nodes by structure, in order of first appearance."""
-    collected: list[tuple[list[str], list[Node]]] = []
-    for name, node in network.nodes.items():
-        for names, members in collected:
-            if alike(node, members[0]):
-                names.append(name)
-                members.append(node)
-                break
-        else:
-            collected.append(([name], [node]))
-    return [
-        Group(tuple(names), stack(members), np.array([crc32(n.encode()) for n in names], dtype=np.uint32))
-        for names, members in collected
-    ]
+    def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Estimate]:
+        """One step of each; z (node, received)."""
+
+        def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Estimate]:
+            return item.step(state, z, u, k)
+
+        over_nodes = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
+        over_filters = eqx.filter_vmap(over_nodes, in_axes=(eqx.if_array(0), 0, None))
+        result: tuple[PyTree, Estimate] = over_filters(self.filters, states, z)
+        return result
 
 
-class AllFilters:
-    """Every filter of a network stepped once: nodes of a group vmapped, then fusion rules and central filters."""
+class Fused(eqx.Module):
+    """A fusion: its rule, where the estimates stand that it takes, and the quantizers on their way, stacked.
 
-    def __init__(self, network: Network, parts: list[Group]):
-        self.network, self.parts = network, parts
+    `sources`: kind and filter, whose nodes' estimates follow one another; `order` brings them into the nodes' order.
+    """
+
+    rule: AbstractFusion
+    order: np.ndarray | None
+    quantizers: PyTree
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+
+class AllFilters(eqx.Module):
+    """Every filter of a network: those of the nodes by kind, fusion rules, and central filters.
+
+    `order` brings the groups' measurements, joined, into the order of the nodes.
+    """
+
+    alike: tuple[Alike, ...]
+    rules: dict[str, Fused]
+    central: dict[str, AbstractFilter]
+    order: np.ndarray | None
+    complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
+    n: int = eqx.field(static=True)
+
+    def __init__(self, network: Network):
+        self.alike = tuple(
+            Alike(_stacked([[network.nodes[name].filters[f] for name in network.groups[g]] for f in names]), g)
+            for g, names in network.kinds
+        )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
-        self.rules = {name: item for name, item in network.fused.items() if isinstance(item, Fusion)}
-        uplinks = {name: item.uplinks(network.nodes_with(item.filter)) for name, item in self.rules.items()}
-        self.uplinks = {name: uplink for name, uplink in uplinks.items() if uplink is not None}
+        fusions = {name: item for name, item in network.fused.items() if isinstance(item, Fusion)}
+        self.rules = {name: _fused(network, item, network.claims()["fused"][name]) for name, item in fusions.items()}
+        grouped = [name for names in network.groups for name in names]
+        lengths = [network.nodes[name].received for name in grouped]
+        entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
+        self.order = _unless_sorted(np.concatenate([entries[name] for name in network.names]))
+        self.complete = tuple(network.nodes[names[0]].complete for names in network.groups)
+        self.n = len(network.states)
 
-    def init(self) -> tuple[list[Any], dict[str, Any]]:
-        """States before the first step: of groups and uplinks with a leading node axis, and of each central filter."""
-        groups = [eqx.filter_vmap(_init, in_axes=eqx.if_array(0))(part.stacked) for part in self.parts]
-        n = len(self.network.states)
-        start = eqx.filter_vmap(lambda uplink: at(uplink, 0).init(n), in_axes=eqx.if_array(0))
-        return groups, _initial(self.central) | {name: start(uplink) for name, uplink in self.uplinks.items()}
+    def init(self) -> PyTree:
+        """States before the first step: of the nodes' filters, of central filters, and of quantizers."""
+        central = {name: _initial(item) for name, item in self.central.items()}
+        start = eqx.filter_vmap(lambda item: at(item, 0).init(self.n), in_axes=eqx.if_array(0))
+        sent = {name: start(item.quantizers) for name, item in self.rules.items() if item.quantizers is not None}
+        return tuple(item.init() for item in self.alike), central, sent
 
-    def __call__(self, states: Any, z: dict[str, jax.Array], u: jax.Array, k: jax.Array) -> tuple[Any, Any]:
-        """One step of all filters from the measurements of each node.
+    def step(
+        self, states: PyTree, z: Sequence[jax.Array], u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, dict[str, PyTree]]:
+        """One step of all filters from the measurements of each group.
 
-        Gives "estimates" by node and filter and, where a fusion has quantizers, "uplinks" by the fusion's name.
+        Gives "estimates" by kind, (filter, node, ...), "fused" by name, and "uplinks" of what has quantizers.
         """
-        step = eqx.filter_vmap(_step, in_axes=(eqx.if_array(0), eqx.if_array(0), eqx.if_array(0), None, None))
-        after, estimates = [], {}
-        for part, state in zip(self.parts, states[0], strict=True):
-            following, group = step(part.stacked, state, jnp.stack([z[name] for name in part.names]), u, k)
-            after.append(following)
-            for i, name in enumerate(part.names):
-                estimates[name] = jax.tree.map(lambda leaf, i=i: leaf[i], group)
-        central, fused, sent = self._fuse(states[1], estimates, z, u, k)
-        if self.network.fused:
-            estimates[FUSED] = fused
-        return (after, central), {"estimates": estimates} | ({"uplinks": sent} if sent else {})
-
-    def _fuse(self, states: Any, estimates: Any, z: Any, u: jax.Array, k: jax.Array) -> tuple[Any, Any, Any]:
-        joined = jnp.concatenate([z[name] for name in self.network.names])
-        results = {name: item.step(states[name], joined, u, k) for name, item in self.central.items()}
-        after, fused = ({name: result[part] for name, result in results.items()} for part in (0, 1))
-        uplinks = {}
-        for name, fusion in self.rules.items():
-            local = [estimates[node][fusion.filter] for node in self.network.nodes_with(fusion.filter)]
-            means, bounds = jnp.stack([e.mean for e in local]), jnp.stack([e.covariance for e in local])
-            if name in self.uplinks:
-                after[name], sent = _send(self.uplinks[name], states[name], means, k)
-                means, bounds = jnp.asarray(sent.value), jax.vmap(widen)(bounds, jnp.asarray(sent.error))
-                uplinks[name] = {"saturated": sent.saturated, "symbols": sent.symbols}
-            fused[name] = Estimate(*fusion.rule.combine(means, bounds), fusion.claim([e.claim for e in local]))
-        return after, fused, uplinks
+        own, central, sent = states
+        results = [item.step(state, z[item.group], u, k) for item, state in zip(self.alike, own, strict=True)]
+        estimates = tuple(estimate for _, estimate in results)
+        joined = jnp.concatenate([jnp.ravel(part) for part in z])
+        joined = joined if self.order is None else joined[self.order]
+        heard = {name: item.step(central[name], joined, u, k) for name, item in self.central.items()}
+        fused, uplinks, after = {name: estimate for name, (_, estimate) in heard.items()}, {}, {}
+        for name, item in self.rules.items():
+            means, covariances = _gathered(item, estimates)
+            if item.quantizers is not None:
+                after[name], received = _send(item.quantizers, sent[name], means, k)
+                means, covariances = received.value, jax.vmap(widen)(covariances, received.error)
+                uplinks[name] = {"saturated": received.saturated, "symbols": received.symbols}
+            fused[name] = Estimate(*item.rule.combine(means, covariances), item.claim)
+        following = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}, after
+        return following, {"estimates": estimates, "fused": fused, "uplinks": uplinks}
 
 
-def _send(uplinks: Any, states: Any, means: jax.Array, k: jax.Array) -> tuple[Any, Quantized]:
+@compiled
+def plan(filters: AllFilters, u: Any) -> AllFilters:
+    """The filters with what does not depend on data computed before, where all data arrive."""
+
+    def one(item: AbstractFilter) -> AbstractFilter:
+        return item.planned(u)
+
+    alike = tuple(
+        Alike(_over_both(one)(item.filters), item.group) if filters.complete[item.group] else item
+        for item in filters.alike
+    )
+    central = {name: one(item) if all(filters.complete) else item for name, item in filters.central.items()}
+    return eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, central))
+
+
+def plans(filters: AllFilters) -> bool:
+    """Whether some filter has anything to compute before."""
+    return any(
+        type(item).planned is not AbstractFilter.planned
+        for item in (*(part.filters for part in filters.alike), *filters.central.values())
+    )
+
+
+def _fused(network: Network, fusion: Fusion, claim: Claim) -> Fused:
+    """Where the estimates of a fusion stand."""
+    nodes, places = network.nodes_with(fusion.filter), network.places()
+    sources = {places[node, fusion.filter][:2]: None for node in nodes}
+    found = [name for k, _ in sources for name in network.groups[network.kinds[k].group]]
+    order = _unless_sorted(np.array([found.index(node) for node in nodes]))
+    return Fused(fusion.rule, order, fusion.uplinks(nodes), tuple(sources), claim)
+
+
+def _gathered(item: Fused, estimates: Sequence[Estimate]) -> tuple[jax.Array, jax.Array]:
+    """Means (node, n) and covariances (node, n, n) that a fusion takes."""
+    means = jnp.concatenate([estimates[k].mean[f] for k, f in item.sources])
+    covariances = jnp.concatenate([estimates[k].covariance[f] for k, f in item.sources])
+    return (means, covariances) if item.order is None else (means[item.order], covariances[item.order])
+
+
+def _send(quantizers: PyTree, states: PyTree, means: jax.Array, k: jax.Array) -> tuple[PyTree, Quantized]:
     """Each node's mean (node, n) through its own quantizer."""
-    step = eqx.filter_vmap(lambda uplink, state, mean: at(uplink, k).step(state, mean), in_axes=(eqx.if_array(0), 0, 0))
-    result: tuple[Any, Quantized] = step(uplinks, states, means)
+    step = eqx.filter_vmap(lambda item, state, mean: at(item, k).step(state, mean), in_axes=(eqx.if_array(0), 0, 0))
+    result: tuple[PyTree, Quantized] = step(quantizers, states, means)
     return result
 
 
-def _init(node: Node) -> dict[str, Any]:
-    return _initial(node.filters)
+def _initial(item: AbstractFilter) -> PyTree:
+    return jax.tree.map(jnp.asarray, item.init())
 
 
-def _initial(filters: dict[str, AbstractFilter]) -> dict[str, Any]:
-    return {name: jax.tree.map(jnp.asarray, item.init()) for name, item in filters.items()}
+def _over_both(function: Any) -> Any:
+    return eqx.filter_vmap(eqx.filter_vmap(function, in_axes=eqx.if_array(0)), in_axes=eqx.if_array(0))
 
 
-def _step(
-    node: Node, states: dict[str, Any], z: jax.Array, u: jax.Array, k: jax.Array
-) -> tuple[dict[str, Any], dict[str, Estimate]]:
-    results = {name: item.step(states[name], z, u, k) for name, item in node.filters.items()}
-    return {name: r[0] for name, r in results.items()}, {name: r[1] for name, r in results.items()}
+def _stacked(rows: Sequence[Sequence[AbstractFilter]]) -> AbstractFilter:
+    """Filters (filter, node) as one."""
+    return stack([stack(row) for row in rows])
+
+
+def _unless_sorted(order: np.ndarray) -> np.ndarray | None:
+    return None if np.array_equal(order, np.arange(len(order))) else order

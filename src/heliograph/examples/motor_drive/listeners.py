@@ -11,7 +11,7 @@ import heliograph as hg
 from heliograph.examples.motor_drive.machine import CURRENT
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import apply
-from heliograph.simulation.simulate import CHANNEL, SENSOR, draw_key
+from heliograph.simulation.draws import CHANNEL, SENSOR, draw_key
 
 SENSOR_VARIANCE = 0.05**2  # A^2
 HOP_VARIANCE = 0.05**2  # A^2, at the relay and at the receiver

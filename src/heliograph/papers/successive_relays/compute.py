@@ -72,9 +72,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     wrong = {name: misprinted(name) for name in MISPRINTS}
     advance("simulating")
     simulated = simulate(network, paper, runs, seed)
-    schedules = hg.relay_schedules(network, paper)
-    receivers = {"own": hg.ScheduledFilter(schedules.pop("receiver"))}
-    shown = hg.simulate_relays(network, schedules, receivers, setting.HORIZON, 1, seed)
+    shown = hg.monte_carlo(world(network, paper), setting.HORIZON, 1, seed)
     return Reproduction(
         seed=seed, runs=runs, network=network, paper=paper, tuned=tuned, bounded=bounded,
         best_behind=np.trace(behind.gains.covariance, axis1=1, axis2=2), steady=states, limits=limits(paper),
@@ -148,13 +146,24 @@ def misprinted(name: str, process: float = setting.VARIANCE, sensor: float = set
     )
 
 
+def world(network: hg.RelayNetwork, design: hg.RelayDesign) -> hg.Network:
+    """The relays with their filters, and the receiver's."""
+    schedules = hg.relay_schedules(network, design)
+    return hg.Network.of_relays(network, schedules, {"own": hg.ScheduledFilter(schedules.pop("receiver"))})
+
+
+def initial_states(runs: int, seed: int) -> np.ndarray:
+    """x_0 of each run, (runs, 3): where a plant that does not move is after a step."""
+    still = hg.LinearPlant(np.eye(3), 0.0, setting.INITIAL_MEAN, setting.INITIAL_COVARIANCE)
+    sensor = hg.LinearSensor(setting.SENSING, 0.0)
+    found = hg.monte_carlo(hg.Network(still, {"nobody": hg.Node(sensor, hg.perfect(), {})}), 1, runs, seed)
+    return np.asarray(found.truth[:, 0])
+
+
 def simulate(network: hg.RelayNetwork, design: hg.RelayDesign, runs: int, seed: int) -> Simulated:
     """Mean squared errors of relays and receiver, run as filters in the world."""
-    schedules = hg.relay_schedules(network, design)
-    receivers = {"own": hg.ScheduledFilter(schedules.pop("receiver"))}
-    found = hg.simulate_relays(network, schedules, receivers, setting.HORIZON, runs, seed, hg.Statistics())
-    first = hg.initial_states(network, runs, seed)
-    start = np.sum((first - network.initial()[0]) ** 2, axis=1)
+    found = hg.monte_carlo(world(network, design), setting.HORIZON, runs, seed, hg.Statistics())
+    start = np.sum((initial_states(runs, seed) - network.initial()[0]) ** 2, axis=1)
     mean, error = {}, {}
     for name in FILTERS:
         statistics = found[name]["own"]

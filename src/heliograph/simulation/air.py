@@ -1,0 +1,197 @@
+"""What is between the plant and the filters: each node's own sensor and channel, or relays that talk in slots."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
+from heliograph.model.relays import SENSOR as SENDER
+from heliograph.model.relays import RelayNetwork
+from heliograph.model.sensor import AnySensor
+from heliograph.random_affine.base import apply
+from heliograph.simulation.draws import CHANNEL, CHANNEL_START, SENSOR, checksum, draw_key
+from heliograph.simulation.network import OWN, Network, Node
+
+Heard = tuple[jax.Array, ...]  # (node, received) of each group
+
+
+class AbstractAir(eqx.Module):
+    """How signals reach the nodes: it holds the states of all channels of a run."""
+
+    def init(self, key: jax.Array) -> PyTree:
+        """Before the first step; `key` is the run's."""
+        raise NotImplementedError
+
+    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+        """What reaches the nodes of each group at step k, when the plant's state is x; NaN where nothing does."""
+        raise NotImplementedError
+
+    def told(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
+        """After the filters' step, with their estimates by kind, (filter, node, ...)."""
+        return state
+
+
+class Antenna(eqx.Module):
+    """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws."""
+
+    sensor: AnySensor
+    channel: Channel
+    checksums: np.ndarray
+
+
+class OwnChannels(AbstractAir):
+    """Each node has its own sensor and its own channel."""
+
+    antennas: tuple[Antenna, ...]
+
+    def init(self, key: jax.Array) -> PyTree:
+        """States of the channels, by group, with a leading node axis."""
+
+        def one(antenna: Antenna) -> PyTree:
+            return _begin(antenna.channel, key, antenna.checksums)
+
+        return tuple(eqx.filter_vmap(one, in_axes=(eqx.if_array(0),))(antenna) for antenna in self.antennas)
+
+    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+        """The sensor measures x, the channel delivers."""
+
+        def one(antenna: Antenna, memory: PyTree) -> tuple[PyTree, jax.Array]:
+            sensor = at(antenna.sensor, k)
+            y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, antenna.checksums, SENSOR))
+            return _deliver(antenna.channel, memory, y, key, k, antenna.checksums)
+
+        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
+        results = [both(antenna, memory) for antenna, memory in zip(self.antennas, state, strict=True)]
+        return tuple(after for after, _ in results), tuple(z for _, z in results)
+
+
+def _begin(channel: Channel, key: jax.Array, place: jax.Array) -> PyTree:
+    return at(channel, 0).init(draw_key(key, 0, place, CHANNEL_START))
+
+
+def _deliver(
+    channel: Channel, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: jax.Array | int
+) -> tuple[PyTree, jax.Array]:
+    memory, h = at(channel, k).draw(memory, draw_key(key, k, place, CHANNEL))
+    return memory, apply(h, y)
+
+
+class Relayed(NamedTuple):
+    """What the relays will send, (relay, n), and the states of the hops that remember."""
+
+    estimates: jax.Array
+    hops: dict[str, PyTree]
+
+
+class Slots(AbstractAir):
+    """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
+
+    A hop that remembers moves on at every step, used or not; the same pair in another slot is another hop.
+    """
+
+    relays: RelayNetwork
+    own: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
+
+    def init(self, key: jax.Array) -> Relayed:
+        """Every relay knows the initial mean."""
+        mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
+        hops = {
+            name: _begin(hop, key, checksum(f"{sender} to {listener}"))
+            for name, (_, listener, sender, hop) in self._remembering().items()
+        }
+        return Relayed(jnp.tile(mean, (len(self.own), 1)), hops)
+
+    def hear(self, state: Relayed, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[Relayed, Heard]:
+        """The sum of the hops of this step's slot, at each listener."""
+        sensor = at(self.relays.sensor, k)
+        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
+        signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
+        sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
+        heard = self._forgetful(k, sent, key)
+        hops, slot = {}, k % len(self.relays.slots)
+        for name, (number, listener, sender, hop) in self._remembering().items():
+            place = checksum(f"{sender} to {listener}")
+            hops[name], z = _deliver(hop, state.hops[name], sent[sender], key, k, place)
+            heard[listener] = heard[listener] + jnp.where(slot == number, z, 0.0)
+        order = [heard[name] for name in self.relays.filters]
+        return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
+
+    def told(self, state: Relayed, estimates: Sequence[Estimate]) -> Relayed:
+        """The relays' estimates, to be sent at the next step."""
+        means = [estimates[kind].mean[f, i] for kind, f, i in self.own]
+        return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
+
+    def _remembering(self) -> dict[str, tuple[int, str, str, Channel]]:
+        return {
+            f"{number} {listener} {sender}": (number, listener, sender, hop)
+            for number, slot in enumerate(self.relays.slots)
+            for listener, hops in slot.items()
+            for sender, hop in hops.items()
+            if first(hop).remembers
+        }
+
+    def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+        """What each listener hears through hops that forget; NaN where nobody transmits to it."""
+        kinds: dict[object, list[int]] = {}
+        for number, slot in enumerate(self.relays.slots):
+            kinds.setdefault(structure(slot), []).append(number)
+        kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)
+        for i, numbers in enumerate(kinds.values()):
+            kind[numbers], position[numbers] = i, np.arange(len(numbers))
+        branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
+        slot = k % len(kind)
+        heard: dict[str, jax.Array] = jax.lax.switch(
+            jnp.asarray(kind)[slot], branches, jnp.asarray(position)[slot], k, sent, key
+        )
+        return heard
+
+    def _branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
+        # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
+        single = slots[0] if len(slots) == 1 else over_time(slots)
+
+        def branch(
+            position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+        ) -> dict[str, jax.Array]:
+            slot = at(single, position) if isinstance(single, OverTime) else single
+            listeners = zip(self.relays.filters, self.relays.received, strict=True)
+            return {name: _hear(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
+
+        return branch
+
+
+def _hear(
+    hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+) -> jax.Array:
+    parts = [
+        _deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"))[1]
+        for sender, hop in hops.items()
+        if not first(hop).remembers
+    ]
+    nobody = jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
+    return jnp.sum(jnp.stack(parts), axis=0) if parts else nobody
+
+
+def air_of(network: Network) -> AbstractAir:
+    """What is between the plant and the nodes of a network."""
+    if network.relays is not None:
+        places = network.places()
+        listeners = {name: i for i, name in enumerate(network.relays.filters)}
+        return Slots(
+            network.relays,
+            tuple(places[name, OWN] for name in network.relays.relays),
+            tuple(tuple(listeners[name] for name in names) for names in network.groups),
+        )
+    antennas = []
+    for names in network.groups:
+        nodes = [node for node in (network.nodes[name] for name in names) if isinstance(node, Node)]
+        parts = stack([(node.sensor, node.channel) for node in nodes])
+        antennas.append(Antenna(*parts, np.array([checksum(name) for name in names], dtype=np.uint32)))
+    return OwnChannels(tuple(antennas))

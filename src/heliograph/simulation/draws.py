@@ -1,0 +1,23 @@
+"""The seed's way to a draw: a key for each run, step, place and purpose, so that no draw depends on the others."""
+
+from zlib import crc32
+
+import jax
+
+# What a key is for: folded in last, so that each use has its own stream.
+INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START = range(5)
+WORLD = 0  # the plant's place among the checksums of names
+
+Number = int | jax.Array
+
+
+def draw_key(run_key: jax.Array, k: Number, place: Number, purpose: int) -> jax.Array:
+    """Key of one draw: folded in by step, place and purpose, so no draw depends on how many others there are."""
+    for part in (k, place, purpose):
+        run_key = jax.random.fold_in(run_key, part)
+    return run_key
+
+
+def checksum(name: str) -> int:
+    """The place of a node, or of a hop "SENDER to LISTENER", among all keys."""
+    return crc32(name.encode())

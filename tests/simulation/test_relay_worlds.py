@@ -1,0 +1,194 @@
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.model.channel import hop
+from heliograph.model.plant import LinearPlant
+from heliograph.model.relays import RelayNetwork
+from heliograph.model.sensor import LinearSensor
+from heliograph.relays.design import relay_schedules
+from heliograph.relays.own_error import own_error_design
+from heliograph.relays.receiver import receiver_behind_relays
+from heliograph.simulation.network import Network, Node
+from heliograph.simulation.simulate import monte_carlo, run
+from heliograph.simulation.statistics import BATCHES, Statistics, error_statistics
+from tests.relays.relay_problems import example, unusual
+
+FALSE_ALARM = 1e-4  # of each comparison over all its steps
+
+
+def world(net, design):
+    schedules = relay_schedules(net, design)
+    receivers = {
+        "own": ScheduledFilter(schedules.pop("receiver")),
+        "best": ScheduledFilter(receiver_behind_relays(net, design.gains)),
+    }
+    return schedules, receivers
+
+
+def relays(net, design):
+    return Network.of_relays(net, *world(net, design))
+
+
+def worst(statistics):
+    """Largest |z| over the steps of the squared error against the claimed trace, and what chance would give."""
+    batches = np.trace(statistics.outer, axis1=2, axis2=3) / statistics.count[:, None]
+    error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
+    claimed = np.trace(statistics.claimed(), axis1=1, axis2=2)
+    limit = stats.t.isf(FALSE_ALARM / 2 / len(claimed), BATCHES - 1)
+    return np.max(np.abs(batches.mean(axis=0) - claimed) / error), limit
+
+
+@pytest.mark.parametrize("kind", ["greedy", "another kind"])
+def test_designed_and_simulated_errors_agree_at_every_step(kind):
+    net, horizon = (unusual(), 7) if kind == "another kind" else (example(), 20)
+    design = own_error_design(net, horizon)
+    found = monte_carlo(relays(net, design), horizon, 3000, 1, Statistics())
+    for node, filters in found.items():
+        for name, statistics in filters.items():
+            largest, limit = worst(statistics)
+            assert largest < limit, (node, name)
+
+
+def test_a_wrong_design_is_seen():
+    """Claims for twice the gains that run: the comparison above can fail."""
+    net = example()
+    design = own_error_design(net, 20)
+    schedules, receivers = world(net, design)
+    gains = schedules["relay_2"].gains
+    short = 0.5 * gains.gain
+    moved = gains._replace(gain=short, direct=short, transition=gains.transition + 0.5 * gains.gain @ gains.expected,
+                           output=gains.transition + 0.5 * gains.gain @ gains.expected)  # fmt: skip
+    schedules["relay_2"] = type(schedules["relay_2"])(moved, schedules["relay_2"].start, "exact")
+    found = monte_carlo(Network.of_relays(net, schedules, receivers), 20, 3000, 1, Statistics())
+    largest, limit = worst(found["relay_2"]["own"])
+    assert largest > 2 * limit
+
+
+def test_runs_do_not_depend_on_chunks_or_on_other_receivers():
+    net = example()
+    schedules, receivers = world(net, own_error_design(net, 6))
+    a = monte_carlo(Network.of_relays(net, schedules, {"own": receivers["own"]}), 6, 70, 3)
+    b = monte_carlo(Network.of_relays(net, schedules, {}), 4, 70, 3, chunk=32)
+    assert np.array_equal(a.truth[:, :4], b.truth)
+    for name in net.filters:
+        np.testing.assert_array_equal(a.measurements[name][:, :4], b.measurements[name])
+    assert np.all(np.isnan(a.measurements["relay_1"][:, 0])) and not np.any(np.isnan(a.measurements["receiver"]))
+
+
+def test_what_holds_for_every_network_holds_for_relays():
+    """A first run, chunks of statistics, single precision, and a record's statistics."""
+    network = relays(example(), own_error_design(example(), 5))
+    whole, part = monte_carlo(network, 5, 96, 7), monte_carlo(network, 5, 32, 7, first_run=64)
+    np.testing.assert_array_equal(
+        whole.estimates["receiver"]["best"].mean[64:], part.estimates["receiver"]["best"].mean
+    )
+    assert whole.failures() == []
+    told = []
+    sums = [monte_carlo(network, 5, 96, 7, Statistics(), chunk=c, progress=lambda *n: told.append(n)) for c in (32, 96)]
+    assert told == [(32, 96), (64, 96), (96, 96), (96, 96)]
+    one, other = (s["relay_2"]["own"] for s in sums)
+    np.testing.assert_array_equal(one.outer, other.outer)
+    kept = error_statistics(whole, "relay_2", "own")
+    np.testing.assert_allclose(kept.outer, one.outer, rtol=1e-12)
+    np.testing.assert_allclose(kept.covariance, one.covariance, rtol=1e-12)
+    np.testing.assert_allclose(kept.nees, one.nees, rtol=1e-9)
+    single = monte_carlo(network, 5, 96, 7, Statistics(), precision="float32")["receiver"]["own"]
+    assert single.rmse()[0] == pytest.approx(one.rmse()[0], rel=2)
+
+
+def quiet():
+    """The sensor is heard through one relay, which listens and talks in turn; the receiver hears it every other step."""
+    hops = hop(0.9, 0.1), hop(0.8, 0.2)
+    slots = [{"a": {"sensor": hops[0]}}, {"receiver": {"a": hops[1]}}]
+    plant = LinearPlant([[0.95]], [[1.0]], [1.0], [[2.0]])
+    return RelayNetwork(plant, LinearSensor([[1.0]], [[0.3]]), ("a",), slots)
+
+
+def test_a_planned_silence_is_no_gap_and_a_loss_is_one():
+    net, horizon = quiet(), 12
+    design = own_error_design(net, horizon)
+    network = relays(net, design)
+    record = monte_carlo(network, horizon, 40, 2)
+    heard = record.measurements["receiver"]
+    assert np.all(np.isnan(heard[:, ::2])) and np.all(np.isfinite(heard[:, 1::2]))
+    assert record.failures() == []
+    for name in ("own", "best"):
+        claimed = record.estimates["receiver"][name].covariance
+        assert np.all(np.isfinite(claimed)) and np.array_equal(claimed[0], claimed[-1])
+    largest, limit = worst(monte_carlo(network, horizon, 3000, 1, Statistics())["receiver"]["own"])
+    assert largest < limit
+    lost = heard[3].copy()
+    lost[5] = np.nan
+    bound = run(network, {"receiver": lost}).estimates["receiver"]["own"].covariance
+    assert np.all(np.isfinite(bound[:5])) and np.all(np.isnan(bound[5:]))
+
+
+def test_a_recording_needs_what_the_receiver_heard_alone():
+    net, horizon = quiet(), 8
+    network = relays(net, own_error_design(net, horizon))
+    record = monte_carlo(network, horizon, 1, 5)
+    z = {name: values[0] for name, values in record.measurements.items()}
+    alone, whole = run(network, {"receiver": z["receiver"]}), run(network, z)
+    assert list(alone.estimates) == ["receiver"] and list(whole.estimates) == ["a", "receiver"]
+    for node, found in (("receiver", alone), ("receiver", whole), ("a", whole)):
+        for name, estimate in found.estimates[node].items():
+            np.testing.assert_allclose(estimate.mean, record.estimates[node][name].mean[0], rtol=1e-12)
+            np.testing.assert_allclose(estimate.covariance, record.estimates[node][name].covariance[0], rtol=1e-12)
+    with pytest.raises(ValueError, match=r"arrays for the nodes \['a', 'receiver'\], got a mismatch in \['receiver'\]"):
+        run(network, {"a": z["a"]})
+
+
+class Staying(hop(1.0, 0.1).__class__):
+    """A hop whose gain is drawn once and stays."""
+
+    @property
+    def remembers(self):
+        return True
+
+    def init(self, key):
+        return jax.random.normal(key)
+
+    def draw(self, state, key):
+        h = super().sample(key)
+        return state, h.at[:-1, :-1].multiply(state)
+
+
+def staying(noise):
+    plain = hop(1.0, noise)
+    return Staying(plain.gain, plain.matrix, plain.noise)
+
+
+def test_hops_that_remember_keep_their_state():
+    """Without noise, what is heard over what was sent is one number for each run and hop."""
+    plant = LinearPlant([[1.0]], [[0.0]], [1.0], [[1.0]])
+    sensor = LinearSensor([[1.0]], [[0.0]])
+    node = Network(plant, {"n": Node(sensor, staying(0.0), {})})
+    record = monte_carlo(node, 4, 40, 0)
+    gains = record.measurements["n"] / record.truth
+    np.testing.assert_allclose(gains, np.broadcast_to(gains[:, :1], gains.shape), rtol=1e-12)
+    assert abs(gains[:, 0].mean()) < 4 / np.sqrt(40) and 0.5 < gains[:, 0].std() < 1.6
+    slots = [{"receiver": {"sensor": staying(0.0)}}, {"receiver": {"sensor": hop(1.0, 0.0)}}]
+    record = monte_carlo(Network.of_relays(RelayNetwork(plant, sensor, (), slots), {}, {}), 4, 40, 0)
+    gains = record.measurements["receiver"] / record.truth
+    np.testing.assert_allclose(gains[:, 2], gains[:, 0], rtol=1e-12)
+    np.testing.assert_allclose(gains[:, 1::2], 1.0, rtol=1e-12)
+    assert gains[:, 0].std() > 0.5
+
+
+def test_bad_input_is_refused():
+    net = example()
+    schedules, receivers = world(net, own_error_design(net, 6))
+    with pytest.raises(ValueError, match="relay schedules: expected those of"):
+        Network.of_relays(net, {"relay_1": schedules["relay_1"]}, receivers)
+    with pytest.raises(
+        ValueError, match=r"schedule of 'relay_1': expected gains of shape \(3, 1\), got shape \(1, 1\)"
+    ):
+        short = relay_schedules(quiet(), own_error_design(quiet(), 6))["a"]
+        Network.of_relays(net, {**schedules, "relay_1": short}, receivers)
+    with pytest.raises(ValueError, match="horizon: expected at most 6 steps"):
+        monte_carlo(Network.of_relays(net, schedules, receivers), 9, 10, 0)
+    with pytest.raises(ValueError, match="runs: expected a positive whole number"):
+        monte_carlo(Network.of_relays(net, schedules, receivers), 6, 0, 0)
