@@ -1,0 +1,87 @@
+"""The Gaussian log-likelihood of an innovation: SciPy's, on a support, and free where nobody asks."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+import heliograph as hg
+from heliograph.filters.innovation import innovation, log_density
+
+ROUNDING = 1e-12
+
+
+def density(value, covariance, size=1.0):
+    with jax.enable_x64(True):
+        return float(log_density(np.asarray(value), np.asarray(covariance), np.full(len(value), size)))
+
+
+@pytest.mark.parametrize("m", [1, 2, 5, 12])
+@pytest.mark.parametrize("units", [1.0, 1e-9])
+def test_it_is_scipys(m, units):
+    draw = np.random.default_rng(m)
+    root = draw.normal(size=(m, m)) * np.append(np.ones(m - 1), units)[:, None]
+    value, covariance = root @ draw.normal(size=m), root @ root.T
+    # in units in which SciPy, whose tolerance is relative to the largest eigenvalue, loses nothing
+    scale = np.sqrt(np.diag(covariance))
+    expected = stats.multivariate_normal(np.zeros(m), covariance / np.outer(scale, scale)).logpdf(value / scale)
+    assert density(value, covariance) == pytest.approx(expected - np.log(scale).sum(), rel=1e-9)
+
+
+def test_components_that_did_not_arrive_are_left_out():
+    covariance = np.array([[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 3.0]])
+    with jax.enable_x64(True):
+        found = innovation(np.array([1.0, np.nan, -2.0]), np.array([0.5, 0.0, 0.0]), covariance)
+    left = np.array([0, 2])
+    assert np.array_equal(np.isnan(found.value), [False, True, False])
+    assert np.array_equal(np.isnan(found.covariance), np.isnan(found.value)[:, None] | np.isnan(found.value))
+    expected = stats.multivariate_normal(np.zeros(2), covariance[np.ix_(left, left)]).logpdf([0.5, -2.0])
+    assert float(found.log_likelihood) == pytest.approx(expected, rel=ROUNDING)
+    assert density([np.nan, np.nan], np.eye(2)) == 0
+
+
+def test_on_a_support_the_free_components_count():
+    """z_2 = 2 z_1 and z_3 known: the density of z_1 where they agree, none where they do not."""
+    covariance = np.zeros((3, 3))
+    covariance[:2, :2] = 0.7 * np.outer([1.0, 2.0], [1.0, 2.0])
+    assert density([0.4, 0.8, 0.0], covariance) == pytest.approx(stats.norm.logpdf(0.4, 0, np.sqrt(0.7)), rel=ROUNDING)
+    assert density([0.4, 0.9, 0.0], covariance) == -np.inf
+    assert density([0.4, 0.8, 0.1], covariance) == -np.inf
+
+
+def test_an_indefinite_covariance_gives_nan():
+    assert np.isnan(density([0.1, 0.2], [[1.0, 2.0], [2.0, 1.0]]))
+
+
+def test_a_silent_channel_says_nothing():
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    item = hg.linear_filter(plant, sensor, hg.silent())
+    heard = item.correct(item.predict(item.init()), [0.0])[1]
+    assert heard.value[0] == 0 and heard.covariance[0, 0] == 0 and heard.log_likelihood == 0
+
+
+def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
+    """S of the first step by the law of total variance: E[g^2] Var y + Var(g) (E y)^2 + noise."""
+    plant, sensor = hg.LinearPlant([[0.5]], 0.2, [3.0], 1.0), hg.LinearSensor([[2.0]], 0.1)
+    gain = hg.Discrete([0.5, 1.0], [0.3, 0.7], 0.1)  # uncertain: the innovation is the nominal law's
+    variance, mean = 4 * (0.25 + 0.2) + 0.1, 2 * 1.5
+    spread = gain.moment(2) - gain.moment(1) ** 2
+    expected = gain.moment(2) * variance + spread * mean**2 + 0.3
+    for make in (hg.linear_filter, hg.cubature_filter):
+        item = make(plant, sensor, hg.hop(gain, 0.3))
+        heard = item.correct(item.predict(item.init()), [2.0])[1]
+        assert heard.covariance[0, 0] == pytest.approx(expected, rel=ROUNDING)
+        assert heard.value[0] == pytest.approx(2.0 - gain.moment(1) * mean, rel=ROUNDING)
+
+
+def test_a_step_that_is_not_asked_for_it_does_not_compute_it():
+    plant, sensor = hg.LinearPlant(0.9 * np.eye(2), 0.1, [1.0, 0.0], 1.0), hg.LinearSensor(np.eye(2), 0.1)
+    item = hg.linear_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2))
+
+    def program(function):
+        with jax.enable_x64(True):
+            z = jax.numpy.ones((32, 2))
+            return jax.jit(jax.vmap(lambda z: function(item.init(), z))).lower(z).compile().as_text()
+
+    assert " log(" in program(lambda s, z: item.correct(s, z)[1].log_likelihood)
+    assert " log(" not in program(item.step)

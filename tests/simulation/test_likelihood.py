@@ -1,0 +1,103 @@
+"""A run's likelihood: the textbook's for a linear Gaussian system, and its gradient."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+import heliograph as hg
+
+A, B = np.array([[0.9, 0.2], [-0.1, 0.8]]), np.array([[0.5], [1.0]])
+C, Q, R = np.array([[1.0, 0.0], [0.5, 1.0]]), np.array([[0.3, 0.1], [0.1, 0.2]]), np.diag([0.2, 0.4])
+START, SPREAD = np.array([1.0, -0.5]), np.array([[0.5, 0.1], [0.1, 0.4]])
+PLANT, SENSOR = hg.LinearPlant(A, Q, START, SPREAD, B), hg.LinearSensor(C, R)
+STEPS = 6
+INPUTS = np.linspace(-1, 1, STEPS)[:, None]
+
+
+def data(holes):
+    z = np.random.default_rng(0).normal(size=(STEPS, 2))
+    if holes:
+        z[1, 0] = z[3] = z[4, 1] = np.nan
+    return z
+
+
+def stacked():
+    """Mean and covariance of (z_1 ... z_T) together."""
+    mean, spread, means, states = START, SPREAD, [], []
+    cross = np.zeros((0, 2))  # of all earlier states with the last
+    joint = np.zeros((0, 0))
+    for u in INPUTS:
+        mean, cross = A @ mean + B @ u, (np.concatenate([cross, spread]) if states else np.zeros((0, 2))) @ A.T
+        spread = A @ spread @ A.T + Q
+        states.append(spread)
+        means.append(C @ mean)
+        joint = np.block([[joint, cross], [cross.T, spread]])
+    read = np.kron(np.eye(STEPS), C)
+    return np.concatenate(means), read @ joint @ read.T + np.kron(np.eye(STEPS), R)
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_it_is_the_density_of_all_measurements_together(holes):
+    z, (mean, covariance) = data(holes), stacked()
+    here = ~np.isnan(z).ravel()
+    expected = stats.multivariate_normal(mean[here], covariance[np.ix_(here, here)]).logpdf(z.ravel()[here])
+    perfect = hg.perfect(2)
+    for item in (hg.kalman_filter(PLANT, SENSOR), hg.linear_filter(PLANT, SENSOR, perfect)):
+        assert hg.log_likelihood(item, z, INPUTS) == pytest.approx(expected, rel=1e-10)
+    if not holes:
+        planned = hg.kalman_filter(PLANT, SENSOR).planned(INPUTS)
+        assert hg.log_likelihood(planned, z, INPUTS) == pytest.approx(expected, rel=1e-10)
+
+
+def test_nodes_one_after_another_are_the_nodes_together():
+    rows = [hg.LinearSensor(C[[i]], R[i, i]) for i in range(2)]
+    apart = hg.sequential_filter([hg.kalman_filter(PLANT, row) for row in rows])
+    together = hg.kalman_filter(PLANT, SENSOR)
+    found, expected = (hg.log_likelihood(item, data(True), INPUTS) for item in (apart, together))
+    assert found == pytest.approx(expected, rel=1e-12)
+
+
+def test_a_mixtures_likelihood_is_that_of_its_sum():
+    plant, sensor = hg.LinearPlant([[1.0]], 0.3, [0.4], 0.5), hg.LinearSensor([[2.0]], 0.1)
+    channel = hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.2)
+    z, variance = 1.3, 4 * 0.8 + 0.1
+    parts = [p * stats.norm.pdf(z, g * 0.8, np.sqrt(g**2 * variance + 0.2)) for p, g in ((0.3, 0.5), (0.7, 1.0))]
+    found = hg.log_likelihood(hg.mixture_filter(plant, sensor, channel), [z])
+    assert found == pytest.approx(np.log(sum(parts)), rel=1e-12)
+
+
+@pytest.mark.parametrize("holes", [False, True])
+def test_gradients_are_finite_differences(holes):
+    channel = hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2)
+    for item in (
+        hg.kalman_filter(PLANT, SENSOR),
+        hg.linear_filter(PLANT, SENSOR, channel),
+        hg.cubature_filter(PLANT, SENSOR, channel),
+    ):
+
+        def likelihood(q, item=item):
+            return hg.log_likelihood(eqx.tree_at(lambda f: f.plant.noise.covariance, item, q), data(holes), INPUTS)
+
+        with jax.enable_x64(True):
+            gradient = np.asarray(jax.jit(jax.grad(likelihood))(jax.numpy.asarray(Q)))
+        for direction in (np.diag([1.0, 0.0]), np.diag([0.0, 1.0]), np.array([[0.0, 1.0], [1.0, 0.0]])):
+            step = 1e-5
+            difference = (likelihood(Q + step * direction) - likelihood(Q - step * direction)) / (2 * step)
+            assert np.sum(gradient * direction) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("measurements", "inputs", "message"),
+    [
+        (np.zeros((STEPS, 3)), INPUTS, r"measurements: expected shape \(any, 2\), got shape \(6, 3\)"),
+        (np.full((STEPS, 2), np.inf), INPUTS, "measurements: expected finite numbers"),
+        (data(True), None, r"inputs: expected shape \(6, 1\)"),
+        (data(True), np.full((STEPS, 1), np.nan), "inputs: expected finite numbers"),
+        ("abc", INPUTS, "measurements: expected an array of numbers"),
+    ],
+)
+def test_what_does_not_fit_is_refused(measurements, inputs, message):
+    with pytest.raises(ValueError, match=message):
+        hg.log_likelihood(hg.kalman_filter(PLANT, SENSOR), measurements, inputs)
