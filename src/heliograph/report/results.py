@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.report.progress import Advance, progress
@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # a missing extra is told by `write_results`, in one line
 SUMMARY = "summary.json"  # also tells earlier results from other folders
 NEEDS = ("jinja2", "matplotlib")
 T = TypeVar("T")
+Json: TypeAlias = "str | float | bool | Sequence[Json] | Mapping[str, Json] | None"
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Results:
 
     figures: "Mapping[str, Figure]"
     page: "Callable[[Mapping[str, bytes]], Page]"
-    summary: Mapping[str, object]
+    summary: Mapping[str, Json]
     write_data: Callable[[Path], None]
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -74,7 +73,7 @@ def relay(channel: AbstractRandomAffine, signals: np.ndarray, seed: int) -> np.n
 
 
 @compiled
-def _send(channel: AbstractRandomAffine, signals: Any, seed: Any) -> Any:
+def _send(channel: AbstractRandomAffine, signals: np.ndarray, seed: np.ndarray) -> jax.Array:
     keys = jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.arange(len(signals)))
     return jax.vmap(lambda key, y: apply(channel.sample(key), y))(keys, signals)
 

@@ -3,8 +3,7 @@
 The constants come from the Plaza2 recording itself; `calibration` says how and computes them again.
 """
 
-from typing import Any
-
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,19 +20,19 @@ START = np.array([-34.209, 45.301, 1.1205])  # m, m, rad: the truth's first pose
 START_DEVIATION = np.array([1.0, 1.0, 0.1])  # m, m, rad, stated
 
 
-def move(x: Any, u: Any) -> Any:
+def move(x: jax.Array, u: jax.Array) -> jax.Array:
     """Dead reckoning along the chord of an arc; x = (x, y, heading), u = (distance, turn, dt)."""
     distance, turn = u[0], u[1] - GYRO_RATE * u[2]
     course = x[2] + turn / 2
     return x + jnp.array([distance * jnp.cos(course), distance * jnp.sin(course), turn])
 
 
-def drift(u: Any) -> Any:
+def drift(u: jax.Array) -> jax.Array:
     """Covariance that one odometry step adds."""
     return jnp.diag(jnp.array([POSITION_WALK * u[0], POSITION_WALK * u[0], HEADING_WALK * u[2]]))
 
 
-def ranges(x: Any) -> Any:
+def ranges(x: jax.Array) -> jax.Array:
     """Range to each beacon."""
     return RANGE_SCALE * jnp.hypot(x[0] - BEACONS[:, 0], x[1] - BEACONS[:, 1])
 

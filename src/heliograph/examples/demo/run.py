@@ -4,7 +4,6 @@ from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from textwrap import fill
-from typing import Any
 
 import rich.box
 import rich.console
@@ -16,7 +15,7 @@ from heliograph.examples.demo.recording import find_recording, read_recording
 from heliograph.files.recording import write_estimates
 from heliograph.files.table import write_table
 from heliograph.report.progress import Advance
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
 from heliograph.simulation.record import Record
 
 NAME = "demo"
@@ -58,13 +57,13 @@ def write_data(outcome: Outcome, folder: Path) -> None:
     write_estimates(record, folder / "estimates.parquet")
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: Outcome) -> dict[str, Json]:
     """The scores by quantity and filter: of the first seed at the top, of all seeds under `seeds`."""
     quantities = [field.name for field in fields(Score)]
     trials = outcome.trials
     spread = {q: {n: [getattr(t.scores[n], q) for t in trials] for n in NAMES} for q in quantities}
-    top = {q: {n: values[0] for n, values in by_name.items()} for q, by_name in spread.items()}
-    start = {"recording": "Plaza2", "rows": len(outcome.recording.time), "seed": trials[0].seed}
+    top: dict[str, Json] = {q: {n: values[0] for n, values in by_name.items()} for q, by_name in spread.items()}
+    start: dict[str, Json] = {"recording": "Plaza2", "rows": len(outcome.recording.time), "seed": trials[0].seed}
     return {**start, **top, "seeds": {"seed": [t.seed for t in trials], **spread}}
 
 

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import jax
 import numpy as np
@@ -87,7 +86,7 @@ def cases(trust: float, seeds: range) -> list[Case]:
     """One departure at a time, then all that can occur together, then a cure for the greatest."""
     free, loaded, dead = simulate_drive(loaded=False), simulate_drive(), simulate_drive(dead_time=DEAD_TIME)
     right, wrong = plant(Machine(), trust=trust), plant(Machine(WRONG_RESISTANCE), trust=trust)
-    own = [_draw_truth(right, loaded.voltages, seed) for seed in seeds]
+    own = [np.asarray(_draw_truth(right, loaded.voltages, seed)) for seed in seeds]
     found = [Case("own_model", loaded.voltages, own, right)]
     for name, drive, model in (
         ("no_load", free, right),
@@ -104,7 +103,7 @@ def cases(trust: float, seeds: range) -> list[Case]:
 
 
 @compiled
-def _draw_truth(model: hg.Plant, voltages: np.ndarray, seed: Any) -> Any:
+def _draw_truth(model: hg.Plant, voltages: np.ndarray, seed: int) -> jax.Array:
     return draw_truth(model, voltages, jax.random.key(seed))
 
 

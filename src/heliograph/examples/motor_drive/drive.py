@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from types import ModuleType
 
 import numpy as np
 
@@ -93,7 +93,7 @@ def _phase(voltages: np.ndarray, start: np.ndarray, load: Mapping[str, float], d
     return np.array(states).reshape(-1, 6)
 
 
-def simulator() -> Any:
+def simulator() -> ModuleType:
     """The simulator's physical systems; imported only here.
 
     Raises:

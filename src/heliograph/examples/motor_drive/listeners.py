@@ -1,6 +1,5 @@
 """Who hears the stator currents: two nodes behind relays, one by wire, and the filters at each."""
 
-from typing import Any
 from zlib import crc32
 
 import jax
@@ -55,11 +54,16 @@ def network(plant: hg.Plant) -> hg.Network:
 def received(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
     """What reaches each node (steps, 2) in A; the three hear one machine, each with its own sensor and channel."""
     sensor = currents(truth.shape[1])
-    return {name: _send(sensor, channel, truth, seed, crc32(name.encode())) for name, channel in CHANNELS.items()}
+    return {
+        name: np.asarray(_send(sensor, channel, truth, seed, crc32(name.encode())))
+        for name, channel in CHANNELS.items()
+    }
 
 
 @compiled
-def _send(sensor: hg.LinearSensor, channel: hg.AbstractRandomAffine, truth: Any, seed: Any, place: Any) -> Any:
+def _send(
+    sensor: hg.LinearSensor, channel: hg.AbstractRandomAffine, truth: np.ndarray, seed: int, place: int
+) -> jax.Array:
     key = jax.random.key(seed)
 
     def one(k: jax.Array, x: jax.Array) -> jax.Array:
@@ -67,4 +71,4 @@ def _send(sensor: hg.LinearSensor, channel: hg.AbstractRandomAffine, truth: Any,
         z: jax.Array = apply(channel.sample(draw_key(key, k, place, CHANNEL)), y)
         return z
 
-    return jax.vmap(one)(jnp.arange(len(truth)), truth)
+    return jax.vmap(one)(jnp.arange(len(truth)), jnp.asarray(truth))

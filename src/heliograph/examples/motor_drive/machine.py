@@ -8,7 +8,6 @@ inertia omega' = 3/2 p k (i x psi turned: psi_alpha i_beta - psi_beta i_alpha) -
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -45,15 +44,16 @@ KNOWN_LOAD_SPEED_WALK = 0.02  # rad/s
 LOAD_WALK = float(np.sqrt(1.0**2 / 0.1 * STEP))  # Nm
 START_DEVIATION = np.array([0.1, 0.1, 0.01, 0.01, 1.0, 0.5])  # A, Vs, rad/s, Nm: at rest and without flux
 
-Rate = Callable[[Any], Any]
+Rate = Callable[[jax.Array], jax.Array]
+Method = Callable[[Rate, jax.Array, float], jax.Array]
 
 
-def euler(rate: Rate, x: Any, step: float) -> Any:
+def euler(rate: Rate, x: jax.Array, step: float) -> jax.Array:
     """x + h x'."""
     return x + step * rate(x)
 
 
-def runge_kutta(rate: Rate, x: Any, step: float) -> Any:
+def runge_kutta(rate: Rate, x: jax.Array, step: float) -> jax.Array:
     """The classical method of fourth order."""
     a = rate(x)
     b = rate(x + step / 2 * a)
@@ -66,22 +66,22 @@ class Machine(eqx.Module):
     """One step of the machine, x per unit of `RATED` (5 states, or 6 with the load's torque), u in volts."""
 
     rotor_resistance: np.ndarray
-    integrate: Callable[[Rate, Any, float], Any] = eqx.field(static=True)
+    integrate: Method = eqx.field(static=True)
 
     def __init__(
         self,
         rotor_resistance: float = ROTOR_RESISTANCE,
-        integrate: Callable[[Rate, Any, float], Any] = runge_kutta,
+        integrate: Method = runge_kutta,
     ):
         self.rotor_resistance = np.asarray(rotor_resistance, dtype=float)
         self.integrate = integrate
 
-    def __call__(self, x: Any, u: Any) -> Any:
+    def __call__(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """State after one step with the voltage held."""
         scale = RATED[: x.shape[0]]
         return self.integrate(lambda physical: self.rates(physical, u), x * scale, STEP) / scale
 
-    def rates(self, x: Any, u: Any) -> Any:
+    def rates(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """x' in SI units."""
         i, psi, omega = x[:2], x[2:4], x[4]
         damping = self.rotor_resistance / WINDING_INDUCTANCE
@@ -94,7 +94,7 @@ class Machine(eqx.Module):
         return jnp.concatenate([current, flux, speed[None], 0 * load])
 
 
-def torque(x: Any) -> Any:
+def torque(x: jax.Array) -> jax.Array:
     """Torque of the machine in Nm, x (..., states) in SI units: 3/2 p k (psi_alpha i_beta - psi_beta i_alpha)."""
     return TORQUE_FACTOR * (x[..., 2] * x[..., 1] - x[..., 3] * x[..., 0])
 
@@ -108,13 +108,13 @@ def plant(machine: Machine, load_is_state: bool = False, trust: float = 1.0) -> 
     return hg.Plant(machine, covariances[0], np.zeros(n), covariances[1], STATES[:n], INPUTS)
 
 
-def draw_truth(model: hg.Plant, voltages: np.ndarray, key: Any) -> Any:
+def draw_truth(model: hg.Plant, voltages: np.ndarray, key: jax.Array) -> jax.Array:
     """One trajectory of the filters' own model with its process noise, (steps, n) per unit."""
 
-    def body(x: Any, item: tuple[Any, Any]) -> tuple[Any, Any]:
+    def body(x: jax.Array, item: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         draw, u = item
         x = model.transition(x, u) + model.sample_noise(draw, u)
         return x, x
 
     start, *_ = keys = jax.random.split(key, len(voltages) + 1)
-    return jax.lax.scan(body, model.sample_initial(start), (keys[1:], voltages))[1]
+    return jax.lax.scan(body, model.sample_initial(start), (keys[1:], jnp.asarray(voltages)))[1]

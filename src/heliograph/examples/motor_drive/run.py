@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from heliograph.examples.motor_drive.compute import (
     CASES,
@@ -15,7 +14,7 @@ from heliograph.examples.motor_drive.compute import (
     Score,
     compute,
 )
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
 
 NAME = "motor-drive"
 
@@ -39,17 +38,22 @@ def results(outcome: Outcome) -> Results:
     return Results(motor_figures(outcome), partial(motor_page, outcome), summary(outcome), lambda folder: None)
 
 
-def summary(outcome: Outcome) -> dict[str, Any]:
+def summary(outcome: Outcome) -> dict[str, Json]:
     """Every score by trust, case and filter, with the rated values in SI units and what each case is."""
     scores = {
         trust: {case: {name: numbers(s) for name, s in filters.items()} for case, filters in by_case.items()}
         for trust, by_case in outcome.scores.items()
     }
-    head = {"seeds": outcome.seeds, "steps": len(outcome.drive.time), "dead_time": DEAD_TIME, "rated": UNITS}
+    head: dict[str, Json] = {
+        "seeds": outcome.seeds,
+        "steps": len(outcome.drive.time),
+        "dead_time": DEAD_TIME,
+        "rated": UNITS,
+    }
     return {**head, "cases": CASES, "failures": outcome.failures, "scores": scores}
 
 
-def numbers(score: Score) -> dict[str, Any]:
+def numbers(score: Score) -> dict[str, Json]:
     """A score without what runs over time."""
     ratios = {quantity: score.ratio(quantity) for quantity in QUANTITIES}
     parts = {"rmse": score.rmse, "claimed": score.claimed, "ratio": ratios, "common": score.common}

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +12,10 @@ from heliograph.papers.cubature_fusion.setting import NODES, STATES
 from heliograph.papers.cubature_fusion.statements import statements
 from heliograph.papers.runs import check_runs
 from heliograph.papers.statement import Statement
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
+
+if TYPE_CHECKING:
+    import xarray
 
 
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
@@ -43,7 +46,7 @@ def results(found: Reproduction) -> Results:
     )
 
 
-def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Json]:
     """All numbers: by scenario and filter, of the nodes together, and the statements."""
     return {
         "paper": "Cubature Kalman fusion filtering under amplify-and-forward relays with randomly varying channel "
@@ -57,7 +60,7 @@ def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
     }
 
 
-def scenario(o: Outcome) -> dict[str, Any]:
+def scenario(o: Outcome) -> dict[str, Json]:
     """Numbers of every filter, and of every fused estimate."""
     return {
         "filters": {name: numbers(o, name) for name in o.statistics[NODES[0]]},
@@ -65,7 +68,7 @@ def scenario(o: Outcome) -> dict[str, Any]:
     }
 
 
-def numbers(o: Outcome, name: str) -> dict[str, Any]:
+def numbers(o: Outcome, name: str) -> dict[str, Json]:
     """RMSE, claimed trace, and where the claim is exceeded most, steps counted from 1."""
     pooled = o.pooled(name)
     rmse, error = pooled.rmse()
@@ -97,7 +100,7 @@ def write_record(result: Reproduction, path: Path) -> None:
     joined.assign_attrs(about).to_netcdf(path, engine="h5netcdf")
 
 
-def _scenario_record(o: Outcome, length: int) -> Any:
+def _scenario_record(o: Outcome, length: int) -> "xarray.Dataset":
     import xarray
 
     local = {name: [o.statistics[node][name] for node in NODES] for name in o.statistics[NODES[0]]}

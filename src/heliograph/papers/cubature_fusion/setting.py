@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -87,14 +86,14 @@ STRONG = replace(
 FIXED_ZERO_MEAN_SCALAR = 1e-2  # ours: the bound is not the paper's, so the paper gives none
 
 
-def transition(s: Setting) -> Callable[[jax.Array, Any], jax.Array]:
+def transition(s: Setting) -> Callable[[jax.Array, object], jax.Array]:
     """The induction machine, one Euler step; one function for one setting, so that its nodes are alike."""
     return _transition(s.voltage, s.torque)
 
 
 @cache
-def _transition(voltage: float, torque: float) -> Callable[[jax.Array, Any], jax.Array]:
-    def f(x: jax.Array, _: Any) -> jax.Array:
+def _transition(voltage: float, torque: float) -> Callable[[jax.Array, object], jax.Array]:
+    def f(x: jax.Array, _: object) -> jax.Array:
         rates = [
             B1 * x[0] + K1 * x[1] + B2 * x[2] + voltage,
             -K1 * x[0] + B1 * x[1] + B2 * x[3],

@@ -1,7 +1,7 @@
 """The designs of each node, what they certify, and the smallest levels under several readings."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -68,7 +68,9 @@ def node_designs(node: int) -> NodeDesigns:
     )
 
 
-def certify(system: hg.GrowthSystem, design: hg.HInfinityDesign, growth: Any = ()) -> hg.HInfinityCertificate:
+def certify(
+    system: hg.GrowthSystem, design: hg.HInfinityDesign, growth: Sequence[hg.GrowthFinding] = ()
+) -> hg.HInfinityCertificate:
     """Check a design by Theorem 1."""
     return hg.certify_level(system, design.gains, design.weights, design.multipliers, design.level, growth)
 
@@ -115,6 +117,7 @@ def true_growth(findings: list[hg.GrowthFinding]) -> TrueGrowth:
     slopes = np.array([f.constant for f in allowed])
     largest = float(slopes.max())
     nominal = np.full(len(slopes), setting.GROWTH)
+    given: list[setting.Constant | tuple[setting.Constant, setting.Constant]]
     given = [largest, (setting.GROWTH, largest), (hg.OverTime(nominal), hg.OverTime(slopes))]
     levels, certified = np.zeros((3, len(setting.NODES), 2)), True
     for i, growth in enumerate(given):

@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -16,7 +15,7 @@ from heliograph.papers.h_infinity_fusion.statements import statements
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
 from heliograph.papers.runs import check_runs
 from heliograph.papers.statement import Statement
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
 
 
 def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
@@ -49,7 +48,7 @@ def results(found: Reproduction) -> Results:
     )
 
 
-def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
+def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Json]:
     """All numbers."""
     outcome = result.outcome
     decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
@@ -89,7 +88,7 @@ def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def node_numbers(node: NodeDesigns, level: float, result: Reproduction) -> dict[str, Any]:
+def node_numbers(node: NodeDesigns, level: float, result: Reproduction) -> dict[str, Json]:
     """Levels of a node, and the certificate of the recursive design at the paper's level."""
     smallest = {f"recursive_{name}": value for name, value in node.smallest.items()}
     return {
@@ -104,7 +103,7 @@ def node_numbers(node: NodeDesigns, level: float, result: Reproduction) -> dict[
     }
 
 
-def certificate(node: NodeDesigns) -> list[dict[str, Any]]:
+def certificate(node: NodeDesigns) -> list[dict[str, Json]]:
     """Everything that Theorem 1 needs at each step; states in the order (x, e)."""
     design = node.paper
     return [
@@ -120,7 +119,7 @@ def certificate(node: NodeDesigns) -> list[dict[str, Any]]:
     ]
 
 
-def fusion_numbers(result: Reproduction) -> dict[str, Any]:
+def fusion_numbers(result: Reproduction) -> dict[str, Json]:
     """Weights and levels of the fused estimate."""
     return {
         "weights": hg.level_weights(setting.LEVELS).tolist(),
@@ -131,9 +130,9 @@ def fusion_numbers(result: Reproduction) -> dict[str, Any]:
     }
 
 
-def error_numbers(result: Reproduction) -> dict[str, Any]:
+def error_numbers(result: Reproduction) -> dict[str, Json]:
     """Mean fused errors of the paper's filters by quantizer, and their differences on the same runs."""
-    numbers: dict[str, Any] = {}
+    numbers: dict[str, Json] = {}
     for name in (*QUANTIZERS, *MORE_QUANTIZERS):
         numbers[name], numbers[f"{name}_se"] = result.outcome.mean_error(RECURSIVE, name)
     for other in ("static", "static_p41"):
@@ -142,7 +141,7 @@ def error_numbers(result: Reproduction) -> dict[str, Any]:
     return numbers
 
 
-def context(outcome: Outcome, name: str) -> dict[str, Any]:
+def context(outcome: Outcome, name: str) -> dict[str, Json]:
     """Mean fused errors of another filter."""
     (mean, error), dynamic, static = (outcome.mean_error(name, q) for q in QUANTIZERS)
     return {
@@ -153,7 +152,7 @@ def context(outcome: Outcome, name: str) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def growth_numbers(result: Reproduction) -> dict[str, Any]:
+def growth_numbers(result: Reproduction) -> dict[str, Json]:
     """What was found about a = 0.7, and levels with constants that were not refuted."""
     found, true = result.growth, result.true_growth
     return {
@@ -168,7 +167,7 @@ def growth_numbers(result: Reproduction) -> dict[str, Any]:
     }
 
 
-def finding_numbers(finding: hg.GrowthFinding) -> dict[str, Any]:
+def finding_numbers(finding: hg.GrowthFinding) -> dict[str, Json]:
     """A finding as numbers."""
     values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in finding._asdict().items()}
     return {**values, "pair": [p.tolist() for p in finding.pair], "refuted": bool(finding.refuted)}
@@ -179,7 +178,7 @@ def found(worst: Worst) -> dict[str, float]:
     return {"found": worst.level, "found_se": worst.standard_error}
 
 
-def second_numbers(second: Discriminating) -> dict[str, Any]:
+def second_numbers(second: Discriminating) -> dict[str, Json]:
     """The second example: by filter, levels of each node and errors; by node, certificates."""
     return {
         "runs": second.runs,

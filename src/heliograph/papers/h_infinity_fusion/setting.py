@@ -1,7 +1,6 @@
 """Section IV's example as printed, but for v_s, which divides by zero there."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,10 +39,10 @@ CHANNEL_NOISES = np.array([0.1, 0.15, 0.2]) / np.sqrt(_S + 1)[:, None]  # rho_1,
 INITIAL_VARIANCE = float(np.mean((START - GUESSES) ** 2))  # for filters that need one; the paper has none
 
 
-def dynamics(s: float) -> Callable[[Any], jax.Array]:
+def dynamics(s: float | jax.Array) -> Callable[[jax.Array], jax.Array]:
     """f at step s."""
 
-    def f(x: Any) -> jax.Array:
+    def f(x: jax.Array) -> jax.Array:
         return jnp.stack([0.7 * x[0] * jnp.cos(0.1 * x[1]), 0.7 * x[1] * jnp.sin(s * x[0])])
 
     return f
@@ -58,11 +57,11 @@ def inputs() -> np.ndarray:
 def plant(disturbed: bool = True, variance: float = 0.0) -> hg.Plant:
     """x+ = f(x, s) + B v; not `disturbed`: what filters believe, v a white noise of this `variance` to them."""
 
-    def transition(x: Any, u: Any) -> jax.Array:
+    def transition(x: jax.Array, u: jax.Array) -> jax.Array:
         following = dynamics(u[1])(x) + (DISTURBANCE[:, 0] * u[0] if disturbed else 0.0)
         return jnp.where(u[2] > 0, following, x)
 
-    def noise(u: Any) -> jax.Array:
+    def noise(u: jax.Array) -> jax.Array:
         return jnp.asarray(u[2] * variance * (DISTURBANCE @ DISTURBANCE.T))
 
     spread = np.zeros((2, 2)) if disturbed else INITIAL_VARIANCE * np.eye(2)
@@ -79,25 +78,27 @@ def disturbed_sensor(node: int) -> hg.OverTime:
     return hg.over_time([sensor(node, hg.Gaussian(np.zeros((1, 1)), [FEEDTHROUGH[node] * v])) for v in DISTURBANCES])
 
 
-Hop = Callable[[int, Any], hg.AbstractRandomAffine]  # of a link 0, 1, 2 and its noise
+Noise = float | hg.Gaussian
+Constant = float | hg.OverTime  # of growth
+Hop = Callable[[int, Noise], hg.AbstractRandomAffine]  # of a link 0, 1, 2 and its noise
 
 
-def lossy(link: int, noise: Any) -> hg.AbstractRandomAffine:
+def lossy(link: int, noise: Noise) -> hg.AbstractRandomAffine:
     """sqrt(E) beta y + noise, as printed."""
     return hg.hop(hg.bernoulli(ARRIVAL[link]), noise, power=POWERS[link])
 
 
-def lossless(link: int, noise: Any) -> hg.AbstractRandomAffine:
+def lossless(link: int, noise: Noise) -> hg.AbstractRandomAffine:
     """The same without losses."""
     return hg.hop(1.0, noise, power=POWERS[link])
 
 
-def told(link: int, noise: Any) -> hg.AbstractRandomAffine:
+def told(link: int, noise: Noise) -> hg.AbstractRandomAffine:
     """The same, lost as often, and the receiver is told."""
     return hg.erasure(lossless(link, noise), ARRIVAL[link])
 
 
-def channel(noises: Sequence[Any], hop: Hop = lossy) -> hg.AbstractRandomAffine:
+def channel(noises: Sequence[Noise], hop: Hop = lossy) -> hg.AbstractRandomAffine:
     """(r, y_2): through the relay and directly, (3) to (5)."""
     links = [hop(link, noise) for link, noise in enumerate(noises)]
     return hg.with_direct_link(hg.amplify_and_forward(links[:2]), links[2])
@@ -120,7 +121,7 @@ def white_channel(hop: Hop = lossy) -> hg.AbstractRandomAffine:
     return channel([float(p) for p in powers], hop)
 
 
-def system(node: int, growth: Any = GROWTH, hop: Hop = lossy) -> hg.GrowthSystem:
+def system(node: int, growth: Constant | tuple[Constant, Constant] = GROWTH, hop: Hop = lossy) -> hg.GrowthSystem:
     """What the design of a node reads; `growth` as in `growth_system`."""
     return hg.growth_system(
         STEPS, DISTURBANCE, [[FEEDTHROUGH[node]]], WANTED, unit_channel(hop), growth, OUTPUT_GROWTH[node],

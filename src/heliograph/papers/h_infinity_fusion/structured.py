@@ -4,7 +4,7 @@ x+ = A x + phi(x) + B v with |eig A| = 0.97 and |phi(x) - phi(xhat)| <= 0.05 |x 
 so does what a filter is designed for.
 """
 
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -28,12 +28,12 @@ SCENARIOS = ("white", "bias", "resonant")
 BOX = 100.0  # half the side of the box over which phi is searched
 
 
-def slight(x: Any) -> jax.Array:
+def slight(x: jax.Array) -> jax.Array:
     """phi: its slope is GROWTH at zero and less elsewhere."""
     return jnp.stack([jnp.zeros_like(x[0]), 10 * GROWTH * jnp.sin(x[0] / 10)])
 
 
-def dynamics(x: Any, k: Any = 0) -> jax.Array:
+def dynamics(x: jax.Array, k: object = 0) -> jax.Array:
     """A x + phi(x)."""
     return jnp.asarray(ROTATION @ x + slight(x))
 
@@ -41,10 +41,10 @@ def dynamics(x: Any, k: Any = 0) -> jax.Array:
 def plant(disturbed: bool = True) -> hg.Plant:
     """The plant; not `disturbed`: what filters believe, v white of variance one."""
 
-    def transition(x: Any, u: Any) -> jax.Array:
+    def transition(x: jax.Array, u: jax.Array) -> jax.Array:
         return jnp.where(u[1] > 0, dynamics(x) + (DISTURBANCE[:, 0] * u[0] if disturbed else 0.0), x)
 
-    def noise(u: Any) -> jax.Array:
+    def noise(u: jax.Array) -> jax.Array:
         return jnp.asarray(u[1] * (u[2] if disturbed else 1.0) * (DISTURBANCE @ DISTURBANCE.T))
 
     return hg.Plant(transition, noise, np.zeros(2), np.eye(2) / WEIGHT, inputs=INPUTS)
@@ -77,7 +77,7 @@ def told(link: int) -> hg.AbstractRandomAffine:
     return hg.erasure(lossless(link), ARRIVAL[link])
 
 
-def channel(hop: Any = lossy) -> hg.AbstractRandomAffine:
+def channel(hop: Callable[[int], hg.AbstractRandomAffine] = lossy) -> hg.AbstractRandomAffine:
     """Through a relay and directly."""
     return hg.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
 
@@ -94,7 +94,13 @@ def world(node: str) -> World:
     """The same for a search for the worst disturbance."""
     matrix = np.array(OUTPUTS[node])
     return World(
-        dynamics, lambda x: matrix @ x, DISTURBANCE, np.zeros((1, 1)), WANTED, WEIGHT * np.eye(4), inputs("bias")
+        dynamics,
+        lambda x: jnp.asarray(matrix @ x),
+        DISTURBANCE,
+        np.zeros((1, 1)),
+        WANTED,
+        WEIGHT * np.eye(4),
+        inputs("bias"),
     )
 
 
@@ -103,7 +109,9 @@ def draws(count: int, seed: int) -> Draws:
     return relay_draws(ARRIVAL, NOISE_GAIN, (1.0, 1.0, 1.0), STEPS, count, seed)
 
 
-def relay_draws(arrival: Any, noise_gain: Any, powers: Any, steps: int, count: int, seed: int) -> Draws:
+def relay_draws(
+    arrival: Sequence[float], noise_gain: Sequence[float], powers: Sequence[float], steps: int, count: int, seed: int
+) -> Draws:
     """G and N of a scalar relay beside a direct link: sqrt(E1 E2) b1 b2 y + sqrt(E2) b2 n1 + n2, sqrt(E3) b3 y + n3."""
     first, second, direct = (np.random.default_rng(seed).random((count, steps, 3)) < arrival).astype(float).T
     first, second, direct = first.T, second.T, direct.T

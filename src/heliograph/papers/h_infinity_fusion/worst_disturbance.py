@@ -6,12 +6,14 @@ the power method. What is found is judged on new draws, so the search cannot fla
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 import heliograph as hg
 
@@ -25,8 +27,8 @@ class World(eqx.Module):
     Shapes: disturbance (n, v), feedthrough (y, v), wanted (z, n), weight (2n, 2n), inputs (time, inputs) of the filter.
     """
 
-    dynamics: Callable[[Any, Any], Any] = eqx.field(static=True)
-    measure: Callable[[Any], Any] = eqx.field(static=True)
+    dynamics: Callable[[jax.Array, jax.Array], jax.Array] = eqx.field(static=True)
+    measure: Callable[[jax.Array], jax.Array] = eqx.field(static=True)
     disturbance: np.ndarray
     feedthrough: np.ndarray
     wanted: np.ndarray
@@ -44,10 +46,10 @@ class Draws(NamedTuple):
 class Disturbance(NamedTuple):
     """x_0, e_0 (n,), v (time, v), rho (time, r)."""
 
-    state: Any
-    error: Any
-    plant: Any
-    channel: Any
+    state: jax.Array | np.ndarray
+    error: jax.Array | np.ndarray
+    plant: jax.Array | np.ndarray
+    channel: jax.Array | np.ndarray
 
 
 class Worst(NamedTuple):
@@ -63,7 +65,7 @@ def worst_disturbance(
     world: World,
     draws: Draws,
     new_draws: Draws,
-    energies: Any,
+    energies: ArrayLike,
     seed: int = 0,
     starts: int = 4,
     rounds: int = 60,
@@ -85,7 +87,7 @@ def worst_disturbance(
 
 @eqx.filter_jit
 def _climb(
-    filter: hg.AbstractFilter, world: World, draws: Draws, points: Disturbance, energies: Any, rounds: int
+    filter: hg.AbstractFilter, world: World, draws: Draws, points: Disturbance, energies: np.ndarray, rounds: int
 ) -> tuple[Disturbance, jax.Array]:
     """Points of each energy and the ratios reached."""
 
@@ -93,7 +95,7 @@ def _climb(
         return jnp.mean(_output_energy(filter, world, draws, w))
 
     def one(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
-        def improve(w: Disturbance, _: Any) -> tuple[Disturbance, jax.Array]:
+        def improve(w: Disturbance, _: None) -> tuple[Disturbance, jax.Array]:
             uphill = _scaled(world, _raised(world, jax.grad(gained)(w)), energy)
             tries = jax.vmap(lambda t: _scaled(world, _between(w, uphill, t), energy))(jnp.append(0.0, SHARES))
             values = jax.lax.map(gained, tries)
@@ -107,7 +109,7 @@ def _climb(
     return result
 
 
-def _between(a: Disturbance, b: Disturbance, share: Any) -> Disturbance:
+def _between(a: Disturbance, b: Disturbance, share: jax.Array) -> Disturbance:
     return Disturbance(*((1 - share) * p + share * q for p, q in zip(a, b, strict=True)))
 
 
@@ -120,7 +122,7 @@ def _energy(world: World, w: Disturbance) -> jax.Array:
     return jnp.sum(w.plant**2) + jnp.sum(w.channel**2) + start @ world.weight @ start
 
 
-def _scaled(world: World, w: Disturbance, energy: Any) -> Disturbance:
+def _scaled(world: World, w: Disturbance, energy: jax.Array) -> Disturbance:
     factor = jnp.sqrt(energy / _energy(world, w))
     return Disturbance(*(factor * part for part in w))
 
@@ -135,8 +137,8 @@ def _raised(world: World, gradient: Disturbance) -> Disturbance:
 def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
     """sum |M e|^2 for each draw, (draw,)."""
 
-    def one(gains: Any, noises: Any) -> jax.Array:
-        def step(carry: Any, item: Any) -> tuple[Any, jax.Array]:
+    def one(gains: jax.Array, noises: jax.Array) -> jax.Array:
+        def step(carry: PyTree, item: PyTree) -> tuple[PyTree, jax.Array]:
             x, state = carry
             k, u, v, rho, gain, noise = item
             z = gain @ (world.measure(x) + world.feedthrough @ v) + noise @ rho
@@ -148,5 +150,5 @@ def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Dis
         items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
         return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
 
-    result: jax.Array = jax.vmap(one)(*draws)
+    result: jax.Array = jax.vmap(one)(jnp.asarray(draws.gain), jnp.asarray(draws.noise))
     return result

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.mixture import mixture_filter
@@ -124,17 +124,17 @@ class StatisticsAndRun(AbstractReducer):
 
     statistics: Statistics
 
-    def initial(self, shapes: Any) -> Any:
+    def initial(self, shapes: PyTree) -> PyTree:
         """Zero sums, and room for one run."""
         return self.statistics.initial(shapes), jax.tree.map(lambda s: jnp.zeros(s.shape[1:], s.dtype), shapes)
 
-    def reduce(self, carry: Any, batch: Any, runs: jax.Array, valid: jax.Array) -> tuple[Any, Any]:
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
         """Add the block, and keep run 0 when it is in it."""
         sums, kept = self.statistics.reduce(carry[0], batch, runs, valid)
         shown = jax.tree.map(lambda new, old: jnp.where(runs[0] == 0, new[0], old), batch, carry[1])
         return (sums, shown), kept
 
-    def finish(self, carry: Any, collected: Any, network: Network) -> tuple[dict[str, ErrorStatistics], Record]:
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> tuple[dict[str, ErrorStatistics], Record]:
         """Statistics of the one node by filter, and the run as a record."""
         found = self.statistics.finish(carry[0], collected, network)[NODE]
         time = np.arange(1, carry[1]["truth"].shape[0] + 1, dtype=np.float64)

@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -19,7 +18,7 @@ from heliograph.papers.quadratic_bias.compute import (
 )
 from heliograph.papers.quadratic_bias.statements import statements
 from heliograph.papers.runs import check_runs
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
 
 STAGES = 5
 
@@ -48,7 +47,7 @@ def results(found: Reproduction) -> Results:
     )
 
 
-def summary(result: Reproduction) -> dict[str, Any]:
+def summary(result: Reproduction) -> dict[str, Json]:
     """All numbers: the example's at the top, our scenario's under `outage`."""
     return {
         "paper": "Quadratic filtering with dynamical bias under amplify-and-forward relays",
@@ -62,7 +61,7 @@ def summary(result: Reproduction) -> dict[str, Any]:
     }
 
 
-def numbers(outcome: Outcome) -> dict[str, Any]:
+def numbers(outcome: Outcome) -> dict[str, Json]:
     """Designed covariances over t = 0 ... horizon, their means and gains, and what the simulation found."""
     states, designs = outcome.model.states, outcome.designs
     simulated = {}
@@ -89,7 +88,7 @@ def numbers(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def named(states: tuple[str, ...], values: np.ndarray, suffix: str = "") -> dict[str, Any]:
+def named(states: tuple[str, ...], values: np.ndarray, suffix: str = "") -> dict[str, Json]:
     """Values by state."""
     return {f"{state}{suffix}": value.tolist() for state, value in zip(states, np.asarray(values), strict=True)}
 

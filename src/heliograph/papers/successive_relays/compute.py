@@ -1,7 +1,7 @@
 """Every number of the reproduction: designs, steady states, certificates, misprints and the simulation."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +9,7 @@ import heliograph as hg
 from heliograph.papers.successive_relays import setting
 from heliograph.papers.successive_relays.certificate import RelayCertificate, certify_relays
 from heliograph.papers.successive_relays.printed import MISPRINTS, by_filter, recursion
+from heliograph.relays.design import GainsByFilter
 
 RUNS = 20_000
 STEADY = 1500  # steps after which a recursion is taken as settled: the plant forgets by 0.98 a step
@@ -108,7 +109,7 @@ def _own(design: hg.RelayDesign) -> Steady:
     return Steady(float(even), float(odd), design.total_power())
 
 
-def _behind(network: hg.RelayNetwork, gains: Any) -> Steady:
+def _behind(network: hg.RelayNetwork, gains: GainsByFilter) -> Steady:
     odd, even = np.trace(hg.periodic_behind_relays(network, gains), axis1=1, axis2=2)
     silent = {name: gains[name] for name in network.relays} | {"receiver": np.zeros((2, 3, 1))}
     return Steady(float(even), float(odd), hg.periodic_given_design(network, silent).total_power())

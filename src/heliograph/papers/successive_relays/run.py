@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from heliograph.files.recording import write_estimates
 from heliograph.papers.runs import check_runs
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
 from heliograph.papers.successive_relays.statements import statements, tuned_mean_ratio
-from heliograph.report.results import Results, write_results
+from heliograph.report.results import Json, Results, write_results
 
 STAGES = 4
 NAMES = {"relay_1": "relay_1", "relay_2": "relay_2", "receiver": "remote"}
@@ -40,7 +39,7 @@ def results(found: Reproduction) -> Results:
     return Results(drawings(found), partial(page, found), summary(found), partial(write_record, found))
 
 
-def summary(result: Reproduction) -> dict[str, Any]:
+def summary(result: Reproduction) -> dict[str, Json]:
     """The numbers by design and filter; traces at k = 0 .. 100."""
     simulated = result.simulated
     return {
