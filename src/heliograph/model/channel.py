@@ -9,7 +9,7 @@ from heliograph.model.over_time import OverTime, over_time, unstack
 from heliograph.model.sensor import AbstractSensor, check_sensor
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.random_affine.atoms import GainAndNoise, known
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant
@@ -117,10 +117,11 @@ def mean_gain(channel: Channel) -> Channel:
     """The channel that most people would design for: every gain taken as its mean, with the noise as it is.
 
     Raises:
-        ValueError: a gain law that does not know its mean.
+        ValueError: a gain law that does not know its mean, a channel that remembers.
     """
     if isinstance(channel, OverTime):
-        return over_time([c.mean_gain() for c in unstack(channel)])
+        return over_time([mean_gain(c) for c in unstack(channel)])
+    check_forgets("channel taken at its mean gain", channel)
     return channel.mean_gain()
 
 

@@ -5,7 +5,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import PyTree
 
+from heliograph.numerics.check import fail
 from heliograph.random_affine.monomials import exponents, monomials
 
 
@@ -36,10 +38,14 @@ class Moments(eqx.Module):
 
 
 class AbstractRandomAffine(eqx.Module):
-    """A random affine map z = G y + n, drawn anew and independently at each step.
+    """A random affine map z = G y + n, one at each step.
 
     Laws: `sample` and `moments` describe one distribution (heliograph.testing.check_random_affine compares them);
-    (G, n) are independent of y and over time, but not of each other: a shared hop makes them dependent.
+    (G, n) are independent of y, but not of each other: a shared hop makes them dependent.
+
+    A map that forgets is drawn independently at each step: it defines `sample`. A map that remembers has a state, of
+    which the next draw depends: it defines `init` and `draw`, and says so by `remembers`. A map that holds others
+    remembers where one of them does, and then must pass their states on.
     """
 
     @property
@@ -59,27 +65,43 @@ class AbstractRandomAffine(eqx.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether what is drawn depends on what was drawn before: then it has a state."""
-        return False
+        """Whether what is drawn depends on what was drawn before; unless told, whether a map held inside does."""
+        return any(part.remembers for part in _held(self))
 
-    def init(self, key: jax.Array) -> Any:
-        """State before the first draw; a map that forgets has none."""
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State before the first draw; () where the map forgets."""
+        if self.remembers:
+            raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
-    def draw(self, state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        """Next state and H of shape (outputs + 1, inputs + 1)."""
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+        if self.remembers:
+            raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
+        if type(self).sample is AbstractRandomAffine.sample:
+            raise NotImplementedError(f"{type(self).__name__}: neither sample nor draw")
         return state, self.sample(key)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw H of shape (outputs + 1, inputs + 1)."""
-        raise NotImplementedError
-
-    def moments(self, order: int) -> Moments:
-        """Return the nominal E[Sym^order(H)].
+        """Draw H of shape (outputs + 1, inputs + 1).
 
         Raises:
-            ValueError: the matrix would need more than the stated memory.
+            ValueError: the map remembers, so that there is no draw without its state.
         """
+        if self.remembers:
+            raise fail(
+                f"sample of {type(self).__name__}", "a map that forgets", "one that remembers; use init and draw"
+            )
+        return self.draw((), key)[1]
+
+    def moments(self, order: int) -> Moments:
+        """Return the nominal E[Sym^order(H)] of a map that forgets.
+
+        Raises:
+            ValueError: the matrix would need more than the stated memory, or the map remembers: then the moments of one
+                step say nothing of the next.
+        """
+        check_forgets("moments of a map", self)
         raise NotImplementedError
 
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
@@ -97,6 +119,21 @@ class AbstractRandomAffine(eqx.Module):
     def example_input(self, generator: np.random.Generator) -> np.ndarray:
         """A point at which moments can be compared with samples (a lifted map takes only lifted points)."""
         return generator.normal(size=self.inputs)
+
+
+def _held(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """The maps in a map's fields, at any depth of lists, dictionaries and other modules, but not those inside them."""
+
+    def is_map(item: object) -> bool:
+        return isinstance(item, AbstractRandomAffine)
+
+    return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
+
+
+def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
+    """Raise ValueError where a map remembers, for what knows only laws that are independent over time."""
+    if channel.remembers:
+        raise fail(name, "one that forgets", f"{type(channel).__name__}, which remembers")
 
 
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:

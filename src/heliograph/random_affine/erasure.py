@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import PyTree
 
 from heliograph.numerics.check import fail, scalar
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
@@ -33,12 +34,16 @@ class Erasure(AbstractRandomAffine):
         """It does."""
         return True
 
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw whether it arrives, and the map."""
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map."""
+        return self.base.init(key)
+
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw whether it arrives, and the map, whose state moves in any case."""
         arrives, drawn = jax.random.split(key)
-        h = self.base.sample(drawn)
+        state, h = self.base.draw(state, drawn)
         lost = ~jax.random.bernoulli(arrives, self.arrival)
-        return h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
+        return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
     def moments(self, order: int) -> Moments:
         """There are none: a filter skips what was lost, and asks for the moments of what arrives.

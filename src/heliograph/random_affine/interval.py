@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Lift, Series, Stack
 from heliograph.random_affine.law import Constant, Discrete
 from heliograph.random_affine.monomials import count, exponents, position, product_table
@@ -23,6 +23,7 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     Raises:
         ValueError: more corners than can be listed, in a map that is not a series or a stack.
     """
+    check_forgets("channel of a bound", channel)
     corners = _corner_count(channel)
     if corners is not None and corners <= CORNERS:
         matrices = np.array([extreme.moments(order).matrix for extreme in channel.extremes()])

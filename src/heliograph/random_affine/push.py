@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Mixture, Series
 from heliograph.random_affine.monomials import Exponents, count, exponents, position, product_table, symmetric_power
 from heliograph.random_affine.noise import AbstractNoise
@@ -111,6 +111,7 @@ def second_moments(moments: np.ndarray, variables: int, degree: int) -> np.ndarr
 
 
 def _checked(channel: AbstractRandomAffine, order: int, moments: np.ndarray) -> np.ndarray:
+    check_forgets("channel of a lift", channel)
     expected = count(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):
         raise fail(f"moments of order {order}", f"shape ({expected},)", f"shape {np.shape(moments)}")

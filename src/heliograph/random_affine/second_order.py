@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.small_matrix import add, contract, diagonal
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, check_forgets
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.monomials import exponents
@@ -66,8 +66,9 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     multilinear (or convex) functions of the probabilities have their maxima.
 
     Raises:
-        ValueError: more corner laws than can be listed in a channel that is no series or stack.
+        ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """
+    check_forgets("channel of a filter", channel)
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     if _is_known(channel):
