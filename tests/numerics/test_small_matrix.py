@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from heliograph import linalg, small_matrix
+from heliograph.numerics import linalg, small_matrix
 from heliograph.numerics.small_matrix import UNROLL_LIMIT, runs_last
 
 RUNS, NODES = 5, 3
