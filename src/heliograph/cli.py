@@ -112,15 +112,15 @@ def reproduce(
         print("\n".join(METHODS))
         return
     from heliograph.files.table import check_output_folder
-    from heliograph.numerics.check import fail
+    from heliograph.numerics.check import check_count, fail
 
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":
         raise fail("method", f"one of {', '.join(METHODS)} or all", repr(method))
     if out is None:
         raise fail("reproduce", "a folder for the results (--out DIR)", "none")
-    if runs is not None and runs < 1:
-        raise fail("--runs", "a positive whole number", runs)
+    if runs is not None:
+        check_count("--runs", runs)
     check_output_folder(out)
     for name in chosen:
         import_module(METHODS[name]).reproduce(out, runs, seed)

@@ -74,7 +74,7 @@ class LinearFilter(AbstractFilter):
             channel,
             present := ~jnp.isnan(z),
         )
-        expected = channel.gain @ (c @ prior.mean + noise.mean) + channel.offset
+        expected = channel.mean_gain @ (c @ prior.mean + noise.mean) + channel.offset
         mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
         after = jnp.where(jnp.any(present), bound, prior.covariance)
         return LinearBelief(mean, after, *own), Estimate(mean, after, self.claim)

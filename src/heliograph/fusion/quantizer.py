@@ -238,8 +238,7 @@ def _midpoint(segment: jax.Array, amplitude: Any, levels: Any) -> jax.Array:
 
 
 def _levels(value: Any) -> np.ndarray:
-    if check_count("levels", value) < 2:
-        raise fail("levels", "at least 2", value)
+    check_count("levels", value, 2)
     return np.asarray(value, dtype=np.float64)
 
 

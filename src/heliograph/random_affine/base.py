@@ -1,13 +1,14 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import array, fail
 from heliograph.random_affine.monomials import exponents, monomials
 
 
@@ -20,19 +21,19 @@ class Moments(eqx.Module):
     Shapes: matrix (C(outputs + k, k), C(inputs + k, k)).
     """
 
-    matrix: np.ndarray
+    matrix: Float[jax.Array | np.ndarray, "rows columns"]
     outputs: int = eqx.field(static=True)
     inputs: int = eqx.field(static=True)
     order: int = eqx.field(static=True)
 
     @property
-    def mean(self) -> np.ndarray:
+    def mean(self) -> Float[jax.Array | np.ndarray, "outputs+1 inputs+1"]:
         """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
         rows = [i for i, powers in enumerate(exponents(self.outputs + 1, self.order)) if powers[-1] >= self.order - 1]
         columns = [i for i, powers in enumerate(exponents(self.inputs + 1, self.order)) if powers[-1] >= self.order - 1]
         return self.matrix[np.ix_(rows, columns)]
 
-    def expect(self, y_moments: Any) -> Any:
+    def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
         """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
         return self.matrix @ y_moments
 
@@ -130,6 +131,17 @@ def _held(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
 
 
+def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
+    """At least one random affine map."""
+    result = tuple(maps)
+    if not result:
+        raise fail(name, "at least one map", "none")
+    for item in result:
+        if not isinstance(item, AbstractRandomAffine):
+            raise fail(name, "random affine maps (hops, and maps made of them)", f"{item!r:.60}")
+    return result
+
+
 def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
     """Raise ValueError where a map remembers, for what knows only laws that are independent over time."""
     if channel.remembers:
@@ -141,7 +153,8 @@ def apply(h: jax.Array, y: jax.Array) -> jax.Array:
     return h[:-1, :-1] @ y + h[:-1, -1]
 
 
-def conditional_moments(channel: AbstractRandomAffine, y: np.ndarray, order: int) -> np.ndarray:
+def conditional_moments(
+    channel: AbstractRandomAffine, y: Float[ArrayLike, " inputs"], order: int
+) -> Float[jax.Array | np.ndarray, " rows"]:
     """E[mono_order(z) | y] for a given point y."""
-    result: np.ndarray = channel.moments(order).expect(monomials(np.asarray(y, dtype=np.float64), order))
-    return result
+    return channel.moments(order).expect(monomials(array("point y", y, (channel.inputs,)), order))

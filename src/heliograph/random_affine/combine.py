@@ -4,17 +4,18 @@ from collections.abc import Sequence
 from functools import reduce
 from itertools import product
 from math import prod
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
 from heliograph.random_affine.monomials import (
     count,
@@ -22,10 +23,11 @@ from heliograph.random_affine.monomials import (
     monomials,
     multiply,
     position,
+    product_table,
     refuse_if_too_large,
     symmetric_power,
 )
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noise import Gaussian, Matrix, Vector
 
 
 class _Parts(AbstractRandomAffine):
@@ -58,9 +60,7 @@ class Series(_Parts):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = tuple(maps)
-        if not self.maps:
-            raise fail("series", "at least one map", "none")
+        self.maps = as_maps("series", maps)
         for first, second in zip(self.maps, self.maps[1:], strict=False):
             if first.outputs != second.inputs:
                 raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
@@ -114,8 +114,8 @@ class Mixture(_Parts):
     maps: tuple[AbstractRandomAffine, ...]
     choice: Discrete
 
-    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: Any, radius: Any = 0.0):
-        self.maps = tuple(maps)
+    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: ArrayLike, radius: ArrayLike = 0.0):
+        self.maps = as_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
             raise fail("mixture", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
@@ -140,7 +140,8 @@ class Mixture(_Parts):
         """sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
-        return Moments(np.tensordot(self.choice.probabilities, parts, axes=1), self.outputs, self.inputs, order)
+        matrix = library(parts, self.choice.probabilities).tensordot(self.choice.probabilities, stacked(parts), axes=1)
+        return Moments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Extreme weights combined with the extremes of each map."""
@@ -159,14 +160,10 @@ class Mixture(_Parts):
         """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
         moments = self.moments(2)
         mean = moments.mean
-        n, last = self.outputs, count(self.inputs + 1, 2) - 1
-        second = np.zeros((n, n))
-        for powers, row in position(n + 1, 2).items():
-            used = [i for i in range(n) for _ in range(powers[i])]
-            if len(used) == 2:
-                second[used[0], used[1]] = second[used[1], used[0]] = moments.matrix[row, last]
+        second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
-        return GainAndNoise(Constant(1.0), mean[:-1, :-1], Gaussian(second - np.outer(offset, offset), offset))
+        noise = Gaussian(second - offset[:, None] * offset, offset)
+        return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)
 
 
 class Stack(_Parts):
@@ -175,9 +172,9 @@ class Stack(_Parts):
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = tuple(maps)
+        self.maps = as_maps("stack", maps)
         if len({m.inputs for m in self.maps}) != 1:
-            raise fail("stack", "at least one map, all of one number of inputs", [m.inputs for m in self.maps])
+            raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])
 
     @property
     def outputs(self) -> int:
@@ -201,11 +198,12 @@ class Stack(_Parts):
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
         tables = [[m.moments(k).matrix if k else None for k in range(order + 1)] for m in self.maps]
         rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
-        return Moments(np.array(rows), self.outputs, self.inputs, order)
+        return Moments(stacked(rows), self.outputs, self.inputs, order)
 
-    def _row(self, powers: tuple[int, ...], tables: list[list[np.ndarray | None]]) -> np.ndarray:
+    def _row(self, powers: tuple[int, ...], tables: list[list[Matrix | None]]) -> Vector:
         variables, start = self.inputs + 1, 0
-        result, degree = np.ones(1), 0
+        result: Vector = np.ones(1)
+        degree = 0
         for m, table in zip(self.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
             start += m.outputs
@@ -216,7 +214,8 @@ class Stack(_Parts):
                 result, degree = multiply(result, degree, polynomial, k, variables), degree + k
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)
-        return multiply(result, degree, constant, powers[-1], variables)
+        result = multiply(result, degree, constant, powers[-1], variables)
+        return result
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """All combinations of the parts' extremes."""
@@ -242,8 +241,7 @@ class Lift(AbstractRandomAffine):
     degree: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
-        if degree < 1:
-            raise fail("lift", "a degree of at least 1", degree)
+        check_count("degree of the lift", degree)
         if base.erases:
             raise fail("lift", "a channel without erasures", "one that erases")
         self.base, self.degree = base, degree

@@ -77,7 +77,7 @@ def _(channel: GainAndNoise) -> DisturbedGain:
     root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
     scaled = np.concatenate([np.asarray(channel.matrix), np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(np.asarray(channel.matrix)), root], axis=1)
-    first, second = channel.gain.moment(1), channel.gain.moment(2)
+    first, second = float(channel.law.moment(1)), float(channel.law.moment(2))
     outer = np.multiply.outer
     cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
     return DisturbedGain(

@@ -1,23 +1,24 @@
 """A loss that the receiver knows of."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
-from jaxtyping import PyTree
+import numpy as np
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail, scalar
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
 
 
 class Erasure(AbstractRandomAffine):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine
-    arrival: Any
+    arrival: Float[jax.Array | np.ndarray, ""]
 
-    def __init__(self, base: AbstractRandomAffine, arrival: Any):
-        self.base, self.arrival = base, scalar("arrival probability", arrival, 0.0, 1.0)
+    def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
+        (self.base,) = as_maps("erasure", [base])
+        self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
 
     @property
     def outputs(self) -> int:

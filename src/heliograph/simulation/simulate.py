@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.over_time import at
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, check_times, fail
 from heliograph.numerics.float64 import compiled, to_numpy
 from heliograph.random_affine.base import apply
 from heliograph.simulation.lanes import BLOCK, Lanes
@@ -99,12 +99,7 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
     }
     network.check_horizon(steps)
     u = _check_inputs(network, inputs, steps)
-    clock = np.arange(steps, dtype=np.float64) if time is None else array("time", time, (steps,))
-    if np.any(np.diff(clock) < 0):
-        row = int(np.flatnonzero(np.diff(clock) < 0)[0]) + 1
-        raise fail(
-            "time", "times that do not go backwards", f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
-        )
+    clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     found = _run_filters(network, z, u)
     return trajectories_record(network, {"truth": None, "measurements": z, **found}, clock)
 

@@ -15,7 +15,7 @@ from heliograph.linear.schedule import Schedule
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import OverTime, alike, at, over_time
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import to_numpy
 from heliograph.random_affine.base import apply
 from heliograph.simulation.lanes import BLOCK
@@ -71,8 +71,7 @@ def simulate_relays(
         ValueError: relays without a schedule, schedules that are too short or of the wrong shape, counts below one.
     """
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
-        if int(count) != count or count < 1:
-            raise fail(name, "a positive whole number", count)
+        check_count(name, count)
     world = _world(network, relays, receivers, horizon)
     reducer = Trajectories() if keep is None else keep
     base = jax.random.key(key) if isinstance(key, int | np.integer) else key
@@ -99,8 +98,7 @@ def initial_states(network: RelayNetwork, runs: int, key: int | jax.Array) -> np
     Raises:
         ValueError: counts below one.
     """
-    if int(runs) != runs or runs < 1:
-        raise fail("runs", "a positive whole number", runs)
+    check_count("runs", runs)
     base = jax.random.key(key) if isinstance(key, int | np.integer) else key
     with jax.enable_x64(True):
         draw = jax.jit(jax.vmap(lambda run: _initial(network, jax.random.fold_in(base, run))))

@@ -12,7 +12,7 @@ import heliograph as hg
 from heliograph.examples.motor_drive.drive import Drive, simulate_drive
 from heliograph.examples.motor_drive.listeners import network, received
 from heliograph.examples.motor_drive.machine import RATED, ROTOR_RESISTANCE, Machine, draw_truth, euler, plant
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import compiled
 
 SEEDS = 20
@@ -151,8 +151,7 @@ def compute(seeds: int = SEEDS, advance: Callable[[str], None] = lambda what: No
         ValueError: fewer than 2 seeds.
         ModuleNotFoundError: the extra `motor` is not installed.
     """
-    if check_count("seeds", seeds) < 2:
-        raise fail("seeds", "at least 2", seeds)
+    check_count("seeds", seeds, 2)
     scores: dict[str, dict[str, dict[str, Score]]] = {}
     shown: dict[str, dict[str, np.ndarray]] = {}
     failures = []

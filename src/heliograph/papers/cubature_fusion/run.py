@@ -12,7 +12,7 @@ import rich.progress
 
 import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count
 from heliograph.papers.claim import Claim
 from heliograph.papers.cubature_fusion.claims import claims
 from heliograph.papers.cubature_fusion.compute import RUNS, Outcome, Reproduction, Tell, reproduction
@@ -38,9 +38,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     import matplotlib  # noqa: F401
     import xarray  # noqa: F401
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < FEWEST:
-        raise fail("runs", f"a whole number of at least {FEWEST}", count)
+    count = check_count("runs", RUNS if runs is None else runs, FEWEST)
     target = Path(out) / FOLDER
     check_replaceable(target, SUMMARY)
     with progress() as tell, whole_folder(target) as folder:

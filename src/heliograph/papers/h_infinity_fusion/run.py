@@ -8,7 +8,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count
 from heliograph.papers.claim import Claim
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.claims import claims
@@ -41,9 +41,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     import matplotlib  # noqa: F401
     import xarray  # noqa: F401
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
+    count = check_count("runs", RUNS if runs is None else runs, 100)
     target = Path(out) / FOLDER
     check_replaceable(target, SUMMARY)
     with progress(STAGES) as advance, whole_folder(target) as folder:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count
 from heliograph.papers.quadratic_bias.claims import claims
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
@@ -43,9 +43,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     from heliograph.papers.quadratic_bias.page import drawings, page
     from heliograph.report.figures import png, svg
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
+    count = check_count("runs", RUNS if runs is None else runs, 100)
     target = Path(out) / FOLDER
     check_replaceable(target, SUMMARY)
     with progress(STAGES) as advance, whole_folder(target) as folder:

@@ -9,7 +9,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.files.output_folder import check_replaceable, whole_folder
 from heliograph.files.recording import write_estimates
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count
 from heliograph.papers.successive_relays.claims import claims, tuned_mean_ratio
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
 from heliograph.report.progress import progress
@@ -36,9 +36,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
     from heliograph.papers.successive_relays.page import drawings, page
     from heliograph.report.figures import png, svg
 
-    count = RUNS if runs is None else runs
-    if int(count) != count or count < 100:
-        raise fail("runs", "a whole number of at least 100", count)
+    count = check_count("runs", RUNS if runs is None else runs, 100)
     target = Path(out) / FOLDER
     check_replaceable(target, SUMMARY)
     with progress(STAGES) as advance, whole_folder(target) as folder:
