@@ -84,6 +84,7 @@ def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike
         ValueError: an arrival probability outside [0, 1].
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
+    (channel,) = as_maps("dropout", [channel])
     return Mixture([channel, silent(channel.outputs, channel.inputs)], library(p).stack([p, 1 - p]), radius)
 
 

@@ -19,6 +19,11 @@ def fail(name: str, expected: str, got: object) -> ValueError:
     return ValueError(f"{name}: expected {expected}, got {got}")
 
 
+def shown(value: object) -> str:
+    """Anything as a short part of one line."""
+    return " ".join(repr(value).split())[:60]
+
+
 def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: bool = False) -> Any:
     """Return `value` as a float64 array of the given shape (None: any length); a traced one keeps its precision.
 
@@ -48,7 +53,7 @@ def _numbers(name: str, value: ArrayLike) -> Any:
             raise ValueError
         known = None if is_traced(value) else result.astype(np.float64 if result.dtype.kind != "c" else complex)
     except (TypeError, ValueError):
-        raise fail(name, "an array of numbers", repr(value)[:60]) from None
+        raise fail(name, "an array of numbers", shown(value)) from None
     if np.issubdtype(result.dtype, np.complexfloating):
         raise fail(name, "real numbers", "complex ones")
     if known is not None:

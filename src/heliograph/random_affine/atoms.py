@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.law import AbstractLaw, Constant
@@ -30,7 +30,7 @@ class GainAndNoise(AbstractRandomAffine):
 
     def __init__(self, law: AbstractLaw, matrix: ArrayLike, noise: AbstractNoise | ArrayLike):
         if not isinstance(law, AbstractLaw):
-            raise fail("gain of a hop", "a law (Constant for a number)", f"{law!r:.60}")
+            raise fail("gain of a hop", "a law (Constant for a number)", shown(law))
         self.law = law
         self.matrix = array("gain matrix", matrix, (None, None))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, shown
 from heliograph.random_affine.monomials import exponents, monomials
 
 
@@ -138,7 +138,7 @@ def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRa
         raise fail(name, "at least one map", "none")
     for item in result:
         if not isinstance(item, AbstractRandomAffine):
-            raise fail(name, "random affine maps (hops, and maps made of them)", f"{item!r:.60}")
+            raise fail(name, "random affine maps (hops, and maps made of them)", shown(item))
     return result
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, covariance, fail, probabilities
+from heliograph.numerics.check import array, covariance, fail, probabilities, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.random_affine.monomials import Exponents, exponents
@@ -123,6 +123,9 @@ class Independent(AbstractNoise):
         self.parts = tuple(parts)
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
+        for part in self.parts:
+            if not isinstance(part, AbstractNoise):
+                raise fail("independent noises", "laws of a noise vector", shown(part))
         means, blocks = [part.mean for part in self.parts], [part.covariance for part in self.parts]
         self.mean = library(means).concatenate(means)
         self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
