@@ -137,6 +137,33 @@ NUMBERS = [
     (lambda: h.Scalars(0.0, 1.0), "scalars of the bound", "(0.0, 1.0)"),
 ]
 
+KINDS = [
+    (lambda: h.hop(1.0, 0.1, dimension=0), "dimension of a hop", "0"),
+    (lambda: h.hop(1.0, 0.1, dimension=2.0), "dimension of a hop", "2.0"),
+    (lambda: h.hop(1.0, 0.1, dimension=True), "dimension of a hop", "True"),
+    (lambda: h.hop(1.0, [0.1, 0.1]), "hop noise", "shape (2,)"),
+    (lambda: h.hop(1.0, h.Discrete([1.0, 2.0], [0.5, 0.5])), "hop noise", "Discrete"),
+    (lambda: h.hop(h.perfect(), 0.1), "constant gain", "GainAndNoise"),
+    (lambda: h.GainAndNoise(3, EYE, 0.1), "gain of a hop", "3"),
+    (lambda: h.amplify_and_forward([3]), "series", "3"),
+    (lambda: h.with_direct_link(3, h.perfect()), "stack", "3"),
+    (lambda: h.parallel([3]), "parallel channels", "3"),
+    (lambda: h.dropout(3, 0.5), "dropout", "3"),
+    (lambda: h.erasure(3, 0.5), "erasure", "3"),
+    (lambda: h.perfect(2.0), "dimension", "2.0"),
+    (lambda: h.silent(0), "outputs of a silent channel", "0"),
+    (lambda: h.Lift(h.perfect(), 2.0), "degree of the lift", "2.0"),
+    (lambda: h.Independent([3]), "independent noises", "3"),
+    (lambda: h.LinearPlant(EYE * 1j, EYE, [0, 0], EYE), "plant matrix", "complex"),
+    (lambda: h.LinearPlant(EYE, EYE * 1j, [0, 0], EYE), "process noise", "complex"),
+    (lambda: h.LinearPlant(EYE, "1", [0, 0], EYE), "process noise", "'1'"),
+    (lambda: h.LinearPlant(EYE, EYE, [0, 0], EYE, states="ab"), "state names", "'ab'"),
+    (lambda: h.LinearSensor(EYE, 0.1, outputs="ab"), "sensor outputs", "'ab'"),
+    (lambda: h.monte_carlo(network(), 5.0, 1, 0), "horizon", "5.0"),
+    (lambda: h.monte_carlo(network(), 5, 10.0, 0), "runs", "10.0"),
+    (lambda: h.monte_carlo(network(), 5, True, 0), "runs", "True"),
+]
+
 MISSING = [
     (lambda: h.Network(plant(), {}), "network", "none"),
     (lambda: h.amplify_and_forward([]), "series", "none"),
@@ -164,7 +191,9 @@ RUNS = [
 ]
 
 
-@pytest.mark.parametrize(("make", "name", "came"), [*SHAPES, *PROBABILITIES, *COVARIANCES, *NUMBERS, *MISSING, *RUNS])
+@pytest.mark.parametrize(
+    ("make", "name", "came"), [*SHAPES, *PROBABILITIES, *COVARIANCES, *NUMBERS, *KINDS, *MISSING, *RUNS]
+)
 def test_one_line_that_names_it(make, name, came):
     with pytest.raises(ValueError) as caught:
         make()

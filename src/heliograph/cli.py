@@ -133,12 +133,14 @@ def reproduce(
     if method is None:
         print("\n".join(METHODS))
         return
+    from heliograph.numerics.check import check_count
+
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":
         raise fail("method", f"one of {', '.join(METHODS)} or all", repr(method))
     target = _folder("reproduce", out)
-    if runs is not None and runs < 1:
-        raise fail("--runs", "a positive whole number", runs)
+    if runs is not None:
+        check_count("--runs", runs)
     for name in chosen:
         import_module(METHODS[name]).reproduce(target, runs, seed)
 

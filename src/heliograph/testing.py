@@ -26,24 +26,46 @@ def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: i
     """Compare a channel's samples with its joint moments, E[mono_k(z) | y] for k = 1 .. highest, at two points y.
 
     Returns the largest |z| seen. Wrong moments of size s are found when s exceeds about 6 standard errors, so more
-    samples make it stricter.
+    samples make it stricter. Of a map that remembers, which has no moments of one step alone, only `init` and `draw`
+    are checked: a state that keeps its structure and shapes.
 
     Raises:
         AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
     """
     generator, worst = np.random.default_rng(seed), 0.0
-    with jax.enable_x64(True):
-        keys = jax.random.split(jax.random.key(seed), samples)
-        drawn = np.asarray(jax.jit(jax.vmap(channel.sample))(keys))
-    expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
-    assert drawn.shape == expected_shape, f"sample: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"
-    bottom = np.eye(1, channel.inputs + 1, channel.inputs)
-    assert np.array_equal(drawn[:, -1:], np.broadcast_to(bottom, drawn[:, -1:].shape)), "last row: expected [0, 1]"
+    drawn = _drawn(channel, seed, samples)
+    if channel.remembers:
+        return worst
     for y in (channel.example_input(generator), channel.example_input(generator)):
         z = drawn[:, :-1] @ np.append(y, 1.0)
         for order in range(1, highest + 1):
             worst = max(worst, _compare(channel, y, z, order))
     return worst
+
+
+def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> np.ndarray:
+    """First draws of H, after the contract of `init`, `draw` and `sample` was checked."""
+
+    def two_steps(key: jax.Array) -> Any:
+        start = channel.init(key)
+        state, h = channel.draw(start, key)
+        return start, state, h, channel.draw(state, key)[0]
+
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(seed), samples)
+        start, state, h, following = jax.jit(jax.vmap(two_steps))(keys)
+        assert channel.remembers or start == (), f"init: expected () of a map that forgets, got {start}"
+        shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), s) for s in (start, state, following)]
+        assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
+        if not channel.remembers:
+            sampled = jax.jit(jax.vmap(channel.sample))(keys)
+            assert np.array_equal(h, sampled, equal_nan=True), "draw: expected what sample draws from the same key"
+    drawn = np.asarray(h)
+    expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
+    assert drawn.shape == expected_shape, f"draw: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"
+    bottom = np.eye(1, channel.inputs + 1, channel.inputs)
+    assert np.array_equal(drawn[:, -1:], np.broadcast_to(bottom, drawn[:, -1:].shape)), "last row: expected [0, 1]"
+    return drawn
 
 
 def _compare(channel: AbstractRandomAffine, y: np.ndarray, z: np.ndarray, order: int) -> float:

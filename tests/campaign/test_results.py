@@ -142,6 +142,6 @@ def test_foreign_folders_are_left_alone(tmp_path):
         run_campaign(write(tmp_path), tmp_path / "out", workers=0)
     with pytest.raises(ValueError, match=r"a folder with results.zarr, got none"):
         open_results(tmp_path / "out")
-    with pytest.raises(ValueError, match="workers: expected a whole number of processes, or 0, got -1"):
+    with pytest.raises(ValueError, match="workers: expected a whole number of at least 0, got -1"):
         run_campaign(write(tmp_path), tmp_path / "new", workers=-1)
     assert not (tmp_path / "new").exists() and not chunk_files(tmp_path / "out")

@@ -44,7 +44,7 @@ def test_sweep(folder, capsys):
         (["campaign.toml", "--out", "o", "--setting", "2"], ["--setting: expected a number from 0 to 1, got 2"]),
         (["campaign.toml", "--out", "o", "--chunk", "0"], ["--chunk: expected a --setting whose chunk it is"]),
         (["campaign.toml", "--out", "o", "--setting", "1", "--chunk", "2"], ["--chunk: expected a number from 0 to 1"]),
-        (["campaign.toml", "--out", "o", "--workers", "-1"], ["workers: expected a whole number of processes, or 0"]),
+        (["campaign.toml", "--out", "o", "--workers", "-1"], ["workers: expected a whole number of at least 0"]),
     ],
 )
 def test_bad_sweeps(folder, capsys, arguments, fragments):

@@ -148,7 +148,7 @@ def test_a_missing_simulator_is_told_before_the_work_starts(tmp_path, monkeypatc
 
 
 def test_refuses_one_seed():
-    with pytest.raises(ValueError, match="seeds: expected at least 2, got 1"):
+    with pytest.raises(ValueError, match="seeds: expected a whole number of at least 2, got 1"):
         compute.compute(1)
 
 

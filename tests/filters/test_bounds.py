@@ -141,14 +141,14 @@ def check_by_enumeration(build, usable=lambda setting: True):
             described = update.describe(channel)
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(e), signal, described))
         for corner in channel.extremes():
-            actual = actual_covariance(joint, gain, corner, described.gain)
+            actual = actual_covariance(joint, gain, corner, described.mean_gain)
             assert np.linalg.eigvalsh(bound - actual)[0] >= -1e-9 * np.trace(bound)
 
 
 def actual_covariance(joint, gain, law, nominal):
     """E of e - K(G y + n - M yhat) = e - K M e_y - K (G - M) y - K n, over the law of (G, n)."""
     own = hg.second_order(law)
-    shift = own.gain - nominal
+    shift = own.mean_gain - nominal
     lift = np.hstack([np.eye(5), -gain @ (nominal + shift), -gain @ shift])  # on (e, e_y, yhat)
     yy = joint[5:7, 5:7] + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
     w = np.zeros((3, 3))
@@ -202,7 +202,7 @@ def too_small(radius, shrink, seeds=range(20)):
         with jax.enable_x64(True):
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(joint[:5, :5]), signal, shrink(right)))
         for corner in channel.extremes():
-            gap = bound - actual_covariance(joint, gain, corner, right.gain)
+            gap = bound - actual_covariance(joint, gain, corner, right.mean_gain)
             worst = min(worst, np.linalg.eigvalsh(gap)[0] / np.trace(bound))
     return worst < -1e-6
 

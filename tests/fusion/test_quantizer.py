@@ -166,8 +166,8 @@ def test_an_amplitude_that_follows_the_data_can_understate():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: hg.UniformQuantizer(1, 1.0), "levels: expected at least 2, got 1"),
-        (lambda: hg.UniformQuantizer(2.5, 1.0), "levels: expected a positive whole number"),
+        (lambda: hg.UniformQuantizer(1, 1.0), "levels: expected a whole number of at least 2, got 1"),
+        (lambda: hg.UniformQuantizer(2.5, 1.0), "levels: expected a whole number of at least 2"),
         (lambda: hg.UniformQuantizer(8, 0.0), "amplitude: expected positive numbers, got 0.0"),
         (lambda: hg.UniformQuantizer(8, [1.0, np.inf]), "amplitude: expected finite numbers"),
         (lambda: hg.UniformQuantizer(8, [[1.0], [2.0, 3.0]]), "amplitude: expected an array of numbers"),

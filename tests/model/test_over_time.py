@@ -27,8 +27,8 @@ def test_a_number_over_time_is_an_array_at_its_step(k):
 def test_objects_over_time_come_back_as_given():
     channels = [hg.hop(hg.Rayleigh(s), 0.1) for s in (0.5, 1.0, 2.0)]
     moved = hg.over_time(channels)
-    assert [float(c.gain.scale) for c in unstack(moved)] == [0.5, 1.0, 2.0]
-    assert float(at(moved, 1).gain.scale) == 1.0
+    assert [float(c.law.scale) for c in unstack(moved)] == [0.5, 1.0, 2.0]
+    assert float(at(moved, 1).law.scale) == 1.0
 
 
 @pytest.mark.parametrize("other", [hg.hop(hg.Nakagami(1.0), 0.1), hg.hop(hg.Rayleigh(1.0), 0.1, dimension=2)])

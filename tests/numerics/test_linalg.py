@@ -41,3 +41,19 @@ def test_solve(n):
     a, b = psd(n, n) + np.eye(n), np.random.default_rng(0).normal(size=(n, 3))
     with jax.enable_x64(True):
         np.testing.assert_allclose(psd_solve(jnp.asarray(a), jnp.asarray(b)), np.linalg.solve(a, b), rtol=1e-9)
+
+
+@pytest.mark.parametrize("n", [3, 10])
+def test_a_component_known_exactly_leaves_the_derivatives_of_the_others(n):
+    """A = diag(B(p), 0): the factor is that of B, and so is its derivative, though the root has none at 0."""
+    b = np.eye(n - 1) + 0.3
+
+    def factor(p):
+        return cholesky(jnp.zeros((n, n)).at[:-1, :-1].set(p * b))
+
+    with jax.enable_x64(True):
+        slopes = [np.asarray(jac(factor)(2.0)) for jac in (jax.jacrev, jax.jacfwd)]
+    expected = np.zeros((n, n))
+    expected[:-1, :-1] = np.linalg.cholesky(2.0 * b) / 4
+    for slope in slopes:
+        np.testing.assert_allclose(slope, expected, atol=1e-13)

@@ -52,7 +52,7 @@ def test_constants_are_those_of_the_oracle(ours, theirs):
         np.testing.assert_array_equal(mine.matrix, reference.matrix)
         np.testing.assert_array_equal(mine.noise.covariance, reference.noise.covariance)
         for part in ("values", "probabilities", "radius"):
-            np.testing.assert_array_equal(getattr(mine.gain, part), getattr(reference.gain, part))
+            np.testing.assert_array_equal(getattr(mine.law, part), getattr(reference.law, part))
 
 
 @pytest.mark.parametrize(("s", "theirs"), [(PRINTED, oracle.PRINTED), (STRONG, oracle.STRONG)])

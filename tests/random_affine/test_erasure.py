@@ -71,7 +71,7 @@ def test_the_parts_of_an_erasure():
     assert channel.corner_count() == len(channel.extremes()) == fading.corner_count() > 1
     assert all(part.erases for part in channel.extremes()) and not fading.erases
     mean = hg.mean_gain(channel)
-    assert mean.erases and mean.base.gain.moment(1) == 1.0 and mean.arrival == 0.7
+    assert mean.erases and mean.base.law.moment(1) == 1.0 and mean.arrival == 0.7
 
 
 def test_a_filter_of_the_channel_inside_is_exact_behind_known_losses():

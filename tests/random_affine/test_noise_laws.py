@@ -95,7 +95,7 @@ def test_a_sample_too_small_for_the_order_is_told_and_the_number_named_is_enough
 
 @pytest.mark.parametrize(
     ("samples", "order", "message"),
-    [([1.0], 2, "at least two"), ([1.0, np.nan], 2, "finite"), ([1.0, 2.0], 0, "at least 1")],
+    [([1.0], 2, "at least two"), ([1.0, np.nan], 2, "finite"), ([1.0, 2.0], 0, "a positive whole number")],
 )
 def test_samples_that_are_none_are_refused(samples, order, message):
     with pytest.raises(ValueError, match=message):

@@ -6,7 +6,8 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine import push
 from heliograph.random_affine.monomials import count, exponents, monomials
-from heliograph.random_affine.push import Tabulated, noise_vector, push_known, second_moments
+from heliograph.random_affine.noise import noise_vector
+from heliograph.random_affine.push import Tabulated, push_known, second_moments
 from tests.random_affine.test_contract import CHANNELS
 
 

@@ -35,7 +35,7 @@ def test_worst_cases_of_a_relay_are_those_of_brute_force():
     found = hg.second_order(relay())
     y = np.zeros((3, 3))
     y[0, 0] = 1.0
-    assert found.gain[0, 0] == pytest.approx(c * mu, rel=1e-14)
+    assert found.mean_gain[0, 0] == pytest.approx(c * mu, rel=1e-14)
     assert evaluate(found.spread, y)[0, 0] == pytest.approx(c**2 * spread, rel=1e-12)
     assert evaluate(found.shift, y)[0, 0] == pytest.approx(c**2 * shift, rel=1e-12)
     assert evaluate(found.power, y)[0, 0] == pytest.approx(c**2 * power, rel=1e-12)
@@ -50,7 +50,7 @@ def test_a_known_channel_has_its_own_second_moments():
     y = np.array([0.5, -1.0])
     w = np.append(y, 1.0)
     second = conditional_moments(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)), y, 2)
-    mean = found.gain @ y + found.offset
+    mean = found.mean_gain @ y + found.offset
     spread = evaluate(found.spread, np.outer(w, w))
     np.testing.assert_allclose(
         spread + np.outer(mean, mean), [[second[0], second[1]], [second[1], second[3]]], rtol=1e-12
@@ -77,9 +77,9 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
     for _ in range(4):
         extreme = hg.Stack([options[rng.integers(len(options))] for options in corners])
         own = hg.second_order(extreme)
-        shift = np.concatenate([own.gain - found.gain, (own.offset - found.offset)[:, None]], axis=1)
+        shift = np.concatenate([own.mean_gain - found.mean_gain, (own.offset - found.offset)[:, None]], axis=1)
         moved = shift @ w @ shift.T
-        cross = np.concatenate([own.gain, own.offset[:, None]], axis=1)
+        cross = np.concatenate([own.mean_gain, own.offset[:, None]], axis=1)
         assert np.isfinite(cross).all()
         for bound, actual in (
             (evaluate(found.spread, w), evaluate(own.spread, w) + moved),

@@ -23,7 +23,7 @@ from heliograph.campaign.store import (
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
 from heliograph.files.output_folder import check_replaceable
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]
@@ -115,9 +115,7 @@ def _count(workers: int | None, jobs: int) -> int:
     if workers is None:
         cpus = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         return min(cpus, jobs)
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
-        raise fail("workers", "a whole number of processes, or 0", workers)
-    return min(workers, jobs)
+    return min(check_count("workers", workers, 0), jobs)
 
 
 def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int], tell: Tell) -> dict[Job, Reply]:

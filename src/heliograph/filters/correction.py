@@ -67,9 +67,9 @@ def young_correction(
     """The update of `Polytope` for any description of the channel."""
     w = homogeneous(signal.second, signal.mean, 1.0)
     both = present[:, None] & present[None, :]
-    mean_part = jnp.where(both, congruence(channel.gain, signal.covariance), 0.0)
+    mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     base = channel.spread(w, present) + absent(present)
-    cross = jnp.where(present[:, None], times(channel.gain, transpose(signal.cross)), 0.0)
+    cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
         return gain_and_bound(prior, cross, base + mean_part)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
@@ -96,7 +96,7 @@ def zero_mean_correction(
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     own = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
-    cross = jnp.where(present[:, None], times(channel.gain, transpose(signal.cross)), 0.0)
+    cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
         return gain_and_bound(prior, cross, base)
     shift, power = channel.shift(own, present), times(cross, transpose(cross))

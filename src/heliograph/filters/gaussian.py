@@ -22,7 +22,7 @@ from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_order import SecondOrder, has_random_gain
 
 
 class Belief(NamedTuple):
@@ -100,7 +100,7 @@ def corrected(
     """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
     gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
     after = _use(prior, gain, bound, signal.mean, channel, z)
-    expected = channel.gain @ signal.mean + channel.offset
+    expected = channel.mean_gain @ signal.mean + channel.offset
     return after, innovation(z, expected, innovation_covariance(signal, channel))
 
 
@@ -109,7 +109,7 @@ def _use(
     prior: Belief, gain: jax.Array, bound: jax.Array, expected: jax.Array, channel: SecondOrder, z: jax.Array
 ) -> Belief:
     present = ~jnp.isnan(z)
-    innovation = jnp.where(present, z - times_vector(channel.gain, expected) - channel.offset, 0.0)
+    innovation = jnp.where(present, z - times_vector(channel.mean_gain, expected) - channel.offset, 0.0)
     covariance_after = jnp.where(jnp.any(present, axis=0), bound, prior.covariance)
     return Belief(prior.mean + times_vector(gain, innovation), covariance_after)
 
@@ -139,7 +139,8 @@ def _build(
     if initial_covariance is not None:
         spread = covariance("filter's initial covariance", initial_covariance, n)
     described = describe(channel, update)
-    linear = is_linear(plant, sensor) and not bool(np.any([s.random_gain for s in _each(described)]))
+    pairs = zip(_each(channel), _each(described), strict=True)
+    linear = is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     own_prior = initial_mean is not None or initial_covariance is not None
     claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
     return GaussianFilter(
@@ -158,7 +159,7 @@ def _build(
     )
 
 
-def _each(item: SecondOrder | OverTime) -> list[SecondOrder]:
+def _each(item: Any) -> list[Any]:
     return unstack(item) if isinstance(item, OverTime) else [item]
 
 

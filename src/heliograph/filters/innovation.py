@@ -41,8 +41,8 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> Float[Array, 
 @runs_last
 def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     second = homogeneous(signal.second, signal.mean, 1.0)
-    everything = jnp.ones((len(channel.gain), *second.shape[2:]), dtype=bool)
-    return congruence(channel.gain, signal.covariance) + channel.nominal(second, everything)
+    everything = jnp.ones((len(channel.mean_gain), *second.shape[2:]), dtype=bool)
+    return congruence(channel.mean_gain, signal.covariance) + channel.nominal(second, everything)
 
 
 @runs_last

@@ -175,8 +175,8 @@ def atoms_of(item: AbstractRandomAffine) -> list[Component]:
     """
     match item:
         case GainAndNoise():
-            gains, noises = _gain_atoms(item.gain), _noise_atoms(item.noise)
-            result = [Component(p * q, g * item.matrix, c, r) for p, g in gains for q, c, r in noises]
+            gains, noises = _gain_atoms(item.law), _noise_atoms(item.noise)
+            result = [Component(p * q, g * np.asarray(item.matrix), c, r) for p, g in gains for q, c, r in noises]
         case Series():
             result = atoms_of(item.maps[0])
             for part in item.maps[1:]:
@@ -234,12 +234,12 @@ def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
     """All combinations of the atoms of a noise's parts."""
     match noise:
         case Gaussian():
-            return [(1.0, noise.mean, noise.covariance)]
+            return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
         case FiniteSupport():
             none = np.zeros((noise.dimension, noise.dimension))
             return [(float(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
         case Shaped():
-            b = noise.matrix
+            b = np.asarray(noise.matrix)
             return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
         case Independent():
             result = [(1.0, np.zeros(0), np.zeros((0, 0)))]

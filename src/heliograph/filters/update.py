@@ -132,14 +132,15 @@ class HopRange(NamedTuple):
 def _hop_range(hop: AbstractRandomAffine) -> HopRange:
     if not isinstance(hop, GainAndNoise) or not _is_scalar(hop.matrix) or np.any(hop.noise.mean):
         raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
-    radius, law = (0.0, 0.0), hop.gain
+    radius, law = (0.0, 0.0), hop.law
     if isinstance(law, Discrete):
         radius = (float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius))
     amplitude = float(hop.matrix[0, 0])
-    return HopRange(amplitude, law.moment(1), radius[0], law.moment(2) + radius[1], hop.noise.covariance)
+    mean, second = float(law.moment(1)), float(law.moment(2))
+    return HopRange(amplitude, mean, radius[0], second + radius[1], np.asarray(hop.noise.covariance))
 
 
-def _is_scalar(matrix: np.ndarray) -> bool:
+def _is_scalar(matrix: jax.Array | np.ndarray) -> bool:
     return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
 
 

@@ -197,8 +197,7 @@ def _midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) ->
 
 
 def _levels(value: int) -> Float[np.ndarray, ""]:
-    if check_count("levels", value) < 2:
-        raise fail("levels", "at least 2", value)
+    check_count("levels", value, 2)
     return np.asarray(value, dtype=np.float64)
 
 

@@ -6,20 +6,20 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import numpy as np
 
-from heliograph.linear.system import LinearSystem, Steps, check_horizon
+from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, exponents
-from heliograph.random_affine.noise import AbstractNoise, Gaussian
-from heliograph.random_affine.push import Tabulated, noise_vector, push, push_known, second_moments
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
+from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
 
 T = TypeVar("T")
 
@@ -57,11 +57,11 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     last: Route | None = None
     for route in routes:
         if last is None or not eqx.tree_equal(route.plant, last.plant):
-            moved = route.plant.moments(degree).matrix
+            moved = np.asarray(route.plant.moments(degree).matrix)
         if last is None or not eqx.tree_equal(route.measurement, last.measurement):
-            measured = route.measurement.moments(degree).matrix
+            measured = np.asarray(route.measurement.moments(degree).matrix)
         last = route
-        moments = push(route.plant, 2 * degree, moments)
+        moments = np.asarray(push(route.plant, 2 * degree, moments))
         after = second_moments(moments, n + 1, degree)
         heard = second_moments(push(route.measurement, 2 * degree, moments), m + 1, degree)
         process, noise = after - moved @ before @ moved.T, heard - measured @ after @ measured.T
@@ -92,7 +92,7 @@ def initial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomi
     law = plant.deviation if plant.deviation is not None else Gaussian(plant.initial_covariance)
     shift = np.eye(len(plant.states) + 1)
     shift[:-1, -1] = plant.initial_mean - law.mean
-    return push_known(shift, order, noise_vector(law, order))
+    return np.asarray(push_known(shift, order, noise_vector(law, order)))
 
 
 def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
@@ -148,16 +148,14 @@ def each_step(item: T | OverTime, horizon: int) -> list[T]:
     check_horizon(horizon)
     if not isinstance(item, OverTime):
         return [item] * horizon
-    if item.steps < horizon:
-        raise fail("horizon", f"at most {item.steps} steps, which what varies over time covers", horizon)
+    check_horizon(horizon, item.steps)
     return unstack(item)[:horizon]
 
 
 def refuse_lift(degree: int, states: int, outputs: int, horizon: int) -> None:
     """Raise ValueError for a horizon or degree below 1 or a lifted system of more than MEMORY_LIMIT_ENTRIES numbers."""
     check_horizon(horizon)
-    if int(degree) != degree or degree < 1:
-        raise fail("degree of the lift", "a positive whole number", degree)
+    check_count("degree of the lift", degree)
     n, m = count(states + 1, degree), count(outputs + 1, degree)
     entries = horizon * (2 * n * n + n * m + m * m)
     if entries > MEMORY_LIMIT_ENTRIES:

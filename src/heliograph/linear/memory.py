@@ -99,7 +99,7 @@ class _Kept:
         """Moments of order 2 and 4 of (x+, q) -> (x+, q, z+)."""
         if route is not self.route:
             wide = Stack([known(np.eye(2 * n)), Series([known(np.eye(n, 2 * n)), route])])
-            self.route, self.wide = route, (wide.moments(2).matrix, wide.moments(4).matrix)
+            self.route, self.wide = route, (np.asarray(wide.moments(2).matrix), np.asarray(wide.moments(4).matrix))
         return self.wide
 
 

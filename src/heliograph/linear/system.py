@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import array, covariance, fail
+from heliograph.numerics.check import array, covariance
 from heliograph.numerics.types import ArrayLike, Float
 
 
@@ -85,9 +85,3 @@ def state_moments(system: LinearSystem) -> StateMoments:
         means.append(mean)
         spreads.append(spread)
     return StateMoments(np.array(means), np.array(spreads))
-
-
-def check_horizon(horizon: int) -> None:
-    """Raise ValueError unless `horizon` is a positive whole number."""
-    if int(horizon) != horizon or horizon < 1:
-        raise fail("horizon", "a positive whole number", horizon)

@@ -1,38 +1,46 @@
 """Channels between a sensor and a filter, each one random affine map: hops, relays, dropouts, direct links."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime, over_time, unstack
 from heliograph.model.sensor import AbstractSensor, check_sensor
 from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise, known
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant
-from heliograph.random_affine.noise import as_noise
+from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 Channel = AbstractRandomAffine | OverTime  # an OverTime holds one channel per step
 
 
-def hop(gain: Any, noise: Any, power: float = 1.0, amplification: float = 1.0, dimension: int = 1) -> GainAndNoise:
-    """One radio link: z = amplification sqrt(power) g y + n, the same gain for all components of y.
+def hop(
+    gain: AbstractLaw | ArrayLike,
+    noise: AbstractNoise | ArrayLike,
+    power: ArrayLike = 1.0,
+    amplification: ArrayLike = 1.0,
+    dimension: int = 1,
+) -> GainAndNoise:
+    """One radio hop: z = amplification sqrt(power) g y + n, the same gain for all components of y.
 
-    `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or a variance for each component, when
-    `dimension` says how many there are. A relay's hop has its amplification factor; a sensor's has 1.
+    `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or one variance common to `dimension`
+    components, which are independent then. A relay's hop has its amplification factor; a sensor's has 1. All numbers
+    may be traced by JAX, those of the laws too.
 
     Raises:
         ValueError: a negative power, a noise that is no covariance, numbers that are not finite.
     Source: cubature fusion under amplify-and-forward relays, equations (3) and (5).
     """
     law = gain if isinstance(gain, AbstractLaw) else Constant(gain)
-    if not isinstance(noise, int | float):
-        dimension = noise.dimension if hasattr(noise, "dimension") else len(np.atleast_1d(noise))
-    factor = scalar("amplification", amplification) * np.sqrt(scalar("hop power", power, 0.0))
-    return GainAndNoise(law, factor * np.eye(dimension), as_noise("hop noise", noise, dimension))
+    count = components(noise) or check_count("dimension of a hop", dimension)
+    p = scalar("hop power", power, 0.0)
+    factor = scalar("amplification", amplification) * library(p).sqrt(p)
+    return GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:
@@ -44,13 +52,14 @@ def perfect(dimension: int = 1) -> GainAndNoise:
     return known(np.eye(check_count("dimension", dimension)))
 
 
-def silent(outputs: int = 1, inputs: int | None = None, noise: Any = 0.0) -> GainAndNoise:
+def silent(outputs: int = 1, inputs: int | None = None, noise: AbstractNoise | ArrayLike = 0.0) -> GainAndNoise:
     """A channel through which nothing comes but noise: z = n.
 
     Raises:
         ValueError: a noise that is no covariance or of another dimension.
     """
-    matrix = np.zeros((outputs, outputs if inputs is None else inputs))
+    rows = check_count("outputs of a silent channel", outputs)
+    matrix = np.zeros((rows, rows if inputs is None else check_count("inputs of a silent channel", inputs)))
     return GainAndNoise(Constant(1.0), matrix, as_noise("noise of a silent channel", noise, outputs))
 
 
@@ -66,7 +75,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> Series:
     return Series(hops)
 
 
-def dropout(channel: AbstractRandomAffine, arrival: Any, radius: Any = 0.0) -> Mixture:
+def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
     """A channel whose packet is lost with probability 1 - arrival; the receiver then reads zero and is not told.
 
     Where the receiver knows of the loss, it is an `erasure`.
@@ -75,10 +84,11 @@ def dropout(channel: AbstractRandomAffine, arrival: Any, radius: Any = 0.0) -> M
         ValueError: an arrival probability outside [0, 1].
     """
     p = scalar("arrival probability", arrival, 0.0, 1.0)
-    return Mixture([channel, silent(channel.outputs, channel.inputs)], [p, 1 - p], radius)
+    (channel,) = as_maps("dropout", [channel])
+    return Mixture([channel, silent(channel.outputs, channel.inputs)], library(p).stack([p, 1 - p]), radius)
 
 
-def erasure(channel: AbstractRandomAffine, arrival: Any) -> Erasure:
+def erasure(channel: AbstractRandomAffine, arrival: ArrayLike) -> Erasure:
     """A channel whose packet is lost with probability 1 - arrival; the receiver knows, and reads NaN.
 
     Filters skip what is NaN, so give a filter the channel inside, without the erasure. A relay forwards NaN as NaN.
@@ -106,6 +116,7 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     """
     if not channels:
         raise fail("parallel channels", "at least one", "none")
+    channels = as_maps("parallel channels", channels)
     parts, start, total = [], 0, sum(c.inputs for c in channels)
     for c in channels:
         parts.append(Series([known(np.eye(total)[start : start + c.inputs]), c]))
@@ -117,10 +128,11 @@ def mean_gain(channel: Channel) -> Channel:
     """The channel that most people would design for: every gain taken as its mean, with the noise as it is.
 
     Raises:
-        ValueError: a gain law that does not know its mean.
+        ValueError: a gain law that does not know its mean, a channel that remembers.
     """
     if isinstance(channel, OverTime):
-        return over_time([c.mean_gain() for c in unstack(channel)])
+        return over_time([mean_gain(c) for c in unstack(channel)])
+    check_forgets("channel taken at its mean gain", channel)
     return channel.mean_gain()
 
 

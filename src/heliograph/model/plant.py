@@ -7,11 +7,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, covariance, fail, names
 from heliograph.numerics.linalg import cholesky
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, as_noise
+from heliograph.numerics.traced import library
+from heliograph.random_affine.noise import (
+    AbstractNoise,
+    Gaussian,
+    Independent,
+    Matrix,
+    Square,
+    Vector,
+    as_noise,
+)
+
+NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), from the input u
 
 
 class AbstractPlant(eqx.Module):
@@ -20,9 +32,9 @@ class AbstractPlant(eqx.Module):
     x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant.
     """
 
-    noise: eqx.AbstractVar[AbstractNoise | Callable[[Any], Any]]
-    initial_mean: eqx.AbstractVar[np.ndarray]
-    initial_covariance: eqx.AbstractVar[np.ndarray]
+    noise: eqx.AbstractVar[AbstractNoise | NoiseFunction]
+    initial_mean: eqx.AbstractVar[Vector]
+    initial_covariance: eqx.AbstractVar[Square]
     deviation: eqx.AbstractVar[AbstractNoise | None]
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
@@ -68,20 +80,20 @@ class Plant(AbstractPlant):
         ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite.
     """
 
-    function: Callable[[Any, Any], Any]
-    noise: AbstractNoise | Callable[[Any], Any]
-    initial_mean: np.ndarray
-    initial_covariance: np.ndarray
+    function: Callable[[jax.Array, jax.Array], ArrayLike]
+    noise: AbstractNoise | NoiseFunction
+    initial_mean: Vector
+    initial_covariance: Square
     deviation: AbstractNoise | None
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
-        transition: Callable[[Any, Any], Any],
-        noise: Any,
-        initial_mean: Any,
-        initial_covariance: Any,
+        transition: Callable[[jax.Array, jax.Array], ArrayLike],
+        noise: AbstractNoise | ArrayLike | NoiseFunction,
+        initial_mean: ArrayLike,
+        initial_covariance: AbstractNoise | ArrayLike,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
     ):
@@ -90,12 +102,13 @@ class Plant(AbstractPlant):
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, len(inputs), "u")
-        is_function = callable(noise) and not isinstance(noise, AbstractNoise)
-        self.noise = noise if is_function else as_noise("process noise", noise, n)
         u = np.zeros(len(self.inputs))
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
-        if is_function:
+        if callable(noise):
             check_shape("process noise covariance(u)", noise, (u,), (n, n))
+            self.noise = noise
+        else:
+            self.noise = as_noise("process noise", noise, n)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u)."""
@@ -111,22 +124,22 @@ class LinearPlant(AbstractPlant):
         ValueError: wrong shapes, covariances that are none, numbers that are not finite.
     """
 
-    matrix: np.ndarray
-    input_matrix: np.ndarray
-    noise: AbstractNoise | Callable[[Any], Any]
-    initial_mean: np.ndarray
-    initial_covariance: np.ndarray
+    matrix: Square
+    input_matrix: Matrix
+    noise: AbstractNoise | NoiseFunction
+    initial_mean: Vector
+    initial_covariance: Square
     deviation: AbstractNoise | None
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(
         self,
-        matrix: Any,
-        noise: Any,
-        initial_mean: Any,
-        initial_covariance: Any,
-        input_matrix: Any = None,
+        matrix: ArrayLike,
+        noise: AbstractNoise | ArrayLike,
+        initial_mean: ArrayLike,
+        initial_covariance: AbstractNoise | ArrayLike,
+        input_matrix: ArrayLike | None = None,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
     ):
@@ -143,7 +156,7 @@ class LinearPlant(AbstractPlant):
         return jnp.asarray(self.matrix) @ x + jnp.asarray(self.input_matrix) @ u
 
 
-def with_bias(plant: LinearPlant, coupling: Any, bias: LinearPlant) -> LinearPlant:
+def with_bias(plant: LinearPlant, coupling: ArrayLike, bias: LinearPlant) -> LinearPlant:
     """The plant driven by a dynamical bias, as one plant of X = [x; b]: x+ = A x + E b + B u + w, b+ = F b + xi.
 
     The bias is a plant of its own, independent of the first; every filter of the result estimates both. A name that
@@ -164,18 +177,19 @@ def with_bias(plant: LinearPlant, coupling: Any, bias: LinearPlant) -> LinearPla
         raise fail("noise of a plant with bias", "a covariance or a noise law", "a function of the inputs")
     deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
     centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
+    xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
     return LinearPlant(
-        np.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
+        xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
         Independent(noises),
-        np.concatenate(centers),
+        xp.concatenate(centers),
         Independent(deviations),
-        np.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
+        xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
         states=(*plant.states, *(f"bias_{name}" if name in plant.states else name for name in bias.states)),
         inputs=plant.inputs,
     )
 
 
-def _initial(mean: Any, spread: Any) -> tuple[Any, Any, AbstractNoise | None]:
+def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector, Square, AbstractNoise | None]:
     """Mean, covariance and law of the deviation (None: Gaussian) of an initial state."""
     center = array("initial mean", mean, (None,))
     n = center.shape[-1]

@@ -10,7 +10,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_horizon, fail
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import second_moment_tensor
 
@@ -87,10 +87,7 @@ class RelayNetwork(eqx.Module):
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError unless `horizon` is positive and within what varies over time."""
         covered = steps_covered(self)
-        if int(horizon) != horizon or horizon < 1:
-            raise fail("horizon", "a positive whole number", horizon)
-        if covered is not None and horizon > covered:
-            raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
+        check_horizon(horizon, covered)
 
     def steps(self, horizon: int) -> "Steps":
         """Matrices and moments of each step, the first leading from x_0 to x_1.
@@ -172,9 +169,9 @@ def link_moments(link: AbstractRandomAffine) -> tuple[np.ndarray, np.ndarray, np
     if not known:
         raise fail("link", "known probabilities", "uncertain ones")
     moments = link.moments(2)
-    mean = moments.mean[:-1]
+    mean = np.asarray(moments.mean[:-1])
     product = np.einsum("ia,jb->ijab", mean, mean)
-    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    raw = np.asarray(second_moment_tensor(moments.matrix, moments.outputs, moments.inputs))
     return mean[:, :-1], mean[:, -1], raw - (product + product.swapaxes(2, 3)) / 2
 
 

@@ -1,17 +1,18 @@
 """Sensors: y = h(x) + v."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import array, fail, names
-from heliograph.random_affine.noise import AbstractNoise, as_noise
+from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
 class AbstractSensor(eqx.Module):
@@ -35,18 +36,18 @@ class Sensor(AbstractSensor):
         ValueError: names, noise and function that disagree about the number of outputs.
     """
 
-    function: Callable[[Any], Any]
+    function: Callable[[jax.Array], ArrayLike]
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, measure: Callable[[Any], Any], noise: Any, outputs: Sequence[str] | None = None):
+    def __init__(
+        self,
+        measure: Callable[[jax.Array], ArrayLike],
+        noise: AbstractNoise | ArrayLike,
+        outputs: Sequence[str] | None = None,
+    ):
         self.function = measure
-        if outputs is not None:
-            dimension = len(outputs)
-        elif isinstance(noise, AbstractNoise):
-            dimension = noise.dimension
-        else:
-            dimension = len(np.atleast_1d(noise))
+        dimension = (components(noise) or 1) if outputs is None else len(outputs)
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
 
@@ -64,11 +65,11 @@ class LinearSensor(AbstractSensor):
         ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite.
     """
 
-    matrix: np.ndarray
+    matrix: Float[jax.Array | np.ndarray, "m n"]
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, matrix: Any, noise: Any, outputs: Sequence[str] | None = None):
+    def __init__(self, matrix: ArrayLike, noise: AbstractNoise | ArrayLike, outputs: Sequence[str] | None = None):
         self.matrix = array("sensor matrix", matrix, (None, None))
         self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")

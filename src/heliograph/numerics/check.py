@@ -1,9 +1,13 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
+from collections.abc import Sequence
 from typing import Any
 
-import jax
+import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.traced import is_traced
 
 SYMMETRY_TOLERANCE = 1e-10  # relative to the largest entry: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # relative to the largest eigenvalue, for the same reason
@@ -15,53 +19,96 @@ def fail(name: str, expected: str, got: object) -> ValueError:
     return ValueError(f"{name}: expected {expected}, got {got}")
 
 
-def array(name: str, value: Any, shape: tuple[int | None, ...]) -> Any:
-    """Return `value` as a finite float64 array of the given shape (None: any length); traced values pass through."""
-    if isinstance(value, jax.Array):  # inside a compiled function: shapes were checked outside
-        return value
-    try:
-        result = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise fail(name, "an array of numbers", repr(value)[:60]) from None
+def shown(value: object) -> str:
+    """Anything as a short part of one line."""
+    return " ".join(repr(value).split())[:60]
+
+
+def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: bool = False) -> Any:
+    """Return `value` as a float64 array of the given shape (None: any length); a traced one keeps its precision.
+
+    Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
+    shape alone is checked.
+    """
+    result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
         want is None or want == have for want, have in zip(shape, result.shape, strict=True)
     )
     if not matches:
         want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise fail(name, f"shape {want}", f"shape {result.shape}")
-    if not np.all(np.isfinite(result)):
-        raise fail(name, "finite numbers", f"{np.count_nonzero(~np.isfinite(result))} that are not finite")
+    if is_traced(result):
+        return result
+    wrong = np.isinf(result) if missing else ~np.isfinite(result)
+    if np.any(wrong):
+        got = f"{np.count_nonzero(wrong)} that are not finite"
+        raise fail(name, "finite numbers, or NaN for what is missing" if missing else "finite numbers", got)
     return result
 
 
-def scalar(name: str, value: Any, low: float = -np.inf, high: float = np.inf) -> Any:
+def _numbers(name: str, value: ArrayLike) -> Any:
+    try:
+        result = jnp.asarray(value) if is_traced(value) else np.asarray(value)
+        if result.dtype.kind in "US":  # text is no number, though it may read as one
+            raise ValueError
+        known = None if is_traced(value) else result.astype(np.float64 if result.dtype.kind != "c" else complex)
+    except (TypeError, ValueError):
+        raise fail(name, "an array of numbers", shown(value)) from None
+    if np.issubdtype(result.dtype, np.complexfloating):
+        raise fail(name, "real numbers", "complex ones")
+    if known is not None:
+        return known
+    return result if jnp.issubdtype(result.dtype, jnp.floating) else result.astype(float)
+
+
+def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
     """Return `value` as a finite scalar between `low` and `high`."""
     result = array(name, value, ())
-    if not isinstance(result, jax.Array) and not low <= result <= high:
+    if not is_traced(result) and not low <= result <= high:
         raise fail(name, f"a number from {low:g} to {high:g}", f"{float(result):g}")
     return result
 
 
-def check_count(name: str, value: Any) -> int:
-    """Return a whole number of at least one."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise fail(name, "a positive whole number", value)
+def check_count(name: str, value: object, least: int = 1) -> int:
+    """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise fail(name, "a positive whole number" if least == 1 else f"a whole number of at least {least}", value)
     return int(value)
 
 
-def covariance(name: str, value: Any, dimension: int | None = None) -> Any:
+def check_horizon(value: object, covered: int | None = None) -> int:
+    """Return a number of steps, no more than what varies over time covers."""
+    horizon = check_count("horizon", value)
+    if covered is not None and horizon > covered:
+        raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
+    return horizon
+
+
+def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Return `count` times that do not go backwards."""
+    clock: np.ndarray = array(name, value, (count,))
+    backwards = np.flatnonzero(np.diff(clock) < 0)
+    if backwards.size:
+        row = int(backwards[0]) + 1
+        got = f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
+        raise fail(name, "times that do not go backwards", got)
+    return clock
+
+
+def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:
     """Return a symmetric positive semidefinite matrix; a scalar is taken as that multiple of the identity.
 
     Raises:
         ValueError: wrong shape, not finite, not symmetric, or with a negative eigenvalue.
     """
-    if dimension is not None and np.ndim(value) == 0 and not isinstance(value, jax.Array):
-        value = scalar(name, value) * np.eye(dimension)
-    result = array(name, value, (dimension, dimension))
-    if isinstance(result, jax.Array):
-        return result
+    result = _numbers(name, value)
+    if dimension is not None and result.ndim == 0:
+        result = array(name, result, ()) * np.eye(dimension)
+    result = array(name, result, (dimension, dimension))
     if result.shape[0] != result.shape[1]:
         raise fail(name, "a square matrix", f"shape {result.shape}")
+    if is_traced(result):
+        return (result + result.T) / 2
     largest = np.max(np.abs(result), initial=0.0)
     skew = np.max(np.abs(result - result.T), initial=0.0)
     if skew > SYMMETRY_TOLERANCE * largest:
@@ -72,10 +119,10 @@ def covariance(name: str, value: Any, dimension: int | None = None) -> Any:
     return (result + result.T) / 2
 
 
-def probabilities(name: str, value: Any, count: int | None = None) -> Any:
+def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
     """Return non-negative numbers that sum to one."""
     result = array(name, value, (count,))
-    if isinstance(result, jax.Array):
+    if is_traced(result):
         return result
     if np.any(result < 0):
         raise fail(name, "no negative probability", result.tolist())
@@ -84,26 +131,32 @@ def probabilities(name: str, value: Any, count: int | None = None) -> Any:
     return result
 
 
-def radii(name: str, value: Any, nominal: np.ndarray) -> Any:
+def radii(name: str, value: ArrayLike, nominal: Any) -> np.ndarray:
     """Return the radius of each uncertain probability; a scalar is the same radius for each.
 
-    A radius above max(p, 1 - p) is refused: no probability could ever move that far.
+    A radius above max(p, 1 - p) is refused: no probability could ever move that far. Which corners a radius leaves is
+    read off the numbers, so that neither it nor, where it is positive, the probabilities can be traced.
     """
-    if np.ndim(value) == 0 and not isinstance(value, jax.Array):
-        value = np.full(nominal.shape, scalar(name, value))
-    result = array(name, value, nominal.shape)
-    if isinstance(result, jax.Array):
-        return result
+    result = _numbers(name, value)
+    if is_traced(result):
+        raise fail(name, "a number, since the corners of what is possible depend on it", "a traced one")
+    radius: np.ndarray = array(name, np.full(nominal.shape, result) if result.ndim == 0 else result, nominal.shape)
+    if is_traced(nominal):
+        if np.any(radius > 0):
+            raise fail(name, "zero, where the probabilities are traced", radius.tolist())
+        return radius
     limit = np.maximum(nominal, 1 - nominal)
-    if np.any(result < 0) or np.any(result > limit + PROBABILITY_TOLERANCE):
-        raise fail(name, f"each radius from 0 to what its probability allows {limit.tolist()}", result.tolist())
-    return result
+    if np.any(radius < 0) or np.any(radius > limit + PROBABILITY_TOLERANCE):
+        raise fail(name, f"each radius from 0 to what its probability allows {limit.tolist()}", radius.tolist())
+    return radius
 
 
-def names(name: str, value: Any, count: int, prefix: str) -> tuple[str, ...]:
+def names(name: str, value: Sequence[str] | None, count: int, prefix: str) -> tuple[str, ...]:
     """Return `count` distinct names; None gives prefix0, prefix1, ..."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
+    if isinstance(value, str):
+        raise fail(name, "a list of names", repr(value))
     result = tuple(str(v) for v in value)
     if len(result) != count or len(set(result)) != count:
         raise fail(name, f"{count} distinct names", list(result))

@@ -4,7 +4,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from heliograph.numerics.small_matrix import PIVOT_TOLERANCE, UNROLL_LIMIT, factor, rounding, runs_last, solve
+from heliograph.numerics.small_matrix import (
+    PIVOT_TOLERANCE,
+    UNROLL_LIMIT,
+    factor,
+    pivot_scale,
+    rounding,
+    runs_last,
+    solve,
+)
 
 
 def symmetrize(a: Float[Array, "... n n"]) -> Float[Array, "... n n"]:
@@ -35,9 +43,7 @@ def _long_cholesky(a: jax.Array) -> jax.Array:
     def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         a, done = carry
         pivot = a[j, j]
-        root = jnp.where(pivot > tolerance, jnp.sqrt(pivot), jnp.nan)
-        scale = jnp.where(jnp.abs(pivot) <= tolerance, 0.0, 1 / root)
-        column = jnp.where(jnp.arange(n) >= j, a[:, j] * scale, 0.0)
+        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(pivot, tolerance), 0.0)
         return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
 
     result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]

@@ -131,10 +131,19 @@ def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     scales: list[jax.Array] = []
     for j in range(n):
         rest = add([a[j:, j], *(-c[j:] * c[j] for c in columns)])
-        root = jnp.where(rest[0] > tolerance, jnp.sqrt(rest[0]), jnp.nan)
-        scales.append(jnp.where(jnp.abs(rest[0]) <= tolerance, 0.0, 1 / root))
+        scales.append(pivot_scale(rest[0], tolerance))
         columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
     return columns, scales
+
+
+def pivot_scale(pivot: jax.Array, tolerance: jax.Array) -> jax.Array:
+    """1 / root of a pivot; 0 for one that is zero up to rounding, NaN for a negative one.
+
+    The root is taken of a positive number in any case, so that what a zero pivot leaves out has the derivative 0.
+    """
+    positive = pivot > tolerance
+    scale = 1 / jnp.sqrt(jnp.where(positive, pivot, 1.0))
+    return jnp.where(positive, scale, jnp.where(jnp.abs(pivot) <= tolerance, 0.0, jnp.nan))
 
 
 def solve(a: jax.Array, b: jax.Array) -> jax.Array:

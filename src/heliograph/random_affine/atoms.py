@@ -1,37 +1,37 @@
 """The atom of the algebra: one random gain times a matrix, plus noise."""
 
-from functools import cache
-from itertools import product
-from math import comb, prod
-from typing import Any
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.monomials import (
-    Exponents,
     count,
-    exponents,
-    position,
+    degrees,
     refuse_if_too_large,
+    sum_plan,
     symmetric_power,
 )
-from heliograph.random_affine.noise import AbstractNoise, Gaussian, as_noise
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Matrix, Vector, as_noise, noise_vector
 
 
 class GainAndNoise(AbstractRandomAffine):
     """z = g A y + n: a scalar random gain g, a known matrix A and noise n, all independent."""
 
-    gain: AbstractLaw
-    matrix: np.ndarray
+    law: AbstractLaw
+    matrix: Matrix
     noise: AbstractNoise
 
-    def __init__(self, gain: AbstractLaw, matrix: Any, noise: Any):
-        self.gain = gain
+    def __init__(self, law: AbstractLaw, matrix: ArrayLike, noise: AbstractNoise | ArrayLike):
+        if not isinstance(law, AbstractLaw):
+            raise fail("gain of a hop", "a law (Constant for a number)", shown(law))
+        self.law = law
         self.matrix = array("gain matrix", matrix, (None, None))
         self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
 
@@ -49,7 +49,7 @@ class GainAndNoise(AbstractRandomAffine):
         """Draw [[g A, n], [0, 1]]."""
         gain_key, noise_key = jax.random.split(key)
         top = jnp.concatenate(
-            [self.gain.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],
+            [self.law.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],
             axis=1,
         )
         return jnp.concatenate([top, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
@@ -58,36 +58,38 @@ class GainAndNoise(AbstractRandomAffine):
         """E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)]."""
         rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
-        homogeneous = np.zeros((self.outputs + 1, self.inputs + 1))
-        homogeneous[:-1, :-1], homogeneous[-1, -1] = self.matrix, 1.0
-        deterministic = symmetric_power(homogeneous, order)  # rows (A y)^b, made homogeneous with 1
-        places = position(self.outputs + 1, order)
-        gain_moment = cache(self.gain.moment)
-        noise_moment = cache(self.noise.moment)
-        matrix = np.zeros((rows, columns))
-        for row, powers in enumerate(exponents(self.outputs + 1, order)):
-            a = powers[:-1]
-            for b in product(*(range(x + 1) for x in a)):
-                weight = _binomial(a, b) * noise_moment(tuple(x - y for x, y in zip(a, b, strict=True)))
-                if weight:
-                    weight *= gain_moment(sum(b))
-                    matrix[row] += weight * deterministic[places[(*b, order - sum(b))]]
+        deterministic = symmetric_power(homogeneous(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
+        row, column, rest, ways = sum_plan(self.outputs, order)
+        gains = gain_moments(self.law, order)[degrees(self.outputs, order)]
+        terms = ways * noise_vector(self.noise, order)[rest] * gains[column]
+        ends = np.searchsorted(row, np.arange(rows + 1))  # the terms of a row stand together
+        matrix = stacked([terms[a:b] @ deterministic[column[a:b]] for a, b in pairwise(ends)])
         return Moments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """One map for each extreme law of the gain."""
-        return tuple(GainAndNoise(law, self.matrix, self.noise) for law in self.gain.extremes())
+        return tuple(GainAndNoise(law, self.matrix, self.noise) for law in self.law.extremes())
 
     def mean_gain(self) -> AbstractRandomAffine:
         """E[g] A y + n."""
-        return GainAndNoise(self.gain.mean_law(), self.matrix, self.noise)
+        return GainAndNoise(self.law.mean_law(), self.matrix, self.noise)
 
 
-def _binomial(a: Exponents, b: Exponents) -> int:
-    return prod(comb(x, y) for x, y in zip(a, b, strict=True))
+def homogeneous(matrix: Matrix) -> Matrix:
+    """[[A, 0], [0, 1]]."""
+    outputs, inputs = matrix.shape
+    right, below = np.zeros((outputs, 1)), np.eye(1, inputs + 1, inputs)
+    xp = library(matrix)
+    result: Matrix = xp.concatenate([xp.concatenate([matrix, right], axis=1), below])
+    return result
 
 
-def known(matrix: Any, offset: Any = None) -> GainAndNoise:
+def gain_moments(law: AbstractLaw, order: int) -> Vector:
+    """E[g^k] for k = 0, ..., order."""
+    return stacked([law.moment(k) for k in range(order + 1)])
+
+
+def known(matrix: ArrayLike, offset: ArrayLike | None = None) -> GainAndNoise:
     """The deterministic map z = A y + b.
 
     Raises:

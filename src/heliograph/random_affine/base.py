@@ -1,11 +1,14 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from typing import Any
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
+from heliograph.numerics.check import array, fail, shown
 from heliograph.random_affine.monomials import exponents, monomials
 
 
@@ -18,28 +21,32 @@ class Moments(eqx.Module):
     Shapes: matrix (C(outputs + k, k), C(inputs + k, k)).
     """
 
-    matrix: np.ndarray
+    matrix: Float[jax.Array | np.ndarray, "rows columns"]
     outputs: int = eqx.field(static=True)
     inputs: int = eqx.field(static=True)
     order: int = eqx.field(static=True)
 
     @property
-    def mean(self) -> np.ndarray:
+    def mean(self) -> Float[jax.Array | np.ndarray, "outputs+1 inputs+1"]:
         """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
         rows = [i for i, powers in enumerate(exponents(self.outputs + 1, self.order)) if powers[-1] >= self.order - 1]
         columns = [i for i, powers in enumerate(exponents(self.inputs + 1, self.order)) if powers[-1] >= self.order - 1]
         return self.matrix[np.ix_(rows, columns)]
 
-    def expect(self, y_moments: Any) -> Any:
+    def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
         """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
         return self.matrix @ y_moments
 
 
 class AbstractRandomAffine(eqx.Module):
-    """A random affine map z = G y + n, drawn anew and independently at each step.
+    """A random affine map z = G y + n, one at each step.
 
     Laws: `sample` and `moments` describe one distribution (heliograph.testing.check_random_affine compares them);
-    (G, n) are independent of y and over time, but not of each other: a shared hop makes them dependent.
+    (G, n) are independent of y, but not of each other: a shared hop makes them dependent.
+
+    A map that forgets is drawn independently at each step: it defines `sample`. A map that remembers has a state, of
+    which the next draw depends: it defines `init` and `draw`, and says so by `remembers`. A map that holds others
+    remembers where one of them does, and then must pass their states on.
     """
 
     @property
@@ -59,27 +66,43 @@ class AbstractRandomAffine(eqx.Module):
 
     @property
     def remembers(self) -> bool:
-        """Whether what is drawn depends on what was drawn before: then it has a state."""
-        return False
+        """Whether what is drawn depends on what was drawn before; unless told, whether a map held inside does."""
+        return any(part.remembers for part in _held(self))
 
-    def init(self, key: jax.Array) -> Any:
-        """State before the first draw; a map that forgets has none."""
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State before the first draw; () where the map forgets."""
+        if self.remembers:
+            raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
-    def draw(self, state: Any, key: jax.Array) -> tuple[Any, jax.Array]:
-        """Next state and H of shape (outputs + 1, inputs + 1)."""
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+        if self.remembers:
+            raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
+        if type(self).sample is AbstractRandomAffine.sample:
+            raise NotImplementedError(f"{type(self).__name__}: neither sample nor draw")
         return state, self.sample(key)
 
     def sample(self, key: jax.Array) -> jax.Array:
-        """Draw H of shape (outputs + 1, inputs + 1)."""
-        raise NotImplementedError
-
-    def moments(self, order: int) -> Moments:
-        """Return the nominal E[Sym^order(H)].
+        """Draw H of shape (outputs + 1, inputs + 1).
 
         Raises:
-            ValueError: the matrix would need more than the stated memory.
+            ValueError: the map remembers, so that there is no draw without its state.
         """
+        if self.remembers:
+            raise fail(
+                f"sample of {type(self).__name__}", "a map that forgets", "one that remembers; use init and draw"
+            )
+        return self.draw((), key)[1]
+
+    def moments(self, order: int) -> Moments:
+        """Return the nominal E[Sym^order(H)] of a map that forgets.
+
+        Raises:
+            ValueError: the matrix would need more than the stated memory, or the map remembers: then the moments of one
+                step say nothing of the next.
+        """
+        check_forgets("moments of a map", self)
         raise NotImplementedError
 
     def extremes(self) -> tuple["AbstractRandomAffine", ...]:
@@ -99,12 +122,39 @@ class AbstractRandomAffine(eqx.Module):
         return generator.normal(size=self.inputs)
 
 
+def _held(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+    """The maps in a map's fields, at any depth of lists, dictionaries and other modules, but not those inside them."""
+
+    def is_map(item: object) -> bool:
+        return isinstance(item, AbstractRandomAffine)
+
+    return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
+
+
+def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
+    """At least one random affine map."""
+    result = tuple(maps)
+    if not result:
+        raise fail(name, "at least one map", "none")
+    for item in result:
+        if not isinstance(item, AbstractRandomAffine):
+            raise fail(name, "random affine maps (hops, and maps made of them)", shown(item))
+    return result
+
+
+def check_forgets(name: str, channel: AbstractRandomAffine) -> None:
+    """Raise ValueError where a map remembers, for what knows only laws that are independent over time."""
+    if channel.remembers:
+        raise fail(name, "one that forgets", f"{type(channel).__name__}, which remembers")
+
+
 def apply(h: jax.Array, y: jax.Array) -> jax.Array:
     """z = G y + n for a drawn H."""
     return h[:-1, :-1] @ y + h[:-1, -1]
 
 
-def conditional_moments(channel: AbstractRandomAffine, y: np.ndarray, order: int) -> np.ndarray:
+def conditional_moments(
+    channel: AbstractRandomAffine, y: Float[ArrayLike, " inputs"], order: int
+) -> Float[jax.Array | np.ndarray, " rows"]:
     """E[mono_order(z) | y] for a given point y."""
-    result: np.ndarray = channel.moments(order).expect(monomials(np.asarray(y, dtype=np.float64), order))
-    return result
+    return channel.moments(order).expect(monomials(array("point y", y, (channel.inputs,)), order))

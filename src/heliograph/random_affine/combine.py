@@ -4,16 +4,18 @@ from collections.abc import Sequence
 from functools import reduce
 from itertools import product
 from math import prod
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
 from heliograph.random_affine.monomials import (
     count,
@@ -21,21 +23,44 @@ from heliograph.random_affine.monomials import (
     monomials,
     multiply,
     position,
+    product_table,
     refuse_if_too_large,
     symmetric_power,
 )
-from heliograph.random_affine.noise import Gaussian
+from heliograph.random_affine.noise import Gaussian, Matrix, Vector
 
 
-class Series(AbstractRandomAffine):
+class _Parts(AbstractRandomAffine):
+    """What holds several maps: its state is the tuple of theirs, and all of them move at each draw."""
+
+    maps: eqx.AbstractVar[tuple[AbstractRandomAffine, ...]]
+
+    @property
+    def erases(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.erases for m in self.maps)
+
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """The maps' states."""
+        keys = jax.random.split(key, len(self.maps))
+        return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
+
+    def _draw_each(
+        self, state: PyTree[jax.Array], keys: Sequence[jax.Array] | jax.Array
+    ) -> tuple[PyTree[jax.Array], list[jax.Array]]:
+        """Next state and one H of each map."""
+        states = state if self.remembers else ((),) * len(self.maps)
+        pairs = [m.draw(s, k) for m, s, k in zip(self.maps, states, keys, strict=True)]
+        return tuple(s for s, _ in pairs) if self.remembers else (), [h for _, h in pairs]
+
+
+class Series(_Parts):
     """One map after another, independent: z = H_last ... H_2 H_1 y; E[Sym^k] is the product of the E[Sym^k]."""
 
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = tuple(maps)
-        if not self.maps:
-            raise fail("series", "at least one map", "none")
+        self.maps = as_maps("series", maps)
         for first, second in zip(self.maps, self.maps[1:], strict=False):
             if first.outputs != second.inputs:
                 raise fail("series", f"a map that takes {first.outputs} inputs", f"one that takes {second.inputs}")
@@ -50,20 +75,15 @@ class Series(AbstractRandomAffine):
         """Inputs of the first map."""
         return self.maps[0].inputs
 
-    @property
-    def erases(self) -> bool:
-        """Whether one of the maps does."""
-        return any(m.erases for m in self.maps)
-
-    def sample(self, key: jax.Array) -> jax.Array:
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and multiply."""
-        keys = jax.random.split(key, len(self.maps))
+        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         then = _after if self.erases else jnp.matmul
-        return reduce(lambda h, pair: then(pair[0].sample(pair[1]), h), zip(self.maps[1:], keys[1:], strict=True),
-                      self.maps[0].sample(keys[0]))  # fmt: skip
+        return state, reduce(lambda h, part: then(part, h), drawn)
 
     def moments(self, order: int) -> Moments:
         """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
+        check_forgets("moments of a map", self)
         matrix = reduce(lambda done, part: part.moments(order).matrix @ done, self.maps[1:],
                         self.maps[0].moments(order).matrix)  # fmt: skip
         return Moments(matrix, self.outputs, self.inputs, order)
@@ -88,14 +108,14 @@ def _after(second: jax.Array, first: jax.Array) -> jax.Array:
     return jnp.where(reached[:, None], jnp.nan, second @ jnp.where(lost[:, None], 0.0, first))
 
 
-class Mixture(AbstractRandomAffine):
+class Mixture(_Parts):
     """One of several maps, chosen at random at each step; moments are linear in the (possibly uncertain) weights."""
 
     maps: tuple[AbstractRandomAffine, ...]
     choice: Discrete
 
-    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: Any, radius: Any = 0.0):
-        self.maps = tuple(maps)
+    def __init__(self, maps: Sequence[AbstractRandomAffine], weights: ArrayLike, radius: ArrayLike = 0.0):
+        self.maps = as_maps("mixture", maps)
         self.choice = Discrete(np.arange(len(self.maps)), weights, radius)
         if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
             raise fail("mixture", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
@@ -110,21 +130,18 @@ class Mixture(AbstractRandomAffine):
         """Inputs of each map."""
         return self.maps[0].inputs
 
-    @property
-    def erases(self) -> bool:
-        """Whether one of the maps does."""
-        return any(m.erases for m in self.maps)
-
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw which map, and the map."""
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw which map, and every map."""
         choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
-        drawn = jnp.stack([m.sample(k) for m, k in zip(self.maps, keys, strict=True)])
-        return drawn[self.choice.sample(choice_key).astype(int)]
+        state, drawn = self._draw_each(state, keys)
+        return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
     def moments(self, order: int) -> Moments:
         """sum_i p_i E[Sym^k(H_i)]."""
+        check_forgets("moments of a map", self)
         parts = [m.moments(order).matrix for m in self.maps]
-        return Moments(np.tensordot(self.choice.probabilities, parts, axes=1), self.outputs, self.inputs, order)
+        matrix = library(parts, self.choice.probabilities).tensordot(self.choice.probabilities, stacked(parts), axes=1)
+        return Moments(matrix, self.outputs, self.inputs, order)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """Extreme weights combined with the extremes of each map."""
@@ -143,25 +160,21 @@ class Mixture(AbstractRandomAffine):
         """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
         moments = self.moments(2)
         mean = moments.mean
-        n, last = self.outputs, count(self.inputs + 1, 2) - 1
-        second = np.zeros((n, n))
-        for powers, row in position(n + 1, 2).items():
-            used = [i for i in range(n) for _ in range(powers[i])]
-            if len(used) == 2:
-                second[used[0], used[1]] = second[used[1], used[0]] = moments.matrix[row, last]
+        second = moments.matrix[product_table(self.outputs + 1, 1, 1)[:-1, :-1], -1]  # E[n n'], the coefficients of 1
         offset = mean[:-1, -1]
-        return GainAndNoise(Constant(1.0), mean[:-1, :-1], Gaussian(second - np.outer(offset, offset), offset))
+        noise = Gaussian(second - offset[:, None] * offset, offset)
+        return GainAndNoise(Constant(1.0), mean[:-1, :-1], noise)
 
 
-class Stack(AbstractRandomAffine):
+class Stack(_Parts):
     """Independent maps that hear the same y, their outputs one above the other; moments are products of polynomials."""
 
     maps: tuple[AbstractRandomAffine, ...]
 
     def __init__(self, maps: Sequence[AbstractRandomAffine]):
-        self.maps = tuple(maps)
+        self.maps = as_maps("stack", maps)
         if len({m.inputs for m in self.maps}) != 1:
-            raise fail("stack", "at least one map, all of one number of inputs", [m.inputs for m in self.maps])
+            raise fail("stack", "maps of one number of inputs", [m.inputs for m in self.maps])
 
     @property
     def outputs(self) -> int:
@@ -173,27 +186,24 @@ class Stack(AbstractRandomAffine):
         """Inputs of each map."""
         return self.maps[0].inputs
 
-    @property
-    def erases(self) -> bool:
-        """Whether one of the maps does."""
-        return any(m.erases for m in self.maps)
-
-    def sample(self, key: jax.Array) -> jax.Array:
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and stack the rows."""
-        keys = jax.random.split(key, len(self.maps))
-        rows = [m.sample(k)[:-1] for m, k in zip(self.maps, keys, strict=True)]
-        return jnp.concatenate([*rows, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
+        state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
+        rows = [h[:-1] for h in drawn]
+        return state, jnp.concatenate([*rows, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
     def moments(self, order: int) -> Moments:
         """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
+        check_forgets("moments of a map", self)
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
         tables = [[m.moments(k).matrix if k else None for k in range(order + 1)] for m in self.maps]
         rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
-        return Moments(np.array(rows), self.outputs, self.inputs, order)
+        return Moments(stacked(rows), self.outputs, self.inputs, order)
 
-    def _row(self, powers: tuple[int, ...], tables: list[list[np.ndarray | None]]) -> np.ndarray:
+    def _row(self, powers: tuple[int, ...], tables: list[list[Matrix | None]]) -> Vector:
         variables, start = self.inputs + 1, 0
-        result, degree = np.ones(1), 0
+        result: Vector = np.ones(1)
+        degree = 0
         for m, table in zip(self.maps, tables, strict=True):
             a = powers[start : start + m.outputs]
             start += m.outputs
@@ -204,7 +214,8 @@ class Stack(AbstractRandomAffine):
                 result, degree = multiply(result, degree, polynomial, k, variables), degree + k
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0  # 1^(order - |a|)
-        return multiply(result, degree, constant, powers[-1], variables)
+        result = multiply(result, degree, constant, powers[-1], variables)
+        return result
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """All combinations of the parts' extremes."""
@@ -230,8 +241,7 @@ class Lift(AbstractRandomAffine):
     degree: int = eqx.field(static=True)
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
-        if degree < 1:
-            raise fail("lift", "a degree of at least 1", degree)
+        check_count("degree of the lift", degree)
         if base.erases:
             raise fail("lift", "a channel without erasures", "one that erases")
         self.base, self.degree = base, degree
@@ -246,12 +256,18 @@ class Lift(AbstractRandomAffine):
         """Monomials of y of degree 1 to `degree`."""
         return count(self.base.inputs + 1, self.degree) - 1
 
-    def sample(self, key: jax.Array) -> jax.Array:
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the base map."""
+        return self.base.init(key)
+
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw Sym^degree(H)."""
-        return jnp.asarray(symmetric_power(self.base.sample(key), self.degree))
+        state, h = self.base.draw(state, key)
+        return state, jnp.asarray(symmetric_power(h, self.degree))
 
     def moments(self, order: int) -> Moments:
         """Rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
+        check_forgets("moments of a map", self)
         inner = self.base.moments(order * self.degree).matrix
         rows = _products(self.base.outputs + 1, self.degree, order)
         columns = _products(self.base.inputs + 1, self.degree, order)

@@ -12,7 +12,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Mixture, Series, Stack
 
 ROUNDING = 1e-13  # relative to the largest eigenvalue of a covariance: smaller ones are zero up to rounding
@@ -70,13 +70,14 @@ def disturbed_gain(channel: AbstractRandomAffine) -> DisturbedGain:
 
 @disturbed_gain.register
 def _(channel: GainAndNoise) -> DisturbedGain:
+    check_forgets("channel of a design", channel)
     values, vectors = np.linalg.eigh(np.asarray(channel.noise.covariance))
     used = values > ROUNDING * np.max(values, initial=0.0)
     root = np.sqrt(values[used]) * vectors[:, used]
     root = root * np.where(root.sum(axis=0) < 0, -1.0, 1.0)
     scaled = np.concatenate([np.asarray(channel.matrix), np.zeros_like(root)], axis=1)
     fixed = np.concatenate([np.zeros_like(np.asarray(channel.matrix)), root], axis=1)
-    first, second = channel.gain.moment(1), channel.gain.moment(2)
+    first, second = float(channel.law.moment(1)), float(channel.law.moment(2))
     outer = np.multiply.outer
     cross = first * (outer(scaled, fixed) + outer(fixed, scaled))
     return DisturbedGain(

@@ -1,22 +1,24 @@
 """A loss that the receiver knows of."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail, scalar
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
 
 
 class Erasure(AbstractRandomAffine):
     """A map whose outputs are all lost with probability 1 - arrival, and the receiver knows: it reads NaN."""
 
     base: AbstractRandomAffine
-    arrival: Any
+    arrival: Float[jax.Array | np.ndarray, ""]
 
-    def __init__(self, base: AbstractRandomAffine, arrival: Any):
-        self.base, self.arrival = base, scalar("arrival probability", arrival, 0.0, 1.0)
+    def __init__(self, base: AbstractRandomAffine, arrival: ArrayLike):
+        (self.base,) = as_maps("erasure", [base])
+        self.arrival = scalar("arrival probability", arrival, 0.0, 1.0)
 
     @property
     def outputs(self) -> int:
@@ -33,12 +35,16 @@ class Erasure(AbstractRandomAffine):
         """It does."""
         return True
 
-    def sample(self, key: jax.Array) -> jax.Array:
-        """Draw whether it arrives, and the map."""
+    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map."""
+        return self.base.init(key)
+
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw whether it arrives, and the map, whose state moves in any case."""
         arrives, drawn = jax.random.split(key)
-        h = self.base.sample(drawn)
+        state, h = self.base.draw(state, drawn)
         lost = ~jax.random.bernoulli(arrives, self.arrival)
-        return h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
+        return state, h.at[:-1].set(jnp.where(lost, jnp.nan, h[:-1]))
 
     def moments(self, order: int) -> Moments:
         """There are none: a filter skips what was lost, and asks for the moments of what arrives.

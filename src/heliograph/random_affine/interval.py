@@ -1,17 +1,21 @@
 """Where every moment can lie when probabilities are uncertain: exact ends from corners, interval arithmetic beyond."""
 
+import jax
 import numpy as np
+from jaxtyping import Float
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.traced import library, placed, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Lift, Series, Stack
 from heliograph.random_affine.law import Constant, Discrete
 from heliograph.random_affine.monomials import count, exponents, position, product_table
 
 CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)
 
-Interval = tuple[np.ndarray, np.ndarray]
+Entries = Float[jax.Array | np.ndarray, "..."]
+Interval = tuple[Entries, Entries]
 
 
 def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
@@ -23,9 +27,11 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     Raises:
         ValueError: more corners than can be listed, in a map that is not a series or a stack.
     """
+    check_forgets("channel of a bound", channel)
     corners = _corner_count(channel)
     if corners is not None and corners <= CORNERS:
-        matrices = np.array([extreme.moments(order).matrix for extreme in channel.extremes()])
+        each = [extreme.moments(order).matrix for extreme in channel.extremes()]
+        matrices = stacked(each)
         return matrices.min(axis=0), matrices.max(axis=0)
     match channel:
         case Series():
@@ -35,7 +41,7 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
             return low, high
         case Stack():
             return _stack_interval(channel, order)
-        case GainAndNoise(gain=Discrete() as law):
+        case GainAndNoise(law=Discrete() as law):
             return _atom_interval(channel, law, order)
         case Lift():
             raise fail("uncertain lifted channel", f"at most {CORNERS} corner laws", corners)
@@ -53,7 +59,8 @@ def _multiply_matrices(second: Interval, first: Interval) -> Interval:
     """Interval matrix product by centres and radii: C2 C1 and |C2| R1 + R2 (|C1| + R1)."""
     c2, r2 = (second[1] + second[0]) / 2, (second[1] - second[0]) / 2
     c1, r1 = (first[1] + first[0]) / 2, (first[1] - first[0]) / 2
-    center, radius = c2 @ c1, np.abs(c2) @ r1 + r2 @ (np.abs(c1) + r1)
+    size = library(c1, c2).abs
+    center, radius = c2 @ c1, size(c2) @ r1 + r2 @ (size(c1) + r1)
     return center - radius, center + radius
 
 
@@ -63,19 +70,20 @@ def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval
     for k in range(order + 1):
         basis.append(_gain_coefficient(channel, k, order))
         ends.append((-law.worst(-(law.values**k)), law.worst(law.values**k)) if k else (1.0, 1.0))
+    xp = library(basis)
     products = [
-        (np.minimum(b * lo, b * hi), np.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
+        (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
     ]
-    return np.sum([low for low, _ in products], axis=0), np.sum([high for _, high in products], axis=0)
+    return sum(low for low, _ in products), sum(high for _, high in products)
 
 
-def _gain_coefficient(channel: GainAndNoise, k: int, order: int) -> np.ndarray:
+def _gain_coefficient(channel: GainAndNoise, k: int, order: int) -> Entries:
     """Coefficient of g^k in the moments, a polynomial of degree `order` in a constant gain g, by interpolation."""
     nodes = np.arange(order + 1, dtype=np.float64)
-    values = np.array([GainAndNoise(Constant(g), channel.matrix, channel.noise).moments(order).matrix for g in nodes])
+    values = [GainAndNoise(Constant(g), channel.matrix, channel.noise).moments(order).matrix for g in nodes]
     weights = np.linalg.inv(np.vander(nodes, increasing=True))[k]
-    coefficient: np.ndarray = np.tensordot(weights, values, axes=1)
-    return coefficient
+    result: Entries = sum(w * v for w, v in zip(weights, values, strict=True))
+    return result
 
 
 def _stack_interval(channel: Stack, order: int) -> Interval:
@@ -99,14 +107,13 @@ def _stack_interval(channel: Stack, order: int) -> Interval:
         constant = np.zeros(count(variables, powers[-1]))
         constant[-1] = 1.0
         rows.append(_multiply_rows(result, degree, (constant, constant), powers[-1], variables))
-    return np.array([r[0] for r in rows]), np.array([r[1] for r in rows])
+    return stacked([r[0] for r in rows]), stacked([r[1] for r in rows])
 
 
 def _multiply_rows(a: Interval, first: int, b: Interval, second: int, variables: int) -> Interval:
     """Interval product of two polynomials: ends of the four products, summed over equal monomials."""
     table = product_table(variables, first, second)
-    ends = np.array([np.outer(x, y) for x in a for y in b])
-    low, high = np.zeros(count(variables, first + second)), np.zeros(count(variables, first + second))
-    np.add.at(low, table, ends.min(axis=0))
-    np.add.at(high, table, ends.max(axis=0))
-    return low, high
+    size = (count(variables, first + second),)
+    products = [x[:, None] * y for x in a for y in b]
+    ends = stacked(products)
+    return placed(size, table, ends.min(axis=0)), placed(size, table, ends.max(axis=0))

@@ -6,29 +6,36 @@ is linear in p has its worst case.
 """
 
 from itertools import product
-from math import exp
-from typing import Any
+from math import gamma
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
+from heliograph.numerics.traced import is_traced, library, plain, scipy_for
+
+Scalar = Float[jax.Array | np.ndarray, ""]
+Vector = Float[jax.Array | np.ndarray, " n"]
 
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
 class AbstractLaw(eqx.Module):
-    """A law of a real random gain, independent over time."""
+    """A law of a real random gain, independent over time.
+
+    Its parameters are numbers, or traced by JAX: then so are its moments.
+    """
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw one gain; shape ()."""
         raise NotImplementedError
 
-    def moment(self, order: int) -> float:
-        """Return E[g^order] under the nominal law."""
+    def moment(self, order: int) -> float | jax.Array:
+        """Return E[g^order] under the nominal law; traced where the law's parameters are."""
         raise NotImplementedError
 
     def extremes(self) -> tuple["AbstractLaw", ...]:
@@ -43,28 +50,28 @@ class AbstractLaw(eqx.Module):
 class Constant(AbstractLaw):
     """A gain that is always `value`."""
 
-    value: np.ndarray
+    value: Scalar
 
-    def __init__(self, value: Any):
+    def __init__(self, value: ArrayLike):
         self.value = scalar("constant gain", value)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Return the value; the key is unused."""
         return jnp.asarray(self.value)
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return value^order."""
-        return float(self.value**order)
+        return plain(self.value**order)
 
 
 class Discrete(AbstractLaw):
     """Gains `values` with `probabilities`, each known within its `radius`."""
 
-    values: np.ndarray
-    probabilities: np.ndarray
+    values: Vector
+    probabilities: Vector
     radius: np.ndarray
 
-    def __init__(self, values: Any, probabilities_: Any, radius: Any = 0.0):
+    def __init__(self, values: ArrayLike, probabilities_: ArrayLike, radius: ArrayLike = 0.0):
         self.values = array("gain values", values, (None,))
         self.probabilities = probabilities("gain probabilities", probabilities_, len(self.values))
         self.radius = radii("probability radius", radius, self.probabilities)
@@ -74,11 +81,11 @@ class Discrete(AbstractLaw):
         edges = jnp.cumsum(jnp.asarray(self.probabilities))[:-1]
         return jnp.asarray(self.values)[jnp.sum(jax.random.uniform(key, dtype=float) > edges)]
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return sum_i p_i v_i^order."""
-        return float(self.probabilities @ self.values**order)
+        return plain(self.probabilities @ self.values**order)
 
-    def worst(self, payoff: Any) -> float:
+    def worst(self, payoff: ArrayLike) -> float:
         """Exact maximum of sum_i (p_i + dp_i) payoff_i over the polytope of probabilities.
 
         Start with every probability at its lower end and give the mass that is left to the largest payoffs first (the
@@ -119,7 +126,7 @@ class Discrete(AbstractLaw):
         return tuple(Discrete(self.values, np.array(c) / sum(c)) for c in sorted(corners))
 
 
-def bernoulli(probability: Any, radius: Any = 0.0) -> Discrete:
+def bernoulli(probability: ArrayLike, radius: ArrayLike = 0.0) -> Discrete:
     """A link that works (gain 1) with `probability` and is silent (gain 0) otherwise.
 
     Raises:
@@ -132,27 +139,27 @@ def bernoulli(probability: Any, radius: Any = 0.0) -> Discrete:
 class Rayleigh(AbstractLaw):
     """Rayleigh fading: the length of a centred complex Gaussian with standard deviation `scale` per part."""
 
-    scale: np.ndarray
+    scale: Scalar
 
-    def __init__(self, scale: Any):
+    def __init__(self, scale: ArrayLike):
         self.scale = scalar("Rayleigh scale", scale, 0.0)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw scale * sqrt(-2 log u)."""
         return jax.random.rayleigh(key, jnp.asarray(self.scale), dtype=float)
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return scale^k 2^(k/2) Gamma(1 + k/2)."""
-        return float((self.scale * np.sqrt(2)) ** order * special.gamma(1 + order / 2))
+        return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2))
 
 
 class Rician(AbstractLaw):
     """Rician fading: a line of sight of amplitude `sight` plus scatter of standard deviation `scale` per part."""
 
-    sight: np.ndarray
-    scale: np.ndarray
+    sight: Scalar
+    scale: Scalar
 
-    def __init__(self, sight: Any, scale: Any):
+    def __init__(self, sight: ArrayLike, scale: ArrayLike):
         self.sight = scalar("Rician line of sight", sight, 0.0)
         self.scale = scalar("Rician scale", scale, np.finfo(float).tiny)
 
@@ -161,19 +168,38 @@ class Rician(AbstractLaw):
         parts = jax.random.normal(key, (2,), dtype=float) * self.scale
         return jnp.hypot(self.sight + parts[0], parts[1])
 
-    def moment(self, order: int) -> float:
-        """Return scale^k 2^(k/2) Gamma(1 + k/2) 1F1(-k/2; 1; -sight^2 / (2 scale^2))."""
-        shape = special.hyp1f1(-order / 2, 1.0, -((self.sight / self.scale) ** 2) / 2)
-        return float((self.scale * np.sqrt(2)) ** order * special.gamma(1 + order / 2) * shape)
+    def moment(self, order: int) -> float | jax.Array:
+        """Return scale^k 2^(k/2) Gamma(1 + k/2) L_(k/2)(-sight^2 / (2 scale^2)), L the Laguerre function."""
+        shape = _laguerre(order, ((self.sight / self.scale) ** 2) / 2)
+        return plain((self.scale * np.sqrt(2)) ** order * gamma(1 + order / 2) * shape)
+
+
+def _laguerre(order: int, x: Scalar) -> Scalar:
+    """L_(order/2)(-x) = 1F1(-order/2; 1; -x) for x >= 0, by (v + 1) L_(v+1) = (2 v + 1 + x) L_v - v L_(v-1).
+
+    Even orders are polynomials, from L_0 = 1; odd ones start from exponentially scaled Bessel functions,
+    L_(-1/2)(-x) = e^(-x/2) I_0(x/2) and L_(1/2)(-x) = e^(-x/2) ((1 + x) I_0(x/2) + x I_1(x/2)). L grows with v, so the
+    difference loses no digits.
+    """
+    if order % 2:
+        bessel = scipy_for(x).special
+        before = bessel.i0e(x / 2)
+        now, v = (1 + x) * before + x * bessel.i1e(x / 2), 0.5
+    else:
+        before, now, v = 0.0 * x, 1.0 + 0.0 * x, 0.0
+    while v < order / 2:
+        before, now, v = now, ((2 * v + 1 + x) * now - v * before) / (v + 1), v + 1
+    result: Scalar = now
+    return result
 
 
 class Nakagami(AbstractLaw):
     """Nakagami-m fading with `shape` m >= 1/2 and mean power `power` = E[g^2]."""
 
-    shape: np.ndarray
-    power: np.ndarray
+    shape: Scalar
+    power: Scalar
 
-    def __init__(self, shape: Any, power: Any = 1.0):
+    def __init__(self, shape: ArrayLike, power: ArrayLike = 1.0):
         self.shape = scalar("Nakagami shape", shape, 0.5)
         self.power = scalar("Nakagami power", power, 0.0)
 
@@ -181,19 +207,20 @@ class Nakagami(AbstractLaw):
         """Draw the root of a gamma variable with shape m and mean `power`."""
         return jnp.sqrt(jax.random.gamma(key, jnp.asarray(self.shape), dtype=float) * self.power / self.shape)
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return Gamma(m + k/2) / Gamma(m) (power / m)^(k/2)."""
-        ratio = np.exp(special.gammaln(self.shape + order / 2) - special.gammaln(self.shape))
-        return float(ratio * (self.power / self.shape) ** (order / 2))
+        gammaln = scipy_for(self.shape).special.gammaln
+        ratio = library(self.shape).exp(gammaln(self.shape + order / 2) - gammaln(self.shape))
+        return plain(ratio * (self.power / self.shape) ** (order / 2))
 
 
 class LogNormal(AbstractLaw):
     """Shadowing: log g is Gaussian with `log_mean` and `log_deviation`."""
 
-    log_mean: np.ndarray
-    log_deviation: np.ndarray
+    log_mean: Scalar
+    log_deviation: Scalar
 
-    def __init__(self, log_mean: Any, log_deviation: Any):
+    def __init__(self, log_mean: ArrayLike, log_deviation: ArrayLike):
         self.log_mean = scalar("log-normal mean", log_mean)
         self.log_deviation = scalar("log-normal deviation", log_deviation, 0.0)
 
@@ -201,9 +228,10 @@ class LogNormal(AbstractLaw):
         """Draw exp(log_mean + log_deviation n)."""
         return jnp.exp(self.log_mean + self.log_deviation * jax.random.normal(key, dtype=float))
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return exp(k mu + k^2 sigma^2 / 2)."""
-        return exp(order * float(self.log_mean) + (order * float(self.log_deviation)) ** 2 / 2)
+        exponent = order * self.log_mean + (order * self.log_deviation) ** 2 / 2
+        return plain(library(exponent).exp(exponent))
 
 
 class GivenMoments(AbstractLaw):
@@ -216,10 +244,12 @@ class GivenMoments(AbstractLaw):
             higher order than given is asked for.
     """
 
-    moments: np.ndarray
+    moments: Vector
 
-    def __init__(self, moments: Any):
+    def __init__(self, moments: ArrayLike):
         self.moments = array("gain moments", moments, (None,))
+        if is_traced(self.moments):
+            return
         sequence = np.concatenate([[1.0], self.moments])
         half = (len(sequence) - 1) // 2
         hankel = np.array([[sequence[i + j] for j in range(half + 1)] for i in range(half + 1)])
@@ -232,10 +262,10 @@ class GivenMoments(AbstractLaw):
         """Refuse: the law itself is unknown."""
         raise fail("simulating a gain known by its moments only", "a law that can be sampled", "GivenMoments")
 
-    def moment(self, order: int) -> float:
+    def moment(self, order: int) -> float | jax.Array:
         """Return the given E[g^order]."""
         if order == 0:
             return 1.0
         if order > len(self.moments):
             raise fail("gain moments", f"moments up to order {order}", f"{len(self.moments)} of them")
-        return float(self.moments[order - 1])
+        return plain(self.moments[order - 1])

@@ -2,14 +2,15 @@
 
 import warnings
 from math import ceil
-from typing import Any
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.traced import is_traced, plain
 from heliograph.random_affine.monomials import Exponents, exponents
-from heliograph.random_affine.noise import AbstractNoise, FiniteSupport
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Number, Square, Vector
 
 MOMENT_TOLERANCE = 1e-10  # of moments scaled to unit second moment: rounding of the numbers given
 MOMENT_ERROR = 0.1  # standard error of an estimated moment, relative to its largest possible size, that is tolerated
@@ -27,30 +28,31 @@ class NoiseMoments(AbstractNoise):
         ValueError: fewer than two moments; moments that no distribution has, with the inequality that fails.
     """
 
-    moments: np.ndarray
-    mean: np.ndarray
-    covariance: np.ndarray
+    moments: Vector
+    mean: Vector
+    covariance: Square
 
-    def __init__(self, moments: Any):
+    def __init__(self, moments: ArrayLike):
         self.moments = array("noise moments", moments, (None,))
         if len(self.moments) < 2:
             raise fail("noise moments", "at least E[n] and E[n^2]", f"{len(self.moments)} of them")
-        check_moments(self.moments)
+        if not is_traced(self.moments):
+            check_moments(np.asarray(self.moments))
         self.mean = self.moments[:1]
-        self.covariance = np.array([[self.moments[1] - self.moments[0] ** 2]])
+        self.covariance = (self.moments[1] - self.moments[0] ** 2).reshape(1, 1)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Refuse: the law itself is unknown."""
         raise fail("simulating a noise known by its moments only", "a law that can be sampled", "NoiseMoments")
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return the given E[n^order]."""
         (order,) = powers
         if order == 0:
             return 1.0
         if order > len(self.moments):
             raise fail("noise moments", f"moments up to order {order}", f"{len(self.moments)} of them")
-        return float(self.moments[order - 1])
+        return plain(self.moments[order - 1])
 
 
 def check_moments(moments: np.ndarray) -> None:
@@ -79,7 +81,7 @@ def check_moments(moments: np.ndarray) -> None:
                        f"{moments[2 * j - 1]:.10g}, which no distribution has")  # fmt: skip
 
 
-def recorded_noise(samples: Any, order: int) -> FiniteSupport:
+def recorded_noise(samples: ArrayLike, order: int) -> FiniteSupport:
     """The law that gives each recorded sample the same probability: its moments are the sample's.
 
     order: the highest moment that will be read (a filter of degree d reads 2 d). Warns where the sample is too small
@@ -95,8 +97,7 @@ def recorded_noise(samples: Any, order: int) -> FiniteSupport:
     values = array("noise samples", values[:, None] if values.ndim == 1 else values, (None, None))
     if len(values) < 2:
         raise fail("noise samples", "at least two", len(values))
-    if order < 1:
-        raise fail("order of the noise moments", "at least 1", order)
+    check_count("order of the noise moments", order)
     absolute = np.abs(values)
     worst, where = 0.0, 1
     for powers in (a for k in range(1, order + 1) for a in exponents(values.shape[1], k)):

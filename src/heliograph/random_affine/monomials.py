@@ -5,13 +5,14 @@ Sym^k(H) of a homogeneous matrix H takes the monomials of Y to those of Z = H Y,
 """
 
 from functools import cache
-from itertools import combinations_with_replacement
+from itertools import combinations_with_replacement, product
 from math import comb, factorial, prod
 from typing import Any
 
 import numpy as np
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.traced import placed
 
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
 
@@ -122,11 +123,30 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
     return np.array(rows, dtype=np.int64).reshape(count(variables, first), count(variables, second))
 
 
-def multiply(a: np.ndarray, first: int, b: np.ndarray, second: int, variables: int) -> np.ndarray:
+def multiply(a: Any, first: int, b: Any, second: int, variables: int) -> Any:
     """Product of two homogeneous polynomials given by coefficients."""
-    result = np.zeros(count(variables, first + second))
-    np.add.at(result, product_table(variables, first, second), np.outer(a, b))
-    return result
+    terms = a[:, None] * b
+    return placed((count(variables, first + second),), product_table(variables, first, second), terms)
+
+
+@cache
+def degrees(dimension: int, order: int) -> np.ndarray:
+    """Degree of each monomial in the variables other than 1."""
+    return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
+
+
+@cache
+def sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
+    places, terms = position(dimension + 1, order), []
+    for row, powers in enumerate(exponents(dimension + 1, order)):
+        a = powers[:-1]
+        for b in product(*(range(x + 1) for x in a)):
+            rest = tuple(x - y for x, y in zip(a, b, strict=True))
+            weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
+            terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
+    row_, column, noise, weight_ = np.array(terms, dtype=np.int64).T
+    return row_, column, noise, weight_
 
 
 def multinomial(powers: Exponents) -> int:

@@ -2,23 +2,33 @@
 
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import block_diag
+from jaxtyping import Float
+from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, covariance, fail, probabilities
+from heliograph.numerics.check import array, covariance, fail, probabilities, shown
+from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.random_affine.monomials import Exponents, exponents
+
+Number = float | jax.Array
+Vector = Float[jax.Array | np.ndarray, " n"]
+Matrix = Float[jax.Array | np.ndarray, "n m"]
+Square = Float[jax.Array | np.ndarray, "n n"]
 
 
 class AbstractNoise(eqx.Module):
-    """A law of a noise vector, independent over time and of everything else."""
+    """A law of a noise vector, independent over time and of everything else.
 
-    mean: eqx.AbstractVar[np.ndarray]
-    covariance: eqx.AbstractVar[np.ndarray]
+    Its parameters are numbers, or traced by JAX: then so are its moments.
+    """
+
+    mean: eqx.AbstractVar[Vector]
+    covariance: eqx.AbstractVar[Square]
 
     @property
     def dimension(self) -> int:
@@ -29,22 +39,28 @@ class AbstractNoise(eqx.Module):
         """Draw one vector; shape (dimension,)."""
         raise NotImplementedError
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return E[n_1^powers[0] n_2^powers[1] ...]."""
         raise NotImplementedError
 
 
 class Gaussian(AbstractNoise):
-    """Gaussian noise with the given covariance and mean (zero unless given)."""
+    """Gaussian noise with the given covariance and mean (zero unless given).
 
-    covariance: np.ndarray
-    mean: np.ndarray
-    factor: np.ndarray  # A with A A' = covariance
+    Shapes: covariance (n, n), mean (n,).
+    """
 
-    def __init__(self, covariance_: Any, mean: Any = None):
+    covariance: Square
+    mean: Vector
+    factor: Square  # A with A A' = covariance; its columns are eigenvectors, or of Cholesky's factor where it is traced
+
+    def __init__(self, covariance_: ArrayLike, mean: ArrayLike | None = None):
         self.covariance = covariance("noise covariance", covariance_)
         n = self.covariance.shape[-1]
         self.mean = np.zeros(n) if mean is None else array("noise mean", mean, (n,))
+        if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
+            self.factor = cholesky(jnp.asarray(self.covariance))
+            return
         values, vectors = np.linalg.eigh(self.covariance)
         self.factor = vectors * np.sqrt(np.maximum(values, 0.0))
 
@@ -52,20 +68,20 @@ class Gaussian(AbstractNoise):
         """Draw mean + A w with w standard normal."""
         return jnp.asarray(self.mean + self.factor @ jax.random.normal(key, self.mean.shape, dtype=float))
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return E[n^a] by E[n_i g(n)] = m_i E[g] + sum_j S_ij E[dg/dn_j] (Isserlis, Stein)."""
 
         @cache
-        def expectation(a: Exponents) -> float:
+        def expectation(a: Exponents) -> Number:
             if sum(a) == 0:
                 return 1.0
             i = next(index for index, power in enumerate(a) if power)
             rest = (*a[:i], a[i] - 1, *a[i + 1 :])
-            total = float(self.mean[i]) * expectation(rest)
+            total = plain(self.mean[i]) * expectation(rest)
             for j, power in enumerate(rest):
-                if power and self.covariance[i, j]:
+                if power and not is_zero(self.covariance[i, j]):
                     lower = (*rest[:j], power - 1, *rest[j + 1 :])
-                    total += float(self.covariance[i, j]) * power * expectation(lower)
+                    total += plain(self.covariance[i, j]) * power * expectation(lower)
             return total
 
         return expectation(tuple(powers))
@@ -74,12 +90,12 @@ class Gaussian(AbstractNoise):
 class FiniteSupport(AbstractNoise):
     """Noise that takes the vectors `atoms` (atom, component) with `probabilities`."""
 
-    atoms: np.ndarray
-    probabilities: np.ndarray
-    mean: np.ndarray
-    covariance: np.ndarray
+    atoms: Matrix
+    probabilities: Vector
+    mean: Vector
+    covariance: Square
 
-    def __init__(self, atoms: Any, probabilities_: Any):
+    def __init__(self, atoms: ArrayLike, probabilities_: ArrayLike):
         self.atoms = array("noise atoms", atoms, (None, None))
         self.probabilities = probabilities("noise probabilities", probabilities_, len(self.atoms))
         self.mean = self.probabilities @ self.atoms
@@ -91,33 +107,38 @@ class FiniteSupport(AbstractNoise):
         edges = jnp.cumsum(jnp.asarray(self.probabilities))[:-1]
         return jnp.asarray(self.atoms)[jnp.sum(jax.random.uniform(key, dtype=float) > edges)]
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return sum_s p_s prod_i atom_si^powers_i."""
-        return float(self.probabilities @ np.prod(self.atoms ** np.array(powers), axis=1))
+        return plain(self.probabilities @ library(self.atoms).prod(self.atoms ** np.array(powers), axis=1))
 
 
 class Independent(AbstractNoise):
     """Independent noises one above the other: E[n^a] is the product of the parts' moments."""
 
     parts: tuple[AbstractNoise, ...]
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: Vector
+    covariance: Square
 
     def __init__(self, parts: Sequence[AbstractNoise]):
         self.parts = tuple(parts)
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
-        self.mean = np.concatenate([part.mean for part in self.parts])
-        self.covariance = np.asarray(block_diag(*(part.covariance for part in self.parts)))
+        for part in self.parts:
+            if not isinstance(part, AbstractNoise):
+                raise fail("independent noises", "laws of a noise vector", shown(part))
+        means, blocks = [part.mean for part in self.parts], [part.covariance for part in self.parts]
+        self.mean = library(means).concatenate(means)
+        self.covariance = scipy_for(blocks).linalg.block_diag(*blocks)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw each part."""
         keys = jax.random.split(key, len(self.parts))
         return jnp.concatenate([part.sample(k) for part, k in zip(self.parts, keys, strict=True)])
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return prod_parts E[n_part^a_part]."""
-        value, start = 1.0, 0
+        value: Number = 1.0
+        start = 0
         for part in self.parts:
             own = tuple(powers[start : start + part.dimension])
             start += part.dimension
@@ -131,12 +152,12 @@ class Shaped(AbstractNoise):
     Shapes: matrix (dimension, source.dimension).
     """
 
-    matrix: np.ndarray
+    matrix: Matrix
     source: AbstractNoise
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: Vector
+    covariance: Square
 
-    def __init__(self, matrix: Any, source: AbstractNoise):
+    def __init__(self, matrix: ArrayLike, source: AbstractNoise):
         self.matrix = array("noise matrix", matrix, (None, source.dimension))
         self.source = source
         self.mean = self.matrix @ source.mean
@@ -146,31 +167,34 @@ class Shaped(AbstractNoise):
         """Draw B u."""
         return jnp.asarray(self.matrix) @ self.source.sample(key)
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Return E[prod_i (sum_j B_ij u_j)^a_i], a polynomial in u whose terms' moments are the source's."""
-        polynomial = {(0,) * self.source.dimension: 1.0}
+        polynomial: dict[Exponents, Number] = {(0,) * self.source.dimension: 1.0}
         for i, power in enumerate(powers):
             for _ in range(power):
                 polynomial = _times_linear(polynomial, self.matrix[i])
         return sum(c * (self.source.moment(a) if any(a) else 1.0) for a, c in polynomial.items())
 
 
-def _times_linear(polynomial: dict[Exponents, float], row: np.ndarray) -> dict[Exponents, float]:
+def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
     """Coefficients of p(u) sum_j row_j u_j."""
-    result: dict[Exponents, float] = {}
+    result: dict[Exponents, Number] = {}
     for a, c in polynomial.items():
-        for j in np.flatnonzero(row):
+        for j in (j for j, entry in enumerate(row) if not is_zero(entry)):
             raised = (*a[:j], a[j] + 1, *a[j + 1 :])
-            result[raised] = result.get(raised, 0.0) + c * float(row[j])
+            result[raised] = result.get(raised, 0.0) + c * plain(row[j])
     return result
 
 
-def as_noise(name: str, value: Any, dimension: int) -> AbstractNoise:
+def as_noise(name: str, value: AbstractNoise | ArrayLike, dimension: int) -> AbstractNoise:
     """Take a noise law as it is, or a covariance (or variance) as zero-mean Gaussian noise.
 
     Raises:
         ValueError: not a covariance, or a law of another dimension.
     """
+    if isinstance(value, eqx.Module) and not isinstance(value, AbstractNoise):
+        expected = "a variance, a covariance or a law of a noise vector (Gaussian, FiniteSupport, Independent, Shaped)"
+        raise fail(name, expected, type(value).__name__)
     if not isinstance(value, AbstractNoise):
         return Gaussian(covariance(name, value, dimension))
     if value.dimension != dimension:
@@ -178,8 +202,14 @@ def as_noise(name: str, value: Any, dimension: int) -> AbstractNoise:
     return value
 
 
-def noise_moments(noise: AbstractNoise, order: int) -> dict[Exponents, float]:
-    """All E[n^a] with |a| <= order."""
-    return {
-        powers: noise.moment(powers) for degree in range(order + 1) for powers in exponents(noise.dimension, degree)
-    }
+def components(value: AbstractNoise | ArrayLike) -> int | None:
+    """How many components a noise law or a covariance has; None for a number, which says a variance alone."""
+    if isinstance(value, AbstractNoise):
+        return value.dimension
+    shape = np.shape(value) if not is_traced(value) else jnp.asarray(value).shape
+    return shape[0] if shape else None
+
+
+def noise_vector(noise: AbstractNoise, order: int) -> Vector:
+    """E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
+    return stacked([noise.moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])

@@ -5,23 +5,35 @@ largest matrix that a known matrix A needs is Sym^(k/2)(A).
 """
 
 from functools import cache, reduce, singledispatch
-from itertools import product
-from math import comb, prod
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from heliograph.numerics.check import fail
-from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.numerics.traced import is_traced, plain, stacked
+from heliograph.random_affine.atoms import GainAndNoise, gain_moments, homogeneous
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Mixture, Series
-from heliograph.random_affine.monomials import Exponents, count, exponents, position, product_table, symmetric_power
-from heliograph.random_affine.noise import AbstractNoise
+from heliograph.random_affine.monomials import (
+    Exponents,
+    count,
+    degrees,
+    position,
+    product_table,
+    sum_plan,
+    symmetric_power,
+)
+from heliograph.random_affine.noise import AbstractNoise, Number, noise_vector
+
+Array1 = Float[jax.Array | np.ndarray, " n"]
+Array2 = Float[jax.Array | np.ndarray, "n m"]
 
 
 @singledispatch
-def push(channel: AbstractRandomAffine, order: int, moments: np.ndarray) -> np.ndarray:
+def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
     """E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
 
     The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
@@ -31,86 +43,80 @@ def push(channel: AbstractRandomAffine, order: int, moments: np.ndarray) -> np.n
     Raises:
         ValueError: a vector that does not have one entry for each monomial, or moments of more than the stated memory.
     """
-    result: np.ndarray = channel.moments(order).expect(_checked(channel, order, moments))
-    return result
+    return channel.moments(order).expect(_checked(channel, order, moments))
 
 
 @push.register
-def _(channel: GainAndNoise, order: int, moments: np.ndarray) -> np.ndarray:
+def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
     """(A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
-    homogeneous = np.zeros((channel.outputs + 1, channel.inputs + 1))
-    homogeneous[:-1, :-1], homogeneous[-1, -1] = channel.matrix, 1.0
-    known = push_known(homogeneous, order, _checked(channel, order, moments))
-    gains = np.array([channel.gain.moment(k) for k in range(order + 1)])
-    scaled = known * gains[_degrees(channel.outputs, order)]
-    row, column, noise, weight = _sum_plan(channel.outputs, order)
+    known = push_known(homogeneous(channel.matrix), order, _checked(channel, order, moments))
+    scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
+    row, column, noise, weight = sum_plan(channel.outputs, order)
     terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
-    return np.bincount(row, terms, minlength=len(scaled))
+    if is_traced(terms):
+        return jnp.bincount(row, terms, length=len(scaled))
+    return np.bincount(row, np.asarray(terms), minlength=len(scaled))
 
 
 @push.register
-def _(channel: Series, order: int, moments: np.ndarray) -> np.ndarray:
+def _(channel: Series, order: int, moments: Array1) -> Array1:
     return reduce(lambda m, part: push(part, order, m), channel.maps, moments)
 
 
 @push.register
-def _(channel: Mixture, order: int, moments: np.ndarray) -> np.ndarray:
-    parts = np.array([push(part, order, moments) for part in channel.maps])
-    result: np.ndarray = channel.choice.probabilities @ parts
-    return result
+def _(channel: Mixture, order: int, moments: Array1) -> Array1:
+    parts = [push(part, order, moments) for part in channel.maps]
+    return channel.choice.probabilities @ stacked(parts)
 
 
-def push_known(homogeneous: np.ndarray, order: int, moments: np.ndarray) -> np.ndarray:
+def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
     """E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
 
     Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
     """
+    result: Array1
     if order % 2:
-        result: np.ndarray = symmetric_power(homogeneous, order) @ moments
+        result = symmetric_power(homogeneous, order) @ moments
         return result
     outputs, inputs = homogeneous.shape
     lifted = symmetric_power(homogeneous, order // 2)
     second = lifted @ second_moments(moments, inputs, order // 2) @ lifted.T
-    return np.asarray(second.reshape(-1)[_one_place(outputs, order // 2)])
-
-
-def noise_vector(noise: AbstractNoise, order: int) -> np.ndarray:
-    """E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
-    moment = noise.moment
-    return np.array([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])
+    result = second.reshape(-1)[_one_place(outputs, order // 2)]
+    return result
 
 
 class Tabulated(AbstractNoise):
     """A noise whose moments up to an order were computed once, for models that read them at every step."""
 
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: Array1
+    covariance: Array2
     source: AbstractNoise
-    table: dict[Exponents, float] = eqx.field(static=True)
+    table: Array1
+    order: int = eqx.field(static=True)
 
     def __init__(self, source: AbstractNoise, order: int):
         self.mean, self.covariance, self.source = source.mean, source.covariance, source
-        powers = [a[:-1] for a in exponents(source.dimension + 1, order)]
-        self.table = dict(zip(powers, noise_vector(source, order).tolist(), strict=True))
+        self.table, self.order = noise_vector(source, order), order
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw from the law itself."""
         return self.source.sample(key)
 
-    def moment(self, powers: Exponents) -> float:
+    def moment(self, powers: Exponents) -> Number:
         """Look E[n^a] up."""
-        return self.table[tuple(powers)]
+        return plain(self.table[position(len(powers) + 1, self.order)[(*powers, self.order - sum(powers))]])
 
 
-def second_moments(moments: np.ndarray, variables: int, degree: int) -> np.ndarray:
+def second_moments(moments: Array1, variables: int, degree: int) -> Array2:
     """E[Y Y'] of the monomials Y of `degree` in (y, 1), gathered from the moments of order 2 degree; last row E[Y'].
 
     Shapes: (C(p + 2 k, 2 k),) -> (C(p + k, k), C(p + k, k)), with variables p + 1.
     """
-    return np.asarray(moments[product_table(variables, degree, degree)])
+    return moments[product_table(variables, degree, degree)]
 
 
-def _checked(channel: AbstractRandomAffine, order: int, moments: np.ndarray) -> np.ndarray:
+def _checked(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+    check_forgets("channel of a lift", channel)
     expected = count(channel.inputs + 1, order)
     if np.shape(moments) != (expected,):
         raise fail(f"moments of order {order}", f"shape ({expected},)", f"shape {np.shape(moments)}")
@@ -124,23 +130,3 @@ def _one_place(variables: int, degree: int) -> np.ndarray:
     places = np.zeros(count(variables, 2 * degree), dtype=np.int64)
     places[table] = np.arange(table.size)
     return places
-
-
-@cache
-def _degrees(dimension: int, order: int) -> np.ndarray:
-    """Degree of each monomial in the variables other than 1."""
-    return np.array([order - powers[-1] for powers in exponents(dimension + 1, order)])
-
-
-@cache
-def _sum_plan(dimension: int, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(y + n)^a = sum_b C(a, b) n^(a-b) y^b as four columns: place of a, of b, of a - b, and C(a, b)."""
-    places, terms = position(dimension + 1, order), []
-    for row, powers in enumerate(exponents(dimension + 1, order)):
-        a = powers[:-1]
-        for b in product(*(range(x + 1) for x in a)):
-            rest = tuple(x - y for x, y in zip(a, b, strict=True))
-            weight = prod(comb(x, y) for x, y in zip(a, b, strict=True))
-            terms.append((row, places[(*b, order - sum(b))], places[(*rest, order - sum(rest))], weight))
-    row_, column, noise, weight_ = np.array(terms, dtype=np.int64).T
-    return row_, column, noise, weight_

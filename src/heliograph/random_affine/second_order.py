@@ -4,14 +4,22 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from heliograph.numerics.small_matrix import add, contract, diagonal
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
-from heliograph.random_affine.combine import Stack
+from heliograph.numerics.traced import is_traced, library, stacked
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, check_forgets
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
-from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.monomials import product_table
 
 PROPORTIONAL_TOLERANCE = 1e-12  # relative: two tensors computed by different sums are one multiple of the other
+
+
+Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
+Matrix = Float[jax.Array | np.ndarray, "m p"]
 
 
 class QuadraticMap(eqx.Module):
@@ -23,8 +31,8 @@ class QuadraticMap(eqx.Module):
     Shapes: center, radius (m, m, p + 1, p + 1).
     """
 
-    center: np.ndarray
-    radius: np.ndarray
+    center: Tensor
+    radius: Tensor
 
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
@@ -37,29 +45,38 @@ class QuadraticMap(eqx.Module):
 class SecondOrder(eqx.Module):
     """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
 
-    gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
+    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
     shift: ((M_v - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored).
 
     nominal: the spread under the nominal law itself.
 
-    Shapes: gain (m, p), offset (m,).
+    Shapes: mean_gain (m, p), offset (m,).
     """
 
-    gain: np.ndarray
-    offset: np.ndarray
+    mean_gain: Matrix
+    offset: Float[jax.Array | np.ndarray, " m"]
     spread: QuadraticMap
     shift: QuadraticMap
     power: QuadraticMap
     nominal: QuadraticMap
     uncertain: bool = eqx.field(static=True)
 
-    @property
-    def random_gain(self) -> bool:
-        """Whether z depends on y through anything but a known gain."""
-        block = np.abs(np.asarray(self.spread.center)[..., :-1, :]) + np.abs(
-            np.asarray(self.spread.radius)[..., :-1, :]
-        )
-        return bool(np.any(block > 0)) or self.uncertain
+
+def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
+    """Whether z depends on y through anything but a known gain; a law with traced parameters counts as random."""
+    if described.uncertain or is_traced(described.spread):
+        return described.uncertain or not _has_constant_gain(channel)
+    block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
+    return bool(np.any(block > 0)) and not _has_constant_gain(channel)
+
+
+def _has_constant_gain(channel: AbstractRandomAffine) -> bool:
+    match channel:
+        case GainAndNoise():
+            return isinstance(channel.law, Constant)
+        case Series() | Stack():
+            return all(_has_constant_gain(part) for part in channel.maps)
+    return False
 
 
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
@@ -69,18 +86,19 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     multilinear (or convex) functions of the probabilities have their maxima.
 
     Raises:
-        ValueError: more corner laws than can be listed in a channel that is no series or stack.
+        ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """
+    check_forgets("channel of a filter", channel)
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
     if _is_known(channel):
         spread, shift, power = _tensors(nominal, mean)
-        parts = [QuadraticMap(t, np.zeros_like(t)) for t in (spread, shift, power)]
+        parts = [QuadraticMap(t, np.zeros(t.shape)) for t in (spread, shift, power)]
     elif isinstance(channel, Stack):
         parts = _from_stack(channel)
     elif _few_corners(channel):
         stacks = zip(*(_tensors(extreme.moments(2), mean) for extreme in channel.extremes()), strict=True)
-        parts = [_dominate(np.array(tensors), mean) for tensors in stacks]
+        parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
     return SecondOrder(
@@ -92,7 +110,7 @@ def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
     """Cov(z | y) under the nominal law."""
     nominal = channel.moments(2)
     spread = _tensors(nominal, nominal.mean[:-1])[0]
-    return QuadraticMap(spread, np.zeros_like(spread))
+    return QuadraticMap(spread, np.zeros(spread.shape))
 
 
 def _few_corners(channel: AbstractRandomAffine) -> bool:
@@ -109,65 +127,69 @@ def _is_known(channel: AbstractRandomAffine) -> bool:
         return False
 
 
-def second_moment_tensor(matrix: np.ndarray, outputs: int, inputs: int) -> np.ndarray:
+def second_moment_tensor(matrix: Matrix, outputs: int, inputs: int) -> Tensor:
     """E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, symmetric in (i, j) and in (a, b), from E[Sym^2(H)]."""
-    tensor = np.zeros((outputs, outputs, inputs + 1, inputs + 1))
-    columns = [np.repeat(np.arange(inputs + 1), powers) for powers in exponents(inputs + 1, 2)]
-    for row, powers in zip(matrix, exponents(outputs + 1, 2), strict=True):
-        if powers[-1]:
-            continue
-        i, j = np.repeat(np.arange(outputs), powers[:-1])
-        for value, (a, b) in zip(row, columns, strict=True):
-            for first, second in {(a, b), (b, a)}:
-                tensor[i, j, first, second] = tensor[j, i, first, second] = value / len({(a, b), (b, a)})
-    return tensor
+    rows = product_table(outputs + 1, 1, 1)[:-1, :-1]
+    columns = product_table(inputs + 1, 1, 1)
+    shares = np.where(np.eye(inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b stands at (a, b) and at (b, a)
+    return matrix[rows[:, :, None, None], columns] / shares
 
 
-def symmetric_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
     """(A y)(B y)' as a tensor, made symmetric in the two factors y."""
-    forward = np.einsum("ia,jb->ijab", a, b)
-    result: np.ndarray = (forward + forward.swapaxes(2, 3)) / 2
-    return result
+    forward: Tensor = library(a, b).einsum("ia,jb->ijab", a, b)
+    return (forward + forward.swapaxes(2, 3)) / 2
 
 
-def _tensors(moments: Moments, mean: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
     own = moments.mean[:-1]
     spread = raw - symmetric_product(mean, own) - symmetric_product(own, mean) + symmetric_product(mean, mean)
-    power = raw.copy()
-    power[..., -1, :] = power[..., :, -1] = 0.0
-    return spread, symmetric_product(own - mean, own - mean), power
+    return spread, symmetric_product(own - mean, own - mean), _of_signal(raw)
 
 
-def _dominate(tensors: np.ndarray, mean: np.ndarray) -> QuadraticMap:
-    """One map above all of the (law, m, m, p + 1, p + 1) tensors."""
+def _of_signal(tensor: Tensor) -> Tensor:
+    """The tensor without its last row and column, those of the constant 1."""
+    signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
+    result: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
+    return result
+
+
+def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
+    """One map above all of the (law, m, m, p + 1, p + 1) tensors.
+
+    Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
+    noise; else the middle of the range of each entry, with its half as radius.
+    """
+    xp = library(tensors)
     low, high = tensors.min(axis=0), tensors.max(axis=0)
-    center, radius = (low + high) / 2, (high - low) / 2
-    exact = _dominate_common_gain(tensors, mean)
-    if exact is not None:
-        return QuadraticMap(exact, np.zeros_like(exact))
-    return QuadraticMap(center, radius)
+    exact, holds = _common_gain(tensors, mean)
+    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
 
 
-def _dominate_common_gain(tensors: np.ndarray, mean: np.ndarray) -> np.ndarray | None:
-    """The dominating tensor where y enters as s_v M y y' M' and the noise part has a largest matrix; None otherwise."""
+def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+    """The tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
+    xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    scale = np.max(np.abs(tensors), initial=0.0)
-    size = float(np.sum(shape**2))
-    multiples = np.einsum("vijab,ijab->v", gains, shape) / size if size else np.zeros(len(gains))
-    residual = np.max(np.abs(gains - multiples[:, None, None, None, None] * shape), initial=0.0)
-    if residual > PROPORTIONAL_TOLERANCE * scale or np.max(np.abs(cross), initial=0.0) > PROPORTIONAL_TOLERANCE * scale:
-        return None
-    largest = noises[np.argmax(np.trace(noises, axis1=1, axis2=2))]
-    gaps = np.linalg.eigvalsh(largest - noises)
-    if np.min(gaps, initial=0.0) < -PROPORTIONAL_TOLERANCE * scale:
-        return None
-    result: np.ndarray = np.zeros_like(tensors[0])
-    result[..., :-1, :-1] = np.max(multiples) * shape
-    result[..., -1, -1] = largest
-    return result
+    tolerance = PROPORTIONAL_TOLERANCE * xp.max(xp.abs(tensors), initial=0.0)
+    size = xp.sum(shape**2)
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
+    residual = xp.max(xp.abs(gains - multiples[:, None, None, None, None] * shape), initial=0.0)
+    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
+    gaps = xp.linalg.eigvalsh(_still(largest - noises))
+    holds = (residual <= tolerance) & (xp.max(xp.abs(cross), initial=0.0) <= tolerance)
+    corner = np.zeros((mean.shape[1], mean.shape[1]))
+    corner[-1, -1] = 1.0
+    widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
+    exact = widened + largest[:, :, None, None] * corner
+    return exact, holds & (xp.min(gaps, initial=0.0) >= -tolerance)
+
+
+def _still(value: Matrix) -> Matrix:
+    """What a decision is made on, which has no derivative."""
+    return jax.lax.stop_gradient(value) if is_traced(value) else value
 
 
 def _from_stack(channel: Stack) -> list[QuadraticMap]:
@@ -175,47 +197,53 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
 
     E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
     """
-    n, columns = channel.outputs, channel.inputs + 1
-    center = [np.zeros((n, n, columns, columns)) for _ in range(3)]
-    radius = [np.zeros((n, n, columns, columns)) for _ in range(3)]
-    reach, mean, start = np.zeros((n, columns)), channel.moments(1).mean[:-1], 0
+    n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
+    blocks: list[list[QuadraticMap]] = []
+    reach = []
     for part in channel.maps:
-        rows = slice(start, start + part.outputs)
-        start += part.outputs
+        stop = start + part.outputs
         own = second_order(part)
         low, high = moment_interval(part, 1)
-        reach[rows] = np.maximum(np.abs(high[:-1] - mean[rows]), np.abs(low[:-1] - mean[rows]))
-        for c, r, quadratic in zip(center, radius, (own.spread, own.shift, own.power), strict=True):
-            c[rows, rows], r[rows, rows] = quadratic.center, quadratic.radius
+        xp = library(low, high, mean)
+        reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
+        blocks.append([_on_diagonal(q, start, n) for q in (own.spread, own.shift, own.power)])
+        start = stop
     label = np.repeat(np.arange(len(channel.maps)), [part.outputs for part in channel.maps])
     apart = (label[:, None] != label[None, :])[:, :, None, None]
-    size = np.abs(mean)
-    gain = np.concatenate([mean[:, :-1], np.zeros((n, 1))], axis=1)
-    cross = symmetric_product(reach, reach)
-    power_cross = symmetric_product(size, reach) + symmetric_product(reach, size) + cross
-    power_cross[..., -1, :] = power_cross[..., :, -1] = 0.0
-    center[2] += apart * symmetric_product(gain, gain)
-    for r, extra in zip(radius, (cross, cross, power_cross), strict=True):
-        r += apart * extra
-    return [QuadraticMap(c, r) for c, r in zip(center, radius, strict=True)]
+    xp = library(mean, reach)
+    far, size = xp.concatenate(reach), xp.abs(mean)
+    cross = symmetric_product(far, far)
+    power_cross = _of_signal(symmetric_product(size, far) + symmetric_product(far, size) + cross)
+    centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
+    radii = (cross, cross, power_cross)
+    return [
+        QuadraticMap(sum(q.center for q in own) + apart * center, sum(q.radius for q in own) + apart * radius)
+        for own, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+    ]
 
 
-def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: np.ndarray) -> list[QuadraticMap]:
+def _on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
+    """The map of outputs start, start + 1, ... among all of them, zero elsewhere."""
+    margin = (start, outputs - start - block.center.shape[0])
+    widths = [margin, margin, (0, 0), (0, 0)]
+    return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
+
+
+def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
     """Maps from the range of each moment: raw - H0 m' - m H0' + H0 H0' with intervals for raw and m."""
     low, high = moment_interval(channel, 2)
+    xp = library(low, high, mean)
     middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
     half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
-    raw_radius = np.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
+    raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
     mean_radius = half.mean[:-1]
     spread, _, power = _tensors(middle, mean)
-    reach = np.abs(middle.mean[:-1] - mean) + mean_radius
-    power_radius = raw_radius.copy()
-    power_radius[..., -1, :] = power_radius[..., :, -1] = 0.0
+    reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
     spread_radius = (
-        raw_radius + symmetric_product(np.abs(mean), mean_radius) + symmetric_product(mean_radius, np.abs(mean))
+        raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
     )
     return [
         QuadraticMap(spread, spread_radius),
-        QuadraticMap(np.zeros_like(spread), symmetric_product(reach, reach)),
-        QuadraticMap(power, power_radius),
+        QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
+        QuadraticMap(power, _of_signal(raw_radius)),
     ]

@@ -16,7 +16,7 @@ from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_horizon, fail
 from heliograph.random_affine.base import AbstractRandomAffine
 
 FUSED = "fused"  # the name under which results of several nodes stand
@@ -233,9 +233,7 @@ class Network(eqx.Module):
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
-        covered = steps_covered(self)
-        if covered is not None and horizon > covered:
-            raise fail("horizon", f"at most {covered} steps, which what varies over time covers", horizon)
+        check_horizon(horizon, steps_covered(self))
 
 
 def _check_received(name: str, item: AbstractFilter, received: int) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, check_times, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.simulation.air import AbstractAir, air_of
 from heliograph.simulation.by_run import trajectories
@@ -104,12 +104,7 @@ def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, t
     }
     network.check_horizon(steps)
     u = _check_inputs(network, inputs, steps)
-    clock = np.arange(steps, dtype=np.float64) if time is None else array("time", time, (steps,))
-    if np.any(np.diff(clock) < 0):
-        row = int(np.flatnonzero(np.diff(clock) < 0)[0]) + 1
-        raise fail(
-            "time", "times that do not go backwards", f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
-        )
+    clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
     found = _run_filters(AllFilters(network), grouped, u)
     return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)

@@ -11,7 +11,7 @@ import heliograph as hg
 from heliograph.examples.motor_drive.drive import Drive, simulate_drive
 from heliograph.examples.motor_drive.listeners import network, received
 from heliograph.examples.motor_drive.machine import RATED, ROTOR_RESISTANCE, Machine, draw_truth, euler, plant
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import compiled
 
 SEEDS = 20
@@ -153,8 +153,7 @@ def compute(count: int, seed: int = 0, advance: Callable[[str], None] = lambda w
         ValueError: fewer than 2 seeds.
         ModuleNotFoundError: the extra `motor` is not installed.
     """
-    if check_count("seeds", count) < 2:
-        raise fail("seeds", "at least 2", count)
+    check_count("seeds", count, 2)
     scores: dict[str, dict[str, dict[str, Score]]] = {}
     shown: dict[str, dict[str, np.ndarray]] = {}
     failures, seeds = [], range(seed, seed + count)

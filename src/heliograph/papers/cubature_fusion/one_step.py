@@ -53,7 +53,7 @@ def channel_of(s: Setting) -> Channel:
 def moments(law: hg.Discrete) -> tuple[float, float, float, float]:
     """First and second nominal moments with their radii, (11) and (18)."""
     v, r = law.values, law.radius
-    return law.moment(1), law.moment(2), float(np.abs(v) @ r), float(v**2 @ r)
+    return float(law.moment(1)), float(law.moment(2)), float(np.abs(v) @ r), float(v**2 @ r)
 
 
 def variance_bound(law: hg.Discrete, sign: int) -> float:
@@ -166,7 +166,7 @@ def _random_channel(rng: np.random.Generator) -> tuple[Channel, tuple[Array, Arr
         corners = [corner for corner in law.extremes() if isinstance(corner, hg.Discrete)]
         corner = corners[rng.integers(len(corners))]
         laws.append(law)
-        truth.append(corner.probabilities)
+        truth.append(np.asarray(corner.probabilities))
     return Channel(float(rng.uniform(0.1, 2)), 1.0, 1e-4 * np.eye(2), 1e-4 * np.eye(2), laws[0], laws[1]), (
         truth[0],
         truth[1],

@@ -54,7 +54,7 @@ class Setting:
     @property
     def mean_gain(self) -> float:
         """mu = E xi E gamma, nominal."""
-        return self.relay_gain.moment(1) * self.sensor_gain.moment(1)
+        return float(self.relay_gain.moment(1) * self.sensor_gain.moment(1))
 
 
 PRINTED = Setting(

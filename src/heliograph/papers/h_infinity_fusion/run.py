@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import check_count
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.compute import RUNS, STAGES, Reproduction, reproduction
 from heliograph.papers.h_infinity_fusion.discriminating import NODE, Discriminating
@@ -13,7 +14,6 @@ from heliograph.papers.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZ
 from heliograph.papers.h_infinity_fusion.levels import NodeDesigns
 from heliograph.papers.h_infinity_fusion.statements import statements
 from heliograph.papers.h_infinity_fusion.worst_disturbance import Worst
-from heliograph.papers.runs import check_runs
 from heliograph.papers.statement import Statement
 from heliograph.report.results import Json, Results, write_results
 
@@ -28,7 +28,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
             something else.
         ModuleNotFoundError: an extra of `lmi`, `report`, `sweep` is not installed.
     """
-    count = check_runs(runs, RUNS, 100)
+    count = check_count("runs", RUNS if runs is None else runs, 100)
     work = partial(reproduction, count, seed)
     needs = ("clarabel", "cvxpy", "xarray", "h5netcdf")
     write_results(Path(out) / "h-infinity-fusion", STAGES, work, results, needs)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from heliograph.numerics.check import check_count
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
     RUNS,
@@ -17,7 +18,6 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_over_time,
 )
 from heliograph.papers.quadratic_bias.statements import statements
-from heliograph.papers.runs import check_runs
 from heliograph.report.results import Json, Results, write_results
 
 STAGES = 5
@@ -33,7 +33,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
             or that holds something else.
         ModuleNotFoundError: an extra of `report`, `sweep` is not installed.
     """
-    count = check_runs(runs, RUNS, 100)
+    count = check_count("runs", RUNS if runs is None else runs, 100)
     work = partial(compute, count, seed)
     write_results(Path(out) / "quadratic-bias", STAGES, work, results, ("xarray", "h5netcdf"))
 

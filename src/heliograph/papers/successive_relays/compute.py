@@ -131,7 +131,7 @@ def limits(paper: hg.RelayDesign) -> dict[str, float]:
     }
     covariance, plant, process = setting.INITIAL_COVARIANCE, setting.plant(), setting.process_covariance()
     for _ in range(STEADY):
-        covariance = plant.matrix @ covariance @ plant.matrix.T + process
+        covariance = np.asarray(plant.matrix @ covariance @ plant.matrix.T) + process
     return {**filtered, "nothing_heard": float(np.trace(covariance))}
 
 

@@ -1,0 +1,57 @@
+"""Numbers that are known (NumPy float64) and numbers that JAX traces: arithmetic written once for both.
+
+A model's moments are plain numbers in ordinary use, and functions of traced parameters under `jax.grad`, `jax.jvp` or
+`jax.jit`. What is decided by a number's value (is it zero, is it certain) is decided for known numbers only.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import jax.scipy.linalg
+import jax.scipy.special
+import numpy as np
+import scipy.linalg
+import scipy.special
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether some number in these arrays or lists of numbers is traced."""
+    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def library(*values: Any) -> Any:
+    """numpy for numbers that are known, jax.numpy where one is traced."""
+    return jnp if is_traced(*values) else np
+
+
+def scipy_for(*values: Any) -> Any:
+    """scipy, or jax.scipy where a number is traced."""
+    return jax.scipy if is_traced(*values) else scipy
+
+
+def plain(value: Any) -> float | jax.Array:
+    """A known number as a Python float, a traced one as it is."""
+    result: float | jax.Array = value if is_traced(value) else float(value)
+    return result
+
+
+def stacked(parts: Sequence[Any]) -> jax.Array | np.ndarray:
+    """Numbers or arrays of one shape along a new first axis."""
+    result: jax.Array | np.ndarray = library(parts).stack(parts)
+    return result
+
+
+def is_zero(value: Any) -> bool:
+    """Whether a number is known to be zero."""
+    return not is_traced(value) and not np.any(value)
+
+
+def placed(size: tuple[int, ...], places: Any, values: Any) -> jax.Array | np.ndarray:
+    """An array of zeros with `values` added at `places` (an index of its leading axes), repeated places included."""
+    if is_traced(values):
+        return jnp.zeros(size).at[places].add(values)
+    result = np.zeros(size)
+    np.add.at(result, places, values)
+    return result

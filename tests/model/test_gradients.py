@@ -1,0 +1,200 @@
+"""Models hold what JAX traces: derivatives of a filter's final error covariance are those of finite differences."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special
+
+import heliograph as hg
+from heliograph.random_affine import push
+
+STEPS = 6
+STEP = 1e-5  # of the central differences: their own error is of the order of STEP^2, that of rounding 1e-11
+
+
+def plant_and_sensor(p):
+    """Growth, process noise, initial variance and sensor noise are parameters."""
+    plant = hg.LinearPlant(
+        [[p[0], 0.1], [0.0, 0.8]], [[p[1], 0.02], [0.02, 0.3]], [1.0, -0.5], [[1.0, 0.1], [0.1, p[2]]]
+    )
+    return plant, hg.LinearSensor([[1.0, 0.5]], p[3])
+
+
+def chain(p):
+    """Two hops: the law's parameters, the first hop's noise and power, the second's amplification."""
+    first = hg.hop(hg.Rayleigh(p[0]), p[1], power=p[2])
+    return hg.amplify_and_forward([first, hg.hop(hg.Rician(p[3], p[4]), 0.1, amplification=p[5])])
+
+
+def with_direct(p):
+    """The chain beside a direct hop with shadowing."""
+    return hg.with_direct_link(chain(p[:6]), hg.hop(hg.LogNormal(p[6], p[7]), p[8], power=p[9]))
+
+
+def dropout(p):
+    """A hop that is lost with a probability which is a parameter too, and noise that has a mean."""
+    noise = hg.Gaussian([[p[3]]], [p[4]])
+    return hg.dropout(hg.hop(hg.Nakagami(p[0], p[1]), noise, power=p[2]), p[5])
+
+
+def discrete(p):
+    """Gains of two values, noise of two atoms; the probabilities are parameters."""
+    law = hg.Discrete([p[0], 1.0], [p[1], 1 - p[1]])
+    return hg.hop(law, hg.FiniteSupport([[p[2]], [-0.2]], [p[3], 1 - p[3]]))
+
+
+MODEL = [0.95, 0.4, 0.8, 0.2]
+CHAIN = [0.9, 0.15, 1.3, 0.7, 0.4, 1.5]
+CASES = {
+    "two hops": (chain, CHAIN),
+    "direct hop beside them": (with_direct, [*CHAIN, -0.1, 0.3, 0.2, 0.8]),
+    "dropout": (dropout, [1.5, 1.2, 0.9, 0.3, 0.4, 0.7]),
+    "discrete": (discrete, [0.3, 0.4, 0.5, 0.3]),
+}
+
+
+def final_error(channel, p):
+    """Trace of the last error covariance; plant, sensor, channel and filter are built inside."""
+    filter_ = hg.linear_filter(*plant_and_sensor(p), channel(p[len(MODEL) :]))
+    assert filter_.claim == "exact"
+    nothing = jnp.zeros(filter_.channel.mean_gain.shape[0])  # the covariance does not depend on what is measured
+
+    def body(state, k):
+        return filter_.step(state, nothing, (), k)[0], None
+
+    return jnp.trace(jax.lax.scan(body, filter_.init(), jnp.arange(STEPS))[0].covariance)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_the_gradient_of_the_final_error_is_that_of_finite_differences(name):
+    channel, parameters = CASES[name]
+    p = np.array([*MODEL, *parameters])
+
+    def error(p):
+        return final_error(channel, p)
+
+    direction = np.cos(np.arange(len(p)))
+    with jax.enable_x64(True):
+        both = jax.jit(lambda p: (jax.value_and_grad(error)(p), jax.jvp(error, (p,), (direction,))[1]))(p)
+        (value, gradient), along = jax.tree.map(np.asarray, both)
+    each = STEP * np.eye(len(p))
+    differences = [(concrete(channel, p + e) - concrete(channel, p - e)) / (2 * STEP) for e in each]
+    np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(along, gradient @ direction, rtol=1e-9)
+    np.testing.assert_allclose(value, concrete(channel, p), rtol=1e-12)
+
+
+def concrete(channel, p):
+    """The same from plain numbers, through the public filter, step by step."""
+    filter_ = hg.linear_filter(*plant_and_sensor(p), channel(p[len(MODEL) :]))
+    state = filter_.init()
+    for k in range(STEPS):
+        state, estimate = filter_.step(state, np.zeros(filter_.channel.mean_gain.shape[0]), (), k)
+    return np.trace(estimate.covariance)
+
+
+LAWS = {
+    "rayleigh": (hg.Rayleigh, [0.7]),
+    "rician": (hg.Rician, [1.5, 0.4]),
+    "rician without sight": (hg.Rician, [0.0, 0.4]),
+    "rician with much sight": (hg.Rician, [30.0, 0.4]),
+    "nakagami": (hg.Nakagami, [1.7, 2.0]),
+    "log-normal": (hg.LogNormal, [-0.2, 0.3]),
+    "discrete": (lambda a, p: hg.Discrete([a, 1.0], [p, 1 - p]), [0.0, 0.3]),
+    "bernoulli": (hg.bernoulli, [0.8]),
+    "moments": (lambda m, s: hg.GivenMoments([m, s, 2.0, 5.0]), [1.0, 1.5]),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name):
+    make, parameters = LAWS[name]
+    p = np.array(parameters)
+    each = np.eye(len(p)) * STEP
+    orders = range(5)
+
+    def moments(p):
+        law = make(*p)
+        return jnp.stack([jnp.asarray(law.moment(k), dtype=float) for k in orders])
+
+    with jax.enable_x64(True):
+        value, slope = jax.jit(lambda p: (moments(p), jax.jacfwd(moments)(p)))(p)
+    known = [make(*p).moment(k) for k in orders]
+    assert all(isinstance(m, float) for m in known)
+    np.testing.assert_allclose(value, known, rtol=1e-13)
+    if name == "rician without sight":  # negative sight is refused; moments are even in it, so the slope is zero
+        np.testing.assert_allclose(slope[:, 0], 0.0, atol=1e-12)
+        each = each[1:]
+        slope = slope[:, 1:]
+    rows = [[(make(*(p + e)).moment(k) - make(*(p - e)).moment(k)) / (2 * STEP) for e in each] for k in orders]
+    np.testing.assert_allclose(slope, rows, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("order", range(9))
+@pytest.mark.parametrize("sight", [0.0, 1e-3, 0.5, 2.0, 20.0])
+def test_rician_moments_are_those_of_the_hypergeometric_function(order, sight):
+    expected = 0.3**order * 2 ** (order / 2) * special.gamma(1 + order / 2)
+    expected *= special.hyp1f1(-order / 2, 1.0, -((sight / 0.3) ** 2) / 2)
+    assert hg.Rician(sight, 0.3).moment(order) == pytest.approx(expected, rel=1e-12)
+
+
+def test_noises_and_moments_of_every_map_can_be_traced():
+    """Joint moments to order four of a channel made of everything, and its draws, against their concrete numbers."""
+
+    def make(p):
+        noise = hg.Shaped(
+            [[1.0, p[0]], [0.0, 1.0]], hg.Independent([hg.Gaussian([[p[1]]]), hg.Gaussian([[0.2]], [p[2]])])
+        )
+        relayed = hg.Series([hg.hop(hg.Rayleigh(p[3]), noise), hg.hop(hg.Rician(1.0, p[4]), [[p[1], 0.0], [0.0, 0.3]])])
+        return hg.Stack([hg.dropout(relayed, p[5]), hg.erasure(hg.known([[1.0, p[0]]], [p[2]]), 1.0).base])
+
+    p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
+    with jax.enable_x64(True):
+        one, two, pushed = jax.jit(
+            lambda p: (make(p).moments(1).matrix, make(p).moments(4).matrix, push(make(p), 4, np.ones(15)))
+        )(p)
+    np.testing.assert_allclose(one, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(two, make(p).moments(4).matrix, rtol=1e-12, atol=1e-14)
+    np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
+
+
+def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
+    """The worst cases over a known polytope are functions of the hop's power; the decisions on the way are the same."""
+
+    def make(p):
+        law = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
+        relayed = hg.amplify_and_forward([hg.hop(law, p[0]), hg.hop(law, 0.1, power=p[1])])
+        return relayed, hg.with_direct_link(relayed, hg.hop(hg.Rayleigh(p[2]), 0.1))
+
+    p = np.array([0.2, 1.3, 0.9])
+    for index in range(2):
+        with jax.enable_x64(True):
+            traced = jax.jit(lambda p, index=index: hg.second_order(make(p)[index]))(p)
+        known = hg.second_order(make(p)[index])
+        for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(known), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
+
+
+def test_what_is_decided_by_numbers_refuses_a_trace_in_one_line():
+    with jax.enable_x64(True), pytest.raises(ValueError, match="probability radius: expected zero, where"):
+        jax.jit(lambda p: hg.bernoulli(p, 0.1).moment(1))(0.5)
+    with jax.enable_x64(True), pytest.raises(ValueError, match="probability radius: expected a number, since"):
+        jax.jit(lambda r: hg.bernoulli(0.5, r).moment(1))(0.1)
+    with jax.enable_x64(True), pytest.raises(ValueError, match=r"plant matrix: expected shape \(2, 2\)"):
+        jax.jit(lambda a: hg.LinearPlant(a, np.eye(2), [0, 0], np.eye(2)).matrix)(np.eye(3))
+
+
+def test_a_trace_reads_no_number_to_choose_a_claim():
+    """A constant gain stays one: the filter is the Kalman filter, and exact, whatever is traced."""
+
+    def claim(p):
+        channel = hg.amplify_and_forward([hg.hop(p, 0.1), hg.hop(1.0, p)])
+        filter_ = hg.cubature_filter(*plant_and_sensor(MODEL), channel)
+        assert filter_.claim == "exact"
+        random = hg.cubature_filter(*plant_and_sensor(MODEL), hg.hop(hg.Rayleigh(p), 0.1))
+        assert random.claim == "nominal"
+        return p
+
+    with jax.enable_x64(True):
+        jax.jit(claim)(0.7)
