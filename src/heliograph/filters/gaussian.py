@@ -1,6 +1,6 @@
 """The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -22,7 +22,11 @@ from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import SecondOrder, has_random_gain
+
+
+Each = TypeVar("Each", AbstractRandomAffine, SecondOrder)
 
 
 class Belief(NamedTuple):
@@ -159,7 +163,7 @@ def _build(
     )
 
 
-def _each(item: Any) -> list[Any]:
+def _each(item: Each | OverTime) -> list[Each]:
     return unstack(item) if isinstance(item, OverTime) else [item]
 
 

@@ -88,10 +88,10 @@ def average_noise(path: AbstractRandomAffine, signals: np.ndarray) -> float:
 
 def networks(extra_variance: float) -> Network:
     """The example's node with one more competitor, and a node that hears the ranges without any relay."""
-    node, count = robot.network.nodes["robot"], len(robot.BEACONS)
+    count = len(robot.BEACONS)
     extra = cubature_filter(robot.plant, robot.sensor, hop(1.0, extra_variance, dimension=count))
     direct = cubature_filter(robot.plant, robot.sensor, perfect(count))
-    relayed = Node(node.sensor, node.channel, node.filters | {"extra_noise": extra})
+    relayed = Node(robot.sensor, robot.channel, robot.filters | {"extra_noise": extra})
     return Network(
         robot.plant, {"robot": relayed, "direct": Node(robot.sensor, perfect(count), {"perfect_channel": direct})}
     )
