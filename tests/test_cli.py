@@ -280,14 +280,27 @@ def test_version_and_help(capsys):
     assert "--measurements" in capsys.readouterr().out
 
 
-def test_help_in_a_process_of_its_own_does_not_load_jax():
+def without_jax(arguments) -> str:
+    """What the command prints in a process of its own, which must not load JAX."""
     code = (
-        "import sys; from heliograph.cli import main; code = main(['--help']); "
+        f"import sys; from heliograph.cli import main; code = main({arguments}); "
         "assert not {'jax', 'numpy', 'equinox', 'scipy'} & set(sys.modules); sys.exit(code)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
-    assert "run" in done.stdout and "demo" in done.stdout
+    return done.stdout
+
+
+def test_help_does_not_load_jax():
+    said = without_jax(["--help"])
+    assert "run" in said and "demo" in said and "example" in said
+
+
+def test_lists_do_not_load_jax():
+    lines = without_jax(["example"]).splitlines()
+    assert [line.split()[0] for line in lines] == ["demo", "motor-drive"]
+    assert all(len(line.split()) > 5 for line in lines)
+    assert "cubature-fusion" in without_jax(["reproduce"]).splitlines()
 
 
 def test_a_refusal_in_a_process_of_its_own(folder):
@@ -299,23 +312,6 @@ def test_a_refusal_in_a_process_of_its_own(folder):
     assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, got")
     assert done.stderr.count("\n") == 1 and done.stdout == ""
     assert contents(folder) == before
-
-
-def test_examples_are_listed_without_loading_jax():
-    code = (
-        "import sys; from heliograph.cli import main; code = main(['example']); "
-        "assert not {'jax', 'numpy', 'equinox', 'scipy'} & set(sys.modules); sys.exit(code)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "")
-    lines = done.stdout.splitlines()
-    assert [line.split()[0] for line in lines] == ["demo", "motor-drive"]
-    assert all(len(line.split()) > 5 for line in lines)
-
-
-def test_reproduce_alone_lists_the_methods(capsys):
-    assert cli.main(["reproduce"]) == 0
-    assert "cubature-fusion" in capsys.readouterr().out.splitlines()
 
 
 @pytest.mark.parametrize(

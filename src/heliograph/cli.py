@@ -127,13 +127,12 @@ def reproduce(
     seed: Annotated[int, Parameter(help="Seed of the simulations.")] = 0,
 ) -> None:
     """Run a published method as printed and as improved, and judge each of its statements by this very run."""
-    from heliograph.numerics.check import fail
     from heliograph.papers import METHODS
 
     if method is None:
         print("\n".join(METHODS))
         return
-    from heliograph.numerics.check import check_count
+    from heliograph.numerics.check import check_count, fail
 
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":

@@ -25,7 +25,6 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_order import SecondOrder, has_random_gain
 
-
 Each = TypeVar("Each", AbstractRandomAffine, SecondOrder)
 
 

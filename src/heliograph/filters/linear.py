@@ -76,7 +76,15 @@ class LinearFilter(AbstractFilter):
         signal = _signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         gain, bound = self.update.correct(state.covariance, signal, channel, ~jnp.isnan(z))
         mean, covariance, expected = _used(
-            state.mean, state.covariance, gain, bound, sensor.matrix, sensor.noise.mean, channel.mean_gain, channel.offset, z
+            state.mean,
+            state.covariance,
+            gain,
+            bound,
+            sensor.matrix,
+            sensor.noise.mean,
+            channel.mean_gain,
+            channel.offset,
+            z,
         )
         heard = innovation(z, expected, innovation_covariance(signal, channel))
         return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), heard

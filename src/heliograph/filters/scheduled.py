@@ -42,8 +42,8 @@ class ScheduledFilter(AbstractFilter):
     Predicted is what follows if what the schedule expects arrives, e = G s + g; a correction adds K (z - e) and
     J (z - e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not
     arrive counts as what the filter expected, and from then on the covariance is NaN: none is known any more, and the
-    record says so; what no gain of the step uses cannot be missed (a planned silence). Where data have gaps, use `LinearSystemFilter`, which recomputes its gains. Before its first
-    prediction a schedule estimates nothing (NaN).
+    record says so; what no gain of the step uses cannot be missed (a planned silence). Where data have gaps, use
+    `LinearSystemFilter`, which recomputes its gains. Before its first prediction a schedule estimates nothing (NaN).
 
     Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
     """

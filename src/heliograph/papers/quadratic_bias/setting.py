@@ -88,7 +88,6 @@ def channel() -> AbstractRandomAffine:
 
 OUTAGE_HORIZON = 150
 OUTAGE_SETTLED = 100
-OUTAGE_STATES = ("x", "bias")
 SHOCK_PROBABILITY = 0.005  # one large shock in 200 steps
 
 
