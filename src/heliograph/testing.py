@@ -145,7 +145,7 @@ def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
         except ValueError as error:
             assert str(error).startswith(name), f"{name}: expected an error that names it, got {error}"
         else:
-            raise AssertionError(f"{name}: expected a refusal of what does not fit (@prediction and @correction do)")
+            raise AssertionError(f"{name}: expected a refusal of what does not fit (@predicts and @corrects do)")
 
 
 def _check_estimate(estimate: Estimate, n: int, k: int) -> None:

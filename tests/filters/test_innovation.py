@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.filters.innovation import innovation, log_density
+from heliograph.filters.innovation import gaussian_innovation, log_density
 
 ROUNDING = 1e-12
 
@@ -31,7 +31,7 @@ def test_it_is_scipys(m, units):
 def test_components_that_did_not_arrive_are_left_out():
     covariance = np.array([[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 3.0]])
     with jax.enable_x64(True):
-        found = innovation(np.array([1.0, np.nan, -2.0]), np.array([0.5, 0.0, 0.0]), covariance)
+        found = gaussian_innovation(np.array([1.0, np.nan, -2.0]), np.array([0.5, 0.0, 0.0]), covariance)
     left = np.array([0, 2])
     assert np.array_equal(np.isnan(found.value), [False, True, False])
     assert np.array_equal(np.isnan(found.covariance), np.isnan(found.value)[:, None] | np.isnan(found.value))

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.base import correction, prediction
+from heliograph.filters.base import corrects, predicts
 from heliograph.testing import check_filter
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1, [0.0, 1.0], 0.3, input_matrix=[[1.0], [0.5]])
@@ -242,11 +242,11 @@ class Silent(hg.AbstractFilter):
     def init(self):
         return np.zeros(2)
 
-    @prediction
+    @predicts
     def predict(self, state, u=(), k=0):
         return state
 
-    @correction
+    @corrects
     def correct(self, state, z, k=0):
         nothing = jax.numpy.where(jax.numpy.isnan(z[0]), 0.0, jax.numpy.nan)
         return state, hg.Innovation(z, jax.numpy.full((1, 1), jax.numpy.nan), nothing)

@@ -29,7 +29,7 @@ class AbstractFilter(eqx.Module):
 
     It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
     what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
-    give the four fields, `init`, `predict` under `@prediction`, `correct` under `@correction`, and `estimate`.
+    give the four fields, `init`, `predict` under `@predicts`, `correct` under `@corrects`, and `estimate`.
     """
 
     claim: eqx.AbstractVar[Claim]
@@ -82,12 +82,12 @@ def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) 
     return after, item.after_step(after, k)
 
 
-def prediction(predict: Callable[P, R]) -> Callable[P, R]:
+def predicts(predict: Callable[P, R]) -> Callable[P, R]:
     """Check what a filter's `predict(state, u, k)` is given, hand it arrays, compile it."""
     return _checked(predict, given)
 
 
-def correction(correct: Callable[P, R]) -> Callable[P, R]:
+def corrects(correct: Callable[P, R]) -> Callable[P, R]:
     """Check what a filter's `correct(state, z, k)` is given, hand it arrays, compile it."""
     return _checked(correct, measured)
 

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
-from heliograph.filters.innovation import innovation, innovation_covariance
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
@@ -64,7 +64,7 @@ class GaussianFilter(AbstractFilter):
         """The prior."""
         return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
 
-    @prediction
+    @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
         plant, u = at(self.plant, k), jnp.asarray(u)
@@ -74,7 +74,7 @@ class GaussianFilter(AbstractFilter):
             moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
         return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
-    @correction
+    @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         sensor, channel = at(self.sensor, k), at(self.channel, k)
@@ -104,7 +104,7 @@ def corrected(
     gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
     after = _use(prior, gain, bound, signal.mean, channel, z)
     expected = channel.mean_gain @ signal.mean + channel.offset
-    return after, innovation(z, expected, innovation_covariance(signal, channel))
+    return after, gaussian_innovation(z, expected, innovation_covariance(signal, channel))
 
 
 @runs_last

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.growth_system import GrowthSystem
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -49,13 +49,13 @@ class HInfinityFilter(AbstractFilter):
         mean = jnp.asarray(self.initial_mean)
         return Pending(mean, jnp.zeros_like(mean))
 
-    @prediction
+    @predicts
     def predict(self, state: Pending, u: ArrayLike = (), k: Step = 0) -> Pending:
         """Over step k, with what came before it."""
         mean = at(self.plant, k).transition(state.mean, jnp.asarray(u)) + state.correction
         return Pending(mean, jnp.zeros_like(mean))
 
-    @correction
+    @corrects
     def correct(self, state: Pending, z: ArrayLike, k: Step = 0) -> tuple[Pending, Innovation]:
         """Keep what z will correct in the next estimate; this one stays."""
         value = jnp.asarray(z) - at(self.expected_gain, k) @ at(self.sensor, k).measure(state.mean)

@@ -20,7 +20,9 @@ OFF_SUPPORT = 1e-6  # standard deviations, and
 OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
 
-def innovation(z: Float[Array, " m"], expected: Float[Array, " m"], covariance: Float[Array, "m m"]) -> Innovation:
+def gaussian_innovation(
+    z: Float[Array, " m"], expected: Float[Array, " m"], covariance: Float[Array, "m m"]
+) -> Innovation:
     """z - expected and its Gaussian log-likelihood; NaN where a component did not arrive."""
     present = ~jnp.isnan(z)
     value, both = jnp.asarray(z - expected), present[:, None] & present

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, describe
-from heliograph.filters.innovation import innovation, innovation_covariance, no_innovation
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
@@ -61,7 +61,7 @@ class LinearFilter(AbstractFilter):
         mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
         return LinearBelief(mean, spread, mean, spread)
 
-    @prediction
+    @predicts
     def predict(self, state: LinearBelief, u: ArrayLike = (), k: Step = 0) -> LinearBelief:
         """Both moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
@@ -69,7 +69,7 @@ class LinearFilter(AbstractFilter):
         error, own = (_moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
         return LinearBelief(*error, *own)
 
-    @correction
+    @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Use what arrived of z."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
@@ -86,7 +86,7 @@ class LinearFilter(AbstractFilter):
             channel.offset,
             z,
         )
-        heard = innovation(z, expected, innovation_covariance(signal, channel))
+        heard = gaussian_innovation(z, expected, innovation_covariance(signal, channel))
         return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), heard
 
     @in_float64
@@ -182,14 +182,14 @@ class OpenLoop(AbstractFilter):
         """The prior."""
         return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
 
-    @prediction
+    @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
         return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
-    @correction
+    @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """z, of whatever length, is not used."""
         return state, no_innovation()

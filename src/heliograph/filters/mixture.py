@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -71,14 +71,14 @@ class MixtureFilter(AbstractFilter):
         start = at(self.plant, 0)
         return Belief(jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance))
 
-    @prediction
+    @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """A m + B u + E w and A P A' + Q."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
         return Belief(plant.transition(state.mean, u) + plant.noise_mean(), spread)
 
-    @correction
+    @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Weigh the combinations by what arrived of z."""
         c, z, (mean, spread) = at(self.components, k), jnp.asarray(z), state

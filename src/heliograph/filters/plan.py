@@ -6,8 +6,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
-from heliograph.filters.innovation import innovation
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.innovation import gaussian_innovation
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -60,19 +60,19 @@ class PlannedFilter(AbstractFilter):
         """The mean at the start."""
         return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
 
-    @prediction
+    @predicts
     def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
         """F m + f; the input is in f."""
         p: Plan = at(self.steps, k)
         return PlannedMean(_affine(p.transition, state.mean, p.drift), _stage(state, 2 * k + 1))
 
-    @correction
+    @corrects
     def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
         """m + K (z - C m - c)."""
         p: Plan = at(self.steps, k)
         expected = _affine(p.output, state.mean, p.offset)
         mean = _affine(p.gain, jnp.asarray(z) - expected, state.mean)
-        return PlannedMean(mean, _stage(state, 2 * k + 2)), innovation(jnp.asarray(z), expected, p.innovation)
+        return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(jnp.asarray(z), expected, p.innovation)
 
     @in_float64
     def estimate(self, state: PlannedMean) -> Estimate:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.innovation import log_density
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.linear.lift import lifted_system
@@ -62,12 +62,12 @@ class PolynomialFilter(AbstractFilter):
         """The inner filter's state."""
         return self.inner.init()
 
-    @prediction
+    @predicts
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """The inner filter's prediction."""
         return self.inner.predict(state, u, k)
 
-    @correction
+    @corrects
     def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
         """Lift z and correct the inner filter."""
         after, heard = self.inner.correct(state, monomials(jnp.asarray(z), self.degree)[:-1], k)
@@ -165,12 +165,12 @@ class MemoryFilter(AbstractFilter):
         """Both filters' starts."""
         return MemoryState(self.linear.init(), self.products.init())
 
-    @prediction
+    @predicts
     def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
         """Both filters' predictions."""
         return MemoryState(self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k))
 
-    @correction
+    @corrects
     def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
         """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
         z = jnp.asarray(z)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import equinox as eqx
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, GaussianFilter
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.check import fail
@@ -40,13 +40,13 @@ class PredictionFilter(AbstractFilter):
         """The prior of the filter."""
         return Ahead(self.base.init(), self.base.init())
 
-    @prediction
+    @predicts
     def predict(self, state: Ahead, u: ArrayLike = (), k: Step = 0) -> Ahead:
         """The filter's prediction, kept beside what z_k will make of it."""
         prior = self.base.predict(state.belief, u, k)
         return Ahead(prior, prior)
 
-    @correction
+    @corrects
     def correct(self, state: Ahead, z: ArrayLike, k: Step = 0) -> tuple[Ahead, Innovation]:
         """Use what arrived of z for the next step; the estimate stays."""
         belief, heard = self.base.correct(state.belief, z, k)

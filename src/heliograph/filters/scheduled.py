@@ -8,9 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief
-from heliograph.filters.innovation import innovation
+from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.schedule import Gains, Schedule
@@ -71,7 +71,7 @@ class ScheduledFilter(AbstractFilter):
         mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
         return ScheduleState(jnp.asarray(self.start), mean, expected, jnp.asarray(True), jnp.asarray(0))
 
-    @prediction
+    @predicts
     def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
         """What follows if what is expected arrives."""
         g: Gains = at(self.gains, k)
@@ -84,7 +84,7 @@ class ScheduledFilter(AbstractFilter):
             jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
         )
 
-    @correction
+    @corrects
     def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
         """Add what was not expected, times the gains of step k."""
         g: Gains = at(self.gains, k)
@@ -99,7 +99,7 @@ class ScheduledFilter(AbstractFilter):
             state.complete & jnp.all(present | unused),
             jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
         )
-        return after, innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
+        return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
 
     @in_float64
     def estimate(self, state: ScheduleState) -> Estimate:
@@ -153,13 +153,13 @@ class LinearSystemFilter(AbstractFilter):
         """The system's start."""
         return Belief(jnp.asarray(self.mean), jnp.asarray(self.covariance))
 
-    @prediction
+    @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """A y + a and A P A' + Cov(w)."""
         s: Steps = at(self.steps, k)
         return Belief(s.transition @ state.mean + s.drift, s.transition @ state.covariance @ s.transition.T + s.process)
 
-    @correction
+    @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use what arrived of z."""
         s: Steps = at(self.steps, k)
@@ -169,7 +169,7 @@ class LinearSystemFilter(AbstractFilter):
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
         gain = _solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
         after = Belief(mean + gain @ jnp.where(present, z - expected, 0.0), symmetrize(spread - gain @ cross))
-        return after, innovation(z, expected, total)
+        return after, gaussian_innovation(z, expected, total)
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, GaussianFilter
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
@@ -36,12 +36,12 @@ class SequentialFilter(AbstractFilter):
         """The first node's prior."""
         return self.filters[0].init()
 
-    @prediction
+    @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """As the first node's filter does."""
         return self.filters[0].predict(state, u, k)
 
-    @correction
+    @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use what arrived from each node in turn."""
         z = jnp.asarray(z)

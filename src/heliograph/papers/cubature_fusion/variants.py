@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 import heliograph as hg
-from heliograph.filters.base import AbstractFilter, Step, correction, prediction
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, GaussianFilter, corrected
 from heliograph.filters.update import AbstractUpdate
@@ -97,14 +97,14 @@ class MixedCross(AbstractFilter):
         start = self.base.init()
         return Propagated(*start, jnp.zeros((2 * len(start.mean), len(start.mean))))
 
-    @prediction
+    @predicts
     def predict(self, state: Propagated, u: ArrayLike = (), k: Step = 0) -> Propagated:
         """Move the points, and keep them."""
         plant, (mean, covariance, _) = at(self.base.plant, k), state
         points = jax.vmap(lambda x: plant.transition(x, jnp.asarray(u)))(cubature_points(mean, covariance))
         return Propagated(*self.base.predict(Belief(mean, covariance), u, k), points)
 
-    @correction
+    @corrects
     def correct(self, state: Propagated, z: ArrayLike, k: Step = 0) -> tuple[Propagated, Innovation]:
         """Redraw for y only, correct."""
         sensor, channel = at(self.base.sensor, k), at(self.base.channel, k)
