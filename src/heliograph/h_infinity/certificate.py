@@ -92,7 +92,7 @@ def theorem_matrix(
     at = dict(zip("xefghdvr", np.cumsum([0, n, n, n, n, y, y, v]), strict=True))  # g: f~, d: h~, r: rho
     q = 4 * n + 2 * y + v + r
 
-    def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} {q}"]:
+    def row(height: int, **blocks: np.ndarray) -> Float[np.ndarray, "{height} q"]:
         result = np.zeros((height, q))
         for name, block in blocks.items():
             result[:, at[name] : at[name] + block.shape[1]] = block
