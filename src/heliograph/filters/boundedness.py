@@ -1,7 +1,7 @@
 """Whether a filter's covariance stays bounded: the published condition with its margin, and what holds instead."""
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +11,7 @@ from scipy.linalg import solve_discrete_lyapunov
 from heliograph.model.plant import AbstractPlant, LinearPlant
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Ceiling:
 
 
 def growth_condition(
-    plant: AbstractPlant, states: Any, first_scalar: float = 0.0, inputs: Any = None
+    plant: AbstractPlant, states: ArrayLike, first_scalar: float = 0.0, inputs: ArrayLike | None = None
 ) -> GrowthCondition:
     """Evaluate the published condition of uniform boundedness at visited states.
 
@@ -81,7 +82,7 @@ def growth_condition(
     return GrowthCondition(float((1 + beta) * gains[worst]), gains, visited[worst])
 
 
-def provable_ceiling(plant: LinearPlant, initial_covariance: Any, first_scalar: float = 0.0) -> Ceiling:
+def provable_ceiling(plant: LinearPlant, initial_covariance: ArrayLike, first_scalar: float = 0.0) -> Ceiling:
     """A ceiling that a linear plant's filter never exceeds, whatever it measures.
 
     The update subtracts a positive matrix from (1 + b) P^-, so the claimed covariance stays below
@@ -119,7 +120,7 @@ def _largest_on_the_way(a: np.ndarray, noise: np.ndarray, beta: float, start: np
     return max(largest, end)
 
 
-def empirical_ceiling(covariances: Any, what: str = "covariance") -> Ceiling:
+def empirical_ceiling(covariances: ArrayLike, what: str = "covariance") -> Ceiling:
     """The largest eigenvalue that occurred in a sequence of covariances, claimed or actual, (time, n, n).
 
     Raises:
