@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from itertools import product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.small_matrix import add, runs_last, symmetric, times, transpose
+from heliograph.numerics.types import Array
 
 POINT_LIMIT = 20_000  # points of a tensor rule: more is refused with the number
 
@@ -87,7 +88,7 @@ def _linear_moments(covariance: jax.Array, jacobian: jax.Array) -> tuple[jax.Arr
     return symmetric(times(jacobian, cross)), cross
 
 
-def linear_transform(matrix: Any, center: jax.Array, covariance: jax.Array) -> Transformed:
+def linear_transform(matrix: Array, center: jax.Array, covariance: jax.Array) -> Transformed:
     """Moments of a linear function with this matrix and this value at the mean: what every transform would find."""
     return Transformed(center, *_linear_moments(covariance, jnp.asarray(matrix)))
 
