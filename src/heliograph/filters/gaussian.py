@@ -130,7 +130,7 @@ def _build(
         sensor=sensor,
         channel=described,
         transform=transform,
-        update=update,
+        update=update.described(),
         initial_mean=mean,
         initial_covariance=spread,
         claim=claim,

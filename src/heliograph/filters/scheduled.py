@@ -30,7 +30,8 @@ class ScheduledFilter(AbstractFilter):
 
     The claimed covariance is the schedule's, and it is computed for complete data. A component that did not arrive
     counts as what the filter expected, and from then on the bound is NaN: no covariance is known any more, and the
-    record says so; what the gains of a step do not use cannot be missed. Where data have gaps, use `LinearSystemFilter`, which recomputes its gains.
+    record says so. What the gains of a step do not use cannot be missed. Where data have gaps, use
+    `LinearSystemFilter`, which recomputes its gains.
     """
 
     gains: OverTime
