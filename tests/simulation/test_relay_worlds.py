@@ -100,7 +100,7 @@ def test_what_holds_for_every_network_holds_for_relays():
 
 
 def quiet():
-    """The sensor is heard through one relay, which listens and talks in turn; the receiver hears it every other step."""
+    """One relay, which listens and talks in turn, so that the receiver hears it every other step."""
     hops = hop(0.9, 0.1), hop(0.8, 0.2)
     slots = [{"a": {"sensor": hops[0]}}, {"receiver": {"a": hops[1]}}]
     plant = LinearPlant([[0.95]], [[1.0]], [1.0], [[2.0]])

@@ -1,5 +1,7 @@
 """What a campaign keeps of each run."""
 
+from operator import itemgetter
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,12 +42,12 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """What was collected, by name."""
-        axes = {"error": -3, "variance": -3, "nees_per_dimension": -2}
         found = {
-            part: by_name(network, collected, lambda kept, part=part: kept[part], axis) for part, axis in axes.items()
+            part: by_name(network, collected, itemgetter(part), axis)
+            for part, axis in (("error", -3), ("variance", -3), ("nees_per_dimension", -2))
         }
         estimates = {
-            node: {name: {part: found[part][node][name] for part in axes} for name in names}
+            node: {name: {part: values[node][name] for part, values in found.items()} for name in names}
             for node, names in network.claims().items()
         }
         if not self.world:

@@ -10,9 +10,8 @@ import numpy as np
 
 from heliograph.files.table import read_table, write_table
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
-from heliograph.simulation.network import Network, Node
+from heliograph.simulation.network import Listener, Network, Node
 from heliograph.simulation.record import Record, is_sound
 
 TIME = "time"
@@ -46,13 +45,16 @@ def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: st
     Columns: `time`, which never goes backwards; each plant input by its name (an input `dt` may be left out: it is
     the time since the previous row, 0 in the first); each received component by `node.name` or, where only one
     thing has that name, by `name`. Components are named as the sensor's outputs where the channel keeps their
-    number, else z0, z1, ... A measurement that is NaN did not arrive.
+    number, else z0, z1, ... A measurement that is NaN did not arrive. What a relay heard may be left out altogether.
 
     Raises:
         ValueError: unknown, missing or doubled columns; a time or an input that is missing; infinite numbers;
             times that go backwards. One line that names the row, from 1, and the column.
     """
     inputs, received = network.inputs, _received_columns(network)
+    for name in () if network.relays is None else network.relays.relays:
+        if not any(column in columns for names in received[name] for column in names):
+            del received[name]  # its own filter is left out
     if TIME in inputs:
         raise fail("input names", f"none called {TIME!r}, which is the recording's own column", list(inputs))
     expected = [(TIME,), *((name,) for name in inputs), *(a for node in received.values() for a in node)]
@@ -78,9 +80,9 @@ def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: st
     return Recording(measurements, u, time)
 
 
-def received_names(node: Node) -> tuple[str, ...]:
+def received_names(node: Node | Listener) -> tuple[str, ...]:
     """Names of what reaches a node's filters: the sensor's outputs where they are as many, else z0, z1, ..."""
-    outputs: tuple[str, ...] = first(node.sensor).outputs
+    outputs = node.outputs
     return outputs if len(outputs) == node.received else tuple(f"z{i}" for i in range(node.received))
 
 

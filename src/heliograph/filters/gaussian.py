@@ -151,7 +151,7 @@ def _build(
         sensor=sensor,
         channel=described,
         transform=transform,
-        update=update,
+        update=update.described(),
         initial_mean=mean,
         initial_covariance=spread,
         linear=linear,

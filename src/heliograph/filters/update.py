@@ -33,6 +33,13 @@ class AbstractUpdate(eqx.Module):
         """The channel's mean gain and its worst cases, computed once before any data."""
         raise NotImplementedError
 
+    def described(self) -> "AbstractUpdate":
+        """What corrects once the channel is described: updates that differ in the description alone share it.
+
+        Filters with one and the same correction share a compiled program.
+        """
+        return self
+
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
@@ -111,6 +118,10 @@ class Interval(AbstractUpdate):
             ValueError: a channel that is not a chain of scalar hops.
         """
         return interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
+
+    def described(self) -> AbstractUpdate:
+        """Young's bound, as for a polytope."""
+        return Polytope(self.scalars)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array

@@ -1,7 +1,7 @@
 """What is between the plant and the filters: each node's own sensor and channel, or relays that talk in slots."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.random_affine.base import apply
-from heliograph.simulation.draws import CHANNEL, CHANNEL_START, SENSOR, checksum, draw_key
+from heliograph.simulation.draws import CHANNEL, CHANNEL_START, SENSOR, Number, checksum, draw_key
 from heliograph.simulation.network import OWN, Network, Node
 
 Heard = tuple[jax.Array, ...]  # (node, received) of each group
@@ -43,7 +43,7 @@ class Antenna(eqx.Module):
 
     sensor: AnySensor
     channel: Channel
-    checksums: np.ndarray
+    checksums: jax.Array | np.ndarray
 
 
 class OwnChannels(AbstractAir):
@@ -72,12 +72,12 @@ class OwnChannels(AbstractAir):
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
 
-def _begin(channel: Channel, key: jax.Array, place: jax.Array) -> PyTree:
+def _begin(channel: Channel, key: jax.Array, place: Number) -> PyTree:
     return at(channel, 0).init(draw_key(key, 0, place, CHANNEL_START))
 
 
 def _deliver(
-    channel: Channel, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: jax.Array | int
+    channel: Channel, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number
 ) -> tuple[PyTree, jax.Array]:
     memory, h = at(channel, k).draw(memory, draw_key(key, k, place, CHANNEL))
     return memory, apply(h, y)
@@ -155,12 +155,12 @@ class Slots(AbstractAir):
 
     def _branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
         # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
-        single = slots[0] if len(slots) == 1 else over_time(slots)
+        single: Any = slots[0] if len(slots) == 1 else over_time(slots)
 
         def branch(
             position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
         ) -> dict[str, jax.Array]:
-            slot = at(single, position) if isinstance(single, OverTime) else single
+            slot: Any = at(single, position) if isinstance(single, OverTime) else single
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
             return {name: _hear(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
 

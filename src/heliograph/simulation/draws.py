@@ -3,12 +3,13 @@
 from zlib import crc32
 
 import jax
+import numpy as np
 
 # What a key is for: folded in last, so that each use has its own stream.
 INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START = range(5)
 WORLD = 0  # the plant's place among the checksums of names
 
-Number = int | jax.Array
+Number = int | jax.Array | np.ndarray
 
 
 def draw_key(run_key: jax.Array, k: Number, place: Number, purpose: int) -> jax.Array:

@@ -106,9 +106,9 @@ def is_sound(estimate: Estimate) -> np.ndarray:
 class AbstractReducer(eqx.Module, Generic[Result]):
     """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
 
-    A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes, "estimates":
-    of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name, "uplinks"}, as
-    `Network` has groups and kinds. What all runs share, such as a covariance, has length 1 along the runs.
+    A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes,
+    "estimates": of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name,
+    "uplinks"}, as `Network` has groups and kinds. What all runs share, a covariance say, has length 1 along the runs.
     """
 
     def initial(self, shapes: PyTree) -> PyTree:
@@ -144,10 +144,8 @@ class Trajectories(AbstractReducer[Record]):
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
     """Record from the scan's output; nodes in the network's order."""
     measurements = measurements_of(network, batch["measurements"])
-    mean, covariance = (
-        by_name(network, batch, lambda e, part=part: np.asarray(getattr(e, part)), axis)
-        for part, axis in (("mean", -3), ("covariance", -4))
-    )
+    mean = by_name(network, batch, lambda e: np.asarray(e.mean), -3)
+    covariance = by_name(network, batch, lambda e: np.asarray(e.covariance), -4)
     estimates = {
         node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
         for node, claims in network.claims().items()
@@ -168,7 +166,7 @@ def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str,
 def by_name(
     network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
 ) -> dict[str, dict[str, np.ndarray]]:
-    """What `read` gives of each kind's part, split at its axes (filter, node), the first being `axis`; by node and filter.
+    """What `read` gives of each kind's part, by node and filter: split at its axes (filter, node), the first `axis`.
 
     `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
     """

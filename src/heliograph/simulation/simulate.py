@@ -2,13 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, get_args, overload
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
+from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
@@ -19,7 +20,7 @@ from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.lanes import BLOCK, Lanes
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import AbstractReducer, Record, Trajectories, trajectories_record
+from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
 from heliograph.simulation.stepping import AllFilters, plan, plans
 
 Progress = Callable[[int, int], None]
@@ -27,18 +28,46 @@ Progress = Callable[[int, int], None]
 Precision = Literal["float64", "float32"]
 
 
+@overload
 def monte_carlo(
     network: Network,
     horizon: int,
     runs: int,
     key: int | jax.Array,
-    keep: AbstractReducer | None = None,
-    inputs: Any = None,
+    keep: None = None,
+    inputs: ArrayLike | None = None,
     chunk: int = 2048,
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
-) -> Any:
+) -> Record: ...
+@overload
+def monte_carlo(
+    network: Network,
+    horizon: int,
+    runs: int,
+    key: int | jax.Array,
+    keep: AbstractReducer[Result],
+    inputs: ArrayLike | None = None,
+    chunk: int = 2048,
+    progress: Progress | None = None,
+    first_run: int = 0,
+    precision: Precision = "float64",
+) -> Result: ...
+
+
+def monte_carlo(
+    network: Network,
+    horizon: int,
+    runs: int,
+    key: int | jax.Array,
+    keep: AbstractReducer[Result] | None = None,
+    inputs: ArrayLike | None = None,
+    chunk: int = 2048,
+    progress: Progress | None = None,
+    first_run: int = 0,
+    precision: Precision = "float64",
+) -> Record | Result:
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
     `key` is a seed or a JAX key; a run's draws depend on the key, the run, the step and the node's name alone, so
@@ -61,7 +90,7 @@ def monte_carlo(
     if first_run < 0 or first_run % BLOCK:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
     network.check_horizon(horizon)
-    reducer = Trajectories() if keep is None else keep
+    reducer: AbstractReducer[Record] | AbstractReducer[Result] = Trajectories() if keep is None else keep
     u = _check_inputs(network, inputs, horizon)
     base = jax.random.key(key) if isinstance(key, int | np.integer) else key
     if precision not in get_args(Precision):
@@ -86,17 +115,23 @@ def monte_carlo(
     return reducer.finish(lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), network)
 
 
-def run(network: Network, measurements: Mapping[str, Any], inputs: Any = None, time: Any = None) -> Record:
+def run(
+    network: Network,
+    measurements: Mapping[str, ArrayLike],
+    inputs: ArrayLike | None = None,
+    time: ArrayLike | None = None,
+) -> Record:
     """Run every filter of the network over recorded measurements.
 
-    measurements: for each node an array (steps, received), NaN where a component did not arrive. inputs: (steps,
+    measurements: for each node an array (steps, received), NaN where a component did not arrive; what relays heard may
+    be left out, and with it their own filters. inputs: (steps,
     inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
     """
     network = network.restricted_to(measurements)
-    steps = len(next(iter(measurements.values())))
+    steps = len(np.asarray(next(iter(measurements.values()))))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
     z = {
@@ -132,7 +167,7 @@ class World(eqx.Module):
         return x, self.air.init(key), self.filters.init()
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """After step k with the input u, and what there is to see of it: truth (n,), measurements by group, estimates."""
+        """After step k with the input u, and what there is to see of it: truth (n,), measurements, estimates."""
         (x, air, states), (k, u) = carry, row
         plant = at(self.plant, k)
         x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
@@ -148,7 +183,7 @@ class _Job(eqx.Module):
     inputs: Any
     key: jax.Array
     stop: np.ndarray
-    reducer: AbstractReducer
+    reducer: AbstractReducer[Any]
     single: bool = eqx.field(static=True)
 
 
@@ -198,14 +233,14 @@ def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTr
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
-def _check_inputs(network: Network, inputs: Any, horizon: int) -> np.ndarray:
+def _check_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
     count = len(network.inputs)
     if inputs is None and count:
         raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
     return np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
 
 
-def _check_measurement(name: str, value: Any, steps: int, received: int) -> np.ndarray:
+def _check_measurement(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
     result = np.asarray(value, dtype=np.float64)
     if result.ndim == 1 and received == 1:
         result = result[:, None]

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from typing import Any
 
 import equinox as eqx
@@ -47,7 +48,8 @@ class ErrorStatistics:
     @property
     def covariance(self) -> np.ndarray:
         """Sums of claimed covariances, (batch, time, n, n)."""
-        return matrices(self.claimed_pairs) * self.count[:, None, None, None]
+        result: np.ndarray = matrices(self.claimed_pairs) * self.count[:, None, None, None]
+        return result
 
     @property
     def runs(self) -> int:
@@ -216,7 +218,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
     def initial(self, shapes: PyTree) -> Sums:
         """Zero sums."""
-        (runs, steps, n), wide = shapes["truth"].shape, BATCHES + shapes["truth"].shape[0] - 1
+        runs, steps, n = shapes["truth"].shape
+        wide = BATCHES + runs - 1
         parts, order, own = _parts(shapes)
         sizes = [int(np.prod(parts[i].mean.shape[2:-1])) for i in order]
         total, mine, pairs = sum(sizes), sum(sizes[:own]), n * (n + 1) // 2
@@ -258,9 +261,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
         kinds = len(network.kinds)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
-        pairs, nees, claimed = (
-            by_name(network, named, lambda part, i=i: part[i], axis) for i, axis in enumerate((-3, -2, -3))
-        )
+        pairs, nees, claimed = (by_name(network, named, itemgetter(i), axis) for i, axis in enumerate((-3, -2, -3)))
         count = _folded(carry.count)
         result = {
             node: {
@@ -311,14 +312,15 @@ def _dealt(sums: jax.Array, values: jax.Array, start: jax.Array) -> jax.Array:
     return jax.lax.dynamic_update_slice_in_dim(sums, there + values, start, last)
 
 
-def _folded(sums: np.ndarray) -> np.ndarray:
+def _folded(sums: jax.Array | np.ndarray) -> np.ndarray:
     """Sums (..., batch) of exactly BATCHES batches, (batch, ...)."""
-    result = np.array(np.moveaxis(sums[..., :BATCHES], -1, 0), order="C")
-    result[: sums.shape[-1] - BATCHES] += np.moveaxis(sums[..., BATCHES:], -1, 0)
+    ahead = np.moveaxis(np.asarray(sums), -1, 0)
+    result = np.array(ahead[:BATCHES], order="C")
+    result[: len(ahead) - BATCHES] += ahead[BATCHES:]
     return result
 
 
-def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, ...]]:
     """Of each kind and fused estimate: sums of pairs and of NEES by batch, and the batches' mean claimed covariances.
 
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.

@@ -1,6 +1,6 @@
-"""Filters of one kind run side by side: stacked along axes of filters and nodes, and vmapped, under the scan over time."""
+"""Filters of one kind run side by side: stacked along axes of filters and nodes, vmapped, under the scan over time."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -10,47 +10,83 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.fusion.quantizer import Quantized, widen
+from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, stack
+from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.float64 import compiled
-from heliograph.simulation.network import Network
+from heliograph.simulation.network import FUSED, Network
 
 
 class Alike(eqx.Module):
-    """Filters that differ in numbers alone, stacked (filter, node), and the group of nodes that they belong to."""
+    """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
+
+    `group`: of nodes that they belong to; `count` of filters at each node.
+    """
 
     filters: AbstractFilter
     group: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
 
     def init(self) -> PyTree:
-        """States before the first step, (filter, node, ...)."""
-        return _over_both(_initial)(self.filters)
+        """States before the first step, (filter and node, ...)."""
+        return _each(_initial)(self.filters)
 
     def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Estimate]:
-        """One step of each; z (node, received)."""
+        """One step of each from the nodes' measurements (node, received); estimates (filter, node, ...)."""
 
         def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Estimate]:
             return item.step(state, z, u, k)
 
-        over_nodes = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
-        over_filters = eqx.filter_vmap(over_nodes, in_axes=(eqx.if_array(0), 0, None))
-        result: tuple[PyTree, Estimate] = over_filters(self.filters, states, z)
-        return result
+        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
+        after, estimate = both(self.filters, states, jnp.tile(z, (self.count, 1)))
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), estimate)
 
 
 class Fused(eqx.Module):
-    """A fusion: its rule, where the estimates stand that it takes, and the quantizers on their way, stacked.
+    """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
 
-    `sources`: kind and filter, whose nodes' estimates follow one another; `order` brings them into the nodes' order.
+    `sources` of each fusion: kind and filter whose nodes' estimates it takes, one group after another; `order` of each
+    (fusion, node) brings them into the order of the nodes.
     """
 
-    rule: AbstractFusion
-    order: np.ndarray | None
+    rules: AbstractFusion
     quantizers: PyTree
-    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
+    order: np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+    sources: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True)
+    claims: tuple[Claim, ...] = eqx.field(static=True)
+
+    def init(self, n: int) -> PyTree:
+        """States of the quantizers."""
+        if self.quantizers is None:
+            return ()
+        return _each(_each(lambda item: at(item, 0).init(n)))(self.quantizers)
+
+    def step(
+        self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
+    ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
+        """Fuse what the filters told, (filter, node, ...) of each kind: estimates and uplinks by the fusions' names."""
+        means = self._gathered([e.mean for e in estimates])
+        covariances = self._gathered([e.covariance for e in estimates])
+        uplinks: dict[str, PyTree] = {}
+        if self.quantizers is not None:
+            send = eqx.filter_vmap(lambda q, s, mean: at(q, k).step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
+            states, sent = eqx.filter_vmap(send, in_axes=(eqx.if_array(0), 0, 0))(self.quantizers, states, means)
+            means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
+            for i, name in enumerate(self.names):
+                uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
+        combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
+        mean, covariance = combine(self.rules, means, covariances)
+        each = enumerate(zip(self.names, self.claims, strict=True))
+        return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in each}, uplinks
+
+    def _gathered(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+        """(fusion, node, ...)."""
+        joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
+        if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
+            return jnp.stack(joined)
+        return jnp.stack([part[order] for part, order in zip(joined, self.order, strict=True)])
 
 
 class AllFilters(eqx.Module):
@@ -60,7 +96,7 @@ class AllFilters(eqx.Module):
     """
 
     alike: tuple[Alike, ...]
-    rules: dict[str, Fused]
+    fusions: tuple[Fused, ...]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
@@ -68,12 +104,11 @@ class AllFilters(eqx.Module):
 
     def __init__(self, network: Network):
         self.alike = tuple(
-            Alike(_stacked([[network.nodes[name].filters[f] for name in network.groups[g]] for f in names]), g)
+            Alike(stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]), g, len(names))
             for g, names in network.kinds
         )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
-        fusions = {name: item for name, item in network.fused.items() if isinstance(item, Fusion)}
-        self.rules = {name: _fused(network, item, network.claims()["fused"][name]) for name, item in fusions.items()}
+        self.fusions = _fusions(network)
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
         entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
@@ -84,9 +119,7 @@ class AllFilters(eqx.Module):
     def init(self) -> PyTree:
         """States before the first step: of the nodes' filters, of central filters, and of quantizers."""
         central = {name: _initial(item) for name, item in self.central.items()}
-        start = eqx.filter_vmap(lambda item: at(item, 0).init(self.n), in_axes=eqx.if_array(0))
-        sent = {name: start(item.quantizers) for name, item in self.rules.items() if item.quantizers is not None}
-        return tuple(item.init() for item in self.alike), central, sent
+        return tuple(item.init() for item in self.alike), central, tuple(item.init(self.n) for item in self.fusions)
 
     def step(
         self, states: PyTree, z: Sequence[jax.Array], u: jax.Array, k: jax.Array
@@ -101,16 +134,16 @@ class AllFilters(eqx.Module):
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
         heard = {name: item.step(central[name], joined, u, k) for name, item in self.central.items()}
-        fused, uplinks, after = {name: estimate for name, (_, estimate) in heard.items()}, {}, {}
-        for name, item in self.rules.items():
-            means, covariances = _gathered(item, estimates)
-            if item.quantizers is not None:
-                after[name], received = _send(item.quantizers, sent[name], means, k)
-                means, covariances = received.value, jax.vmap(widen)(covariances, received.error)
-                uplinks[name] = {"saturated": received.saturated, "symbols": received.symbols}
-            fused[name] = Estimate(*item.rule.combine(means, covariances), item.claim)
-        following = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}, after
-        return following, {"estimates": estimates, "fused": fused, "uplinks": uplinks}
+        fused = {name: estimate for name, (_, estimate) in heard.items()}
+        uplinks: dict[str, PyTree] = {}
+        after = []
+        for item, state in zip(self.fusions, sent, strict=True):
+            following, found, traffic = item.step(state, estimates, k)
+            after.append(following)
+            fused |= found
+            uplinks |= traffic
+        own, central = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}
+        return (own, central, tuple(after)), {"estimates": estimates, "fused": fused, "uplinks": uplinks}
 
 
 @compiled
@@ -121,11 +154,12 @@ def plan(filters: AllFilters, u: Any) -> AllFilters:
         return item.planned(u)
 
     alike = tuple(
-        Alike(_over_both(one)(item.filters), item.group) if filters.complete[item.group] else item
+        Alike(_each(one)(item.filters), item.group, item.count) if filters.complete[item.group] else item
         for item in filters.alike
     )
     central = {name: one(item) if all(filters.complete) else item for name, item in filters.central.items()}
-    return eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, central))
+    result: AllFilters = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, central))
+    return result
 
 
 def plans(filters: AllFilters) -> bool:
@@ -136,40 +170,42 @@ def plans(filters: AllFilters) -> bool:
     )
 
 
-def _fused(network: Network, fusion: Fusion, claim: Claim) -> Fused:
-    """Where the estimates of a fusion stand."""
-    nodes, places = network.nodes_with(fusion.filter), network.places()
-    sources = {places[node, fusion.filter][:2]: None for node in nodes}
-    found = [name for k, _ in sources for name in network.groups[network.kinds[k].group]]
-    order = _unless_sorted(np.array([found.index(node) for node in nodes]))
-    return Fused(fusion.rule, order, fusion.uplinks(nodes), tuple(sources), claim)
+def _fusions(network: Network) -> tuple[Fused, ...]:
+    """The network's fusions, those of one structure together."""
+    alike: dict[object, list[str]] = {}
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion):
+            nodes = network.nodes_with(item.filter)
+            alike.setdefault(structure((item.rule, item.uplinks(nodes), (None,) * len(nodes))), []).append(name)
+    places, claims = network.places(), network.claims().get(FUSED, {})
+    return tuple(_fused(network, names, places, [claims[name] for name in names]) for names in alike.values())
 
 
-def _gathered(item: Fused, estimates: Sequence[Estimate]) -> tuple[jax.Array, jax.Array]:
-    """Means (node, n) and covariances (node, n, n) that a fusion takes."""
-    means = jnp.concatenate([estimates[k].mean[f] for k, f in item.sources])
-    covariances = jnp.concatenate([estimates[k].covariance[f] for k, f in item.sources])
-    return (means, covariances) if item.order is None else (means[item.order], covariances[item.order])
-
-
-def _send(quantizers: PyTree, states: PyTree, means: jax.Array, k: jax.Array) -> tuple[PyTree, Quantized]:
-    """Each node's mean (node, n) through its own quantizer."""
-    step = eqx.filter_vmap(lambda item, state, mean: at(item, k).step(state, mean), in_axes=(eqx.if_array(0), 0, 0))
-    result: tuple[PyTree, Quantized] = step(quantizers, states, means)
-    return result
+def _fused(
+    network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
+) -> Fused:
+    """Where the estimates of fusions stand."""
+    items = [item for item in (network.fused[name] for name in names) if isinstance(item, Fusion)]
+    nodes = [network.nodes_with(item.filter) for item in items]
+    sources, order = [], []
+    for item, mine in zip(items, nodes, strict=True):
+        source = tuple({places[node, item.filter][:2]: None for node in mine})
+        found = {node: i for i, node in enumerate(n for k, _ in source for n in network.groups[network.kinds[k].group])}
+        sources.append(source)
+        order.append([found[node] for node in mine])
+    quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
+    rules = stack([item.rule for item in items])
+    return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims))
 
 
 def _initial(item: AbstractFilter) -> PyTree:
     return jax.tree.map(jnp.asarray, item.init())
 
 
-def _over_both(function: Any) -> Any:
-    return eqx.filter_vmap(eqx.filter_vmap(function, in_axes=eqx.if_array(0)), in_axes=eqx.if_array(0))
-
-
-def _stacked(rows: Sequence[Sequence[AbstractFilter]]) -> AbstractFilter:
-    """Filters (filter, node) as one."""
-    return stack([stack(row) for row in rows])
+def _each(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+    """A function of one of what is stacked, for all of them."""
+    over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0))
+    return over
 
 
 def _unless_sorted(order: np.ndarray) -> np.ndarray | None:

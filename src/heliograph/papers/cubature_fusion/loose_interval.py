@@ -27,6 +27,10 @@ class LooseInterval(AbstractUpdate):
         """
         return interval_description(channel, lambda hop: hop.second + (hop.mean - hop.mean_radius) ** 2)
 
+    def described(self) -> AbstractUpdate:
+        """Young's bound, as for a polytope."""
+        return hg.Polytope(self.scalars)
+
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
     ) -> tuple[jax.Array, jax.Array]:

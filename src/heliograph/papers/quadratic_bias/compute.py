@@ -119,7 +119,7 @@ def _covariances(model: Model, schedules: Mapping[str, Schedule], printed: Print
     return {name: np.concatenate([start, value]) for name, value in found.items()}
 
 
-class StatisticsAndRun(AbstractReducer):
+class StatisticsAndRun(AbstractReducer[tuple[dict[str, ErrorStatistics], Record]]):
     """Error statistics of all runs, and the trajectories of the first one."""
 
     statistics: Statistics
