@@ -15,14 +15,17 @@ REPEATS = 5
 STEP_LIMIT, HORIZON_LIMIT = 8, 300  # milliseconds
 
 
-def system() -> hg.GrowthSystem:
+def system() -> hg.h_infinity.GrowthSystem:
     """Node 1 of the publication."""
     hops = [
-        hg.hop(hg.bernoulli(p), c**2, power) for p, c, power in ((0.8, 0.1, 1.0), (0.75, 0.1, 1.0), (0.7, 0.15, 2.0))
+        hg.hop(hg.random_affine.bernoulli(p), c**2, power)
+        for p, c, power in ((0.8, 0.1, 1.0), (0.75, 0.1, 1.0), (0.7, 0.15, 2.0))
     ]
     channel = hg.with_direct_link(hg.amplify_and_forward(hops[:2]), hops[2])
     b = 0.15 * np.sqrt(2)
-    return hg.growth_system(16, [[-0.15], [0.15]], [[0.3]], [[0.05, 0.05]], channel, 0.7, b, initial_weight=15.0)
+    return hg.h_infinity.growth_system(
+        16, [[-0.15], [0.15]], [[0.3]], [[0.05, 0.05]], channel, 0.7, b, initial_weight=15.0
+    )
 
 
 def milliseconds(call: Callable[[], object]) -> float:
@@ -48,7 +51,7 @@ def recursion() -> tuple[float, float]:
     StepProblem.solve = timed
     try:
         for _ in range(REPEATS):
-            hg.recursive_design(system(), 1.8, 10 * np.eye(4))
+            hg.h_infinity.recursive_design(system(), 1.8, 10 * np.eye(4))
     finally:
         StepProblem.solve = solve
     return found[0], float(np.median([t for i, t in enumerate(found) if i % 16]))
@@ -57,8 +60,8 @@ def recursion() -> tuple[float, float]:
 def measure() -> dict[str, Any]:
     """Medians, but for the first solve and the worst horizon."""
     first, median = recursion()
-    horizon = [milliseconds(lambda: hg.horizon_design(system())) for _ in range(REPEATS)]
-    separate = [milliseconds(lambda: hg.horizon_design(system(), separate=True)) for _ in range(REPEATS)]
+    horizon = [milliseconds(lambda: hg.h_infinity.horizon_design(system())) for _ in range(REPEATS)]
+    separate = [milliseconds(lambda: hg.h_infinity.horizon_design(system(), separate=True)) for _ in range(REPEATS)]
     values = {
         "recursive inequality, first": first,
         "recursive inequality, re-solved": median,

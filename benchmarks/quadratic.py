@@ -25,23 +25,23 @@ DIMENSIONS = (4, 8, 16)
 REPEATS = 7
 
 
-def square_of(dimension: int) -> hg.LinearSystem:
+def square_of(dimension: int) -> hg.linear.LinearSystem:
     """State and bias of half the dimension each, one output behind a relay of two hops."""
     generator = np.random.default_rng(dimension)
     half = dimension // 2
     a = generator.normal(size=(half, half))
     a *= 0.8 / np.abs(np.linalg.eigvals(a)).max()
-    skewed = hg.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
-    noise = hg.Independent([skewed] * half)
+    skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+    noise = hg.random_affine.Independent([skewed] * half)
     bias = hg.LinearPlant(0.5 * np.eye(half), noise, np.zeros(half), noise)
-    plant = hg.with_bias(hg.LinearPlant(a, noise, np.zeros(half), noise), 0.1 * np.eye(half), bias)
+    plant = hg.model.with_bias(hg.LinearPlant(a, noise, np.zeros(half), noise), 0.1 * np.eye(half), bias)
     sensor = hg.LinearSensor(generator.normal(size=(1, dimension)), skewed)
     powers = hg.Discrete(np.sqrt([1.0, 1.5, 2.0]), [0.1, 0.3, 0.6])
     channel = hg.amplify_and_forward([hg.hop(powers, skewed), hg.hop(powers, skewed)])
-    return hg.lifted_system(plant, sensor, channel, 2, 2)
+    return hg.linear.lifted_system(plant, sensor, channel, 2, 2)
 
 
-def duplicated(system: hg.LinearSystem, dimension: int) -> tuple[Steps, np.ndarray, np.ndarray]:
+def duplicated(system: hg.linear.LinearSystem, dimension: int) -> tuple[Steps, np.ndarray, np.ndarray]:
     """The last step and the start in the full form [y; y (x) y], and the matrix that copies the half into the full."""
     places, unit = position(dimension + 1, 2), np.eye(dimension + 1, dtype=int)
     rows = [places[tuple(unit[i] + unit[-1])] for i in range(dimension)]

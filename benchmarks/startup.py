@@ -26,7 +26,9 @@ METHODS = {
     "cubature filter": NETWORK.format(plant=NONLINEAR, filter="hg.cubature_filter(plant, sensor, channel)"),
     "quadratic filter": NETWORK.format(plant=LINEAR, filter="hg.polynomial_filter(plant, sensor, channel, 20)"),
 }
-BEFORE = "import sys, time; import heliograph as hg, jax.numpy as jnp, numpy as np; hg.keep_compilations(sys.argv[1])\n"
+BEFORE = """import sys, time; import heliograph as hg, jax.numpy as jnp, numpy as np
+hg.simulation.keep_compilations(sys.argv[1])
+"""
 
 
 def seconds(command: list[str]) -> float:

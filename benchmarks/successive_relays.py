@@ -31,10 +31,10 @@ def median_time(call: Callable[[], object], repeats: int = 21) -> float:
     return float(np.median(times))
 
 
-def of_dimension(n: int) -> hg.RelayNetwork:
+def of_dimension(n: int) -> hg.model.RelayNetwork:
     rng = np.random.default_rng(n)
     plant = hg.LinearPlant(rng.normal(size=(n, n)) * 0.5 / np.sqrt(n), np.eye(n), np.zeros(n), np.eye(n))
-    return hg.RelayNetwork(plant, hg.LinearSensor(rng.normal(size=(1, n)), [[1.0]]), ("relay_1", "relay_2"),
+    return hg.model.RelayNetwork(plant, hg.LinearSensor(rng.normal(size=(1, n)), [[1.0]]), ("relay_1", "relay_2"),
                            setting.network().slots)  # fmt: skip
 
 
@@ -50,9 +50,9 @@ def measure() -> dict[str, Any]:
     """Milliseconds to design STEPS steps of the example."""
     network = setting.network()
     start = time.perf_counter()
-    hg.own_error_design(network, STEPS)
+    hg.relays.own_error_design(network, STEPS)
     first = time.perf_counter() - start
-    warm = median_time(lambda: hg.own_error_design(network, STEPS))
+    warm = median_time(lambda: hg.relays.own_error_design(network, STEPS))
     steps, moments = network.steps(STEPS), start_moments(network)
     recursion = median_time(lambda: _propagate_own(steps, moments))
     values = {"first call": 1e3 * first, "warm": 1e3 * warm, "recursion, of the warm call": 1e3 * recursion}

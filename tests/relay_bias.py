@@ -11,13 +11,13 @@ from tests.oracles import quadratic_bias as oracle
 class Model(NamedTuple):
     """Plant with bias, sensor and relay."""
 
-    plant: hg.OverTime
+    plant: hg.model.OverTime
     sensor: hg.LinearSensor
     channel: hg.AbstractRandomAffine
 
 
 def support(law):
-    return hg.FiniteSupport(law.points, law.chance)
+    return hg.random_affine.FiniteSupport(law.points, law.chance)
 
 
 def powers(law):
@@ -31,13 +31,13 @@ def model(s: oracle.System, horizon: int, initial=None) -> Model:
     start = support(s.x0) if initial is None else initial
 
     def at_time(t):
-        state = hg.LinearPlant(s.A(t), hg.Shaped(s.B, support(s.w)), np.zeros(n), start)
-        return hg.with_bias(state, s.E(t), bias)
+        state = hg.LinearPlant(s.A(t), hg.random_affine.Shaped(s.B, support(s.w)), np.zeros(n), start)
+        return hg.model.with_bias(state, s.E(t), bias)
 
     plant = hg.over_time([at_time(t) for t in range(horizon)])
-    sensor = hg.LinearSensor(s.C @ np.eye(n, n + extra), hg.Shaped(s.D, support(s.v)))
-    first = hg.GainAndNoise(powers(s.l), s.Phi, support(s.varpi))
-    second = hg.GainAndNoise(powers(s.m), s.theta * s.Psi, support(s.sigma))
+    sensor = hg.LinearSensor(s.C @ np.eye(n, n + extra), hg.random_affine.Shaped(s.D, support(s.v)))
+    first = hg.random_affine.GainAndNoise(powers(s.l), s.Phi, support(s.varpi))
+    second = hg.random_affine.GainAndNoise(powers(s.m), s.theta * s.Psi, support(s.sigma))
     return Model(plant, sensor, hg.amplify_and_forward([first, second]))
 
 

@@ -20,7 +20,11 @@ def networks(draw):
     plant = hg.LinearPlant(a / max(1, np.abs(np.linalg.eigvals(a)).max()), 0.1, rng.normal(size=n), np.eye(n))
     sensor = hg.LinearSensor(rng.normal(size=(m, n)), 0.1)
     radius = draw(st.sampled_from([0.0, 0.05]))
-    laws = [hg.Discrete(rng.uniform(-0.5, 1.5, 3), [0.2, 0.3, 0.5], radius), hg.Rayleigh(0.8), hg.bernoulli(0.7)]
+    laws = [
+        hg.Discrete(rng.uniform(-0.5, 1.5, 3), [0.2, 0.3, 0.5], radius),
+        hg.Rayleigh(0.8),
+        hg.random_affine.bernoulli(0.7),
+    ]
     chains = [
         [(laws[rng.integers(3)], rng.uniform(0.01, 0.3)) for _ in range(draw(st.integers(1, 3)))] for _ in range(m)
     ]
@@ -35,7 +39,7 @@ def channel(chains, scale=1.0, off=None):
             hg.hop(law, noise * scale**2, amplification=scale if k == 0 else 1.0)
             for k, (law, noise) in enumerate(chain)
         ]
-        parts.append(hg.silent(1, 1, 2.0) if i == off else hg.amplify_and_forward(hops))
+        parts.append(hg.model.silent(1, 1, 2.0) if i == off else hg.amplify_and_forward(hops))
     return hg.parallel(parts)
 
 

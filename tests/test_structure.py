@@ -4,6 +4,7 @@ import ast
 import inspect
 import re
 import textwrap
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -70,22 +71,44 @@ def _raises(function) -> bool:
     return any(isinstance(node, ast.Raise) for node in ast.walk(tree))
 
 
-@pytest.mark.parametrize("name", heliograph.__all__)
-def test_exported_names_exist_and_are_documented(name):
-    item = getattr(heliograph, name)
+ROOMS = [name for name in heliograph.__all__ if inspect.ismodule(getattr(heliograph, name)) and name != "testing"]
+PUBLIC = [("heliograph", name) for name in heliograph.__all__ if name not in (*ROOMS, "testing")] + [
+    (f"heliograph.{room}", name) for room in ROOMS for name in getattr(heliograph, room).__all__
+]
+
+
+@pytest.mark.parametrize(("place", "name"), PUBLIC, ids=lambda part: part.removeprefix("heliograph."))
+def test_public_names_exist_and_are_documented(place, name):
+    item = getattr(import_module(place), name)
+    assert not inspect.ismodule(item), f"{name}: expected no module of this name beside it"
     text = inspect.getdoc(item) or ""
     assert text and "\n" not in text.split(".")[0], f"{name}: expected a first line that says what it is"
     if inspect.isfunction(item):
         assert not re.search(r"Raises:\s*nothing", text), f"{name}: expected no word of errors where there are none"
         assert "Raises:" in text or not _raises(item), f"{name}: expected what it raises"
-        if item.__module__.startswith(("heliograph.filter", "heliograph.fusion.rules")):
+        if name.endswith("_filter") or item.__module__ == "heliograph.fusion.rules":
             assert "Source:" in text, f"{name}: expected where it comes from"
+
+
+def test_a_name_has_one_home_and_the_hall_is_small():
+    names = [name for _, name in PUBLIC]
+    assert len(set(names)) == len(names)
+    assert len(heliograph.__all__) <= 60, "the first hour needs no more names than these"
+    assert len([p for p in SOURCE.glob("*.py") if p.name != "__init__.py"]) <= 6
+
+
+def test_every_room_says_what_it_is():
+    for room in (p for p in SOURCE.iterdir() if (p / "__init__.py").exists()):
+        lines = (room / "README.md").read_text().splitlines()
+        assert len(lines) == 3 and all(line.startswith("**") for line in lines), f"{room.name}: expected three lines"
 
 
 def test_no_public_function_is_without_a_docstring():
     for path in FILES:
         for node in ast.parse(path.read_text()).body:
             if isinstance(node, ast.FunctionDef | ast.ClassDef) and not node.name.startswith("_"):
+                if any(isinstance(d, ast.Name) and d.id == "overload" for d in node.decorator_list):
+                    continue  # the function itself says it
                 assert ast.get_docstring(node), f"{path.name}: {node.name} has no docstring"
                 members = node.body if isinstance(node, ast.ClassDef) else []
                 for member in members:

@@ -13,7 +13,7 @@ from heliograph.papers.cubature_fusion.setting import STRONG, cubature
 
 def prepare(p: Arrays) -> Contender:
     known = replace(STRONG, sensor_gain=hg.Discrete(*SENSOR_GAINS), relay_gain=hg.Discrete(*RELAY_GAINS))
-    ckf = cubature(known, 0, hg.Polytope())
+    ckf = cubature(known, 0, hg.filters.Polytope())
     start = ckf.init()
 
     def step(state: Any, z: Any) -> tuple[Any, Any]:
@@ -24,7 +24,7 @@ def prepare(p: Arrays) -> Contender:
         last, means = jax.lax.scan(step, start, z)
         return means, last.covariance
 
-    return Contender(lambda: hg.over_runs(one_run, p["z"]), lambda result: result[0], "over_runs, all cores")
+    return Contender(lambda: hg.simulation.over_runs(one_run, p["z"]), lambda result: result[0], "over_runs, all cores")
 
 
 if __name__ == "__main__":

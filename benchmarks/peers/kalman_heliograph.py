@@ -23,7 +23,7 @@ def prepare(p: Arrays) -> Contender:
         return means, last.covariance
 
     return Contender(
-        lambda: hg.over_runs(one_run, p["gains"], p["z"]), lambda result: result[0], "over_runs, all cores"
+        lambda: hg.simulation.over_runs(one_run, p["gains"], p["z"]), lambda result: result[0], "over_runs, all cores"
     )
 
 

@@ -12,7 +12,7 @@ from typing import Annotated
 from cyclopts import App, CycloptsError, Parameter
 
 import heliograph
-from heliograph.numerics.compilation_cache import keep_compilations
+from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143  # the last two are 128 + the signal's number
 

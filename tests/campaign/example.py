@@ -29,7 +29,7 @@ class Bare(hg.AbstractFilter):
         return state
 
     def correct(self, state, z, k=0):
-        return state, hg.Innovation(z, jnp.zeros((0, 0)), 0.0)
+        return state, hg.model.Innovation(z, jnp.zeros((0, 0)), 0.0)
 
     def estimate(self, state):
         return hg.Estimate(state, jnp.full((1, 1), jnp.nan), self.claim)

@@ -15,7 +15,7 @@ from tests.campaign.example import CHUNKS, chunk_files, contents, write
 DRIVER = """
 import sys
 import heliograph as hg
-hg.run_campaign(hg.load_campaign("campaign.toml"), "out", workers=int(sys.argv[1]))
+hg.campaign.run_campaign(hg.campaign.load_campaign("campaign.toml"), "out", workers=int(sys.argv[1]))
 """
 
 

@@ -19,7 +19,7 @@ def check_recursion(build, terms, name, fixed):
     """An interval bound in a filter is the oracle's recursion with its terms."""
     s, node = SETTINGS[name], 2
     z = machine.data(s, STEPS)[:, node]
-    update = build(hg.Scalars(*s["beta"])) if fixed else build()
+    update = build(hg.filters.Scalars(*s["beta"])) if fixed else build()
     item = hg.cubature_filter(
         machine.plant(s), machine.sensor(s, node), machine.channel(s), update, **machine.start(s, node)
     )
@@ -30,7 +30,7 @@ def check_recursion(build, terms, name, fixed):
 @pytest.mark.parametrize("name", SETTINGS)
 @pytest.mark.parametrize("fixed", [True, False])
 def test_the_interval_bound_is_the_oracles_recursion(name, fixed):
-    check_recursion(hg.Interval, oracle.tight_terms, name, fixed)
+    check_recursion(hg.filters.Interval, oracle.tight_terms, name, fixed)
 
 
 @pytest.mark.parametrize("name", SETTINGS)
@@ -50,7 +50,7 @@ def test_exact_prediction_repairs_what_cubature_misses():
     move = lambda x: plant.transition(x, ())  # noqa: E731
     with jax.enable_x64(True):
         m = jnp.asarray(machine.PRINTED["xbar0"])
-        rough = hg.Cubature().apply(move, m, jnp.asarray(p)).covariance
+        rough = hg.filters.Cubature().apply(move, m, jnp.asarray(p)).covariance
         exact = PolynomialMoments(2).apply(move, m, jnp.asarray(p)).covariance
     assert np.linalg.eigvalsh(rough - exact)[0] == pytest.approx(-(0.125**2), rel=1e-9)
 
@@ -76,13 +76,13 @@ def one_step(update, s=STRONG):
     return p, signal, np.asarray(gain), np.asarray(bound)
 
 
-FIXED = hg.Scalars(1e-3, 1e-2)
+FIXED = hg.filters.Scalars(1e-3, 1e-2)
 ONE_STEP = {  # trace of the bound after one step from tr P- = .08353, from the derivation's own computation
-    "tight": (hg.Interval(FIXED), 0.082144),
-    "tight, optimal": (hg.Interval(), 0.073786),
-    "polytope": (hg.Polytope(FIXED), 0.058821),
-    "polytope, optimal": (hg.Polytope(), 0.051282),
-    "zero mean": (hg.ZeroMean(), 0.048194),
+    "tight": (hg.filters.Interval(FIXED), 0.082144),
+    "tight, optimal": (hg.filters.Interval(), 0.073786),
+    "polytope": (hg.filters.Polytope(FIXED), 0.058821),
+    "polytope, optimal": (hg.filters.Polytope(), 0.051282),
+    "zero mean": (hg.filters.ZeroMean(), 0.048194),
 }
 
 
@@ -93,11 +93,11 @@ def test_one_step_traces(name):
 
 
 def test_bounds_are_ordered_at_equal_scalars():
-    tight, polytope = (one_step(u(FIXED))[3] for u in (hg.Interval, hg.Polytope))
+    tight, polytope = (one_step(u(FIXED))[3] for u in (hg.filters.Interval, hg.filters.Polytope))
     assert np.linalg.eigvalsh(tight - polytope)[0] >= -1e-15
 
 
-@pytest.mark.parametrize("build", [hg.Interval, hg.Polytope])
+@pytest.mark.parametrize("build", [hg.filters.Interval, hg.filters.Polytope])
 def test_optimal_scalars_beat_every_fixed_pair(build):
     check_optimal_scalars(build)
 
@@ -106,7 +106,7 @@ def check_optimal_scalars(build):
     """No pair of fixed scalars on a grid has a smaller trace than the optimal ones."""
     best = np.trace(one_step(build())[3])
     grid = 10.0 ** np.arange(-3, 0.1, 0.5)
-    assert best <= min(np.trace(one_step(build(hg.Scalars(a, b)))[3]) for a in grid for b in grid) * (1 + 1e-9)
+    assert best <= min(np.trace(one_step(build(hg.filters.Scalars(a, b)))[3]) for a in grid for b in grid) * (1 + 1e-9)
 
 
 def random_setting(rng):
@@ -117,7 +117,7 @@ def random_setting(rng):
     return s
 
 
-@pytest.mark.parametrize("build", [hg.Interval, hg.Polytope])
+@pytest.mark.parametrize("build", [hg.filters.Interval, hg.filters.Polytope])
 def test_theorem_1_holds_by_enumeration(build):
     check_by_enumeration(build)
 
@@ -135,7 +135,7 @@ def check_by_enumeration(build, usable=lambda setting: True):
         e, ey, y = joint[:5, :5], joint[5:7, 5:7], slice(7, 9)
         yy = ey + joint[y, y] + joint[5:7, y] + joint[y, 5:7]
         signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
-        update = build(hg.Scalars(*10 ** rng.uniform(-2, 0, 2)))
+        update = build(hg.filters.Scalars(*10 ** rng.uniform(-2, 0, 2)))
         channel = machine.channel(s)
         with jax.enable_x64(True):
             described = update.describe(channel)
@@ -147,7 +147,7 @@ def check_by_enumeration(build, usable=lambda setting: True):
 
 def actual_covariance(joint, gain, law, nominal):
     """E of e - K(G y + n - M yhat) = e - K M e_y - K (G - M) y - K n, over the law of (G, n)."""
-    own = hg.second_order(law)
+    own = hg.random_affine.second_order(law)
     shift = own.mean_gain - nominal
     lift = np.hstack([np.eye(5), -gain @ (nominal + shift), -gain @ shift])  # on (e, e_y, yhat)
     yy = joint[5:7, 5:7] + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
@@ -166,17 +166,17 @@ def test_the_raw_minus_sign_is_no_bound():
     attained = max(c.moment(2) - c.moment(1) ** 2 for c in inside)
     assert second - (mean - radius) ** 2 == pytest.approx(0.09)
     assert attained == pytest.approx(0.25) and largest <= attained
-    described = hg.Interval().describe(hg.hop(law, 0.0))
+    described = hg.filters.Interval().describe(hg.hop(law, 0.0))
     assert described.spread.center[0, 0, 0, 0] >= attained
 
 
 def test_interval_bounds_need_scalar_hops():
     with pytest.raises(ValueError, match="interval bound: expected a chain of hops"):
-        hg.Interval().describe(hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 0.1)]))
+        hg.filters.Interval().describe(hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 0.1)]))
 
 
 def test_the_extended_filter_takes_the_interval_bound():
-    check_extended(hg.Interval(FIXED), oracle.tight_terms)
+    check_extended(hg.filters.Interval(FIXED), oracle.tight_terms)
 
 
 def check_extended(update, terms):
@@ -197,7 +197,7 @@ def too_small(radius, shrink, seeds=range(20)):
         ey = joint[5:7, 5:7]
         yy = ey + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
         signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
-        channel, update = machine.channel(STRONG, radius), hg.Polytope(hg.Scalars(0.01, 0.01))
+        channel, update = machine.channel(STRONG, radius), hg.filters.Polytope(hg.filters.Scalars(0.01, 0.01))
         right = update.describe(channel)
         with jax.enable_x64(True):
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(joint[:5, :5]), signal, shrink(right)))

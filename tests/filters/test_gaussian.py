@@ -41,12 +41,12 @@ def agree(ours, theirs, tolerance=ROUNDING):
 def cases():
     poly = oracle.poly_terms
     for name in SETTINGS:
-        s, fixed = SETTINGS[name], hg.Scalars(*SCALARS[name])
+        s, fixed = SETTINGS[name], hg.filters.Scalars(*SCALARS[name])
         yield (
             name,
             "cubature, fixed",
             hg.cubature_filter,
-            hg.Polytope(fixed),
+            hg.filters.Polytope(fixed),
             oracle.predict_cubature,
             oracle.bounded(poly(s), False),
         )
@@ -54,7 +54,7 @@ def cases():
             name,
             "cubature, optimal",
             hg.cubature_filter,
-            hg.Polytope(),
+            hg.filters.Polytope(),
             oracle.predict_cubature,
             oracle.bounded(poly(s), True),
         )
@@ -62,11 +62,18 @@ def cases():
             name,
             "extended, fixed",
             hg.extended_filter,
-            hg.Polytope(fixed),
+            hg.filters.Polytope(fixed),
             oracle.predict_extended,
             oracle.bounded(poly(s), False),
         )
-        yield name, "zero mean", hg.cubature_filter, hg.ZeroMean(), oracle.predict_cubature, oracle.orthogonal(poly(s))
+        yield (
+            name,
+            "zero mean",
+            hg.cubature_filter,
+            hg.filters.ZeroMean(),
+            oracle.predict_cubature,
+            oracle.orthogonal(poly(s)),
+        )
 
 
 @pytest.mark.parametrize("case", list(cases()), ids=lambda c: f"{c[0]}, {c[1]}")
@@ -95,7 +102,7 @@ def test_a_perfect_channel_gives_the_textbook_filter_with_the_noises_added(qm, q
     """Exact limit: xi = gamma = 1, no uncertainty, alpha sqrt(E) = 1."""
     z = machine.data(STRONG, STEPS)[:, 2]
     noisier = {**STRONG, "Q": STRONG["Q"] + (qm + qn) * np.eye(2), "Qm": 0 * np.eye(2), "Qn": 0 * np.eye(2)}
-    for update in (hg.Polytope(), hg.ZeroMean()):
+    for update in (hg.filters.Polytope(), hg.filters.ZeroMean()):
         item = hg.cubature_filter(machine.plant(STRONG), machine.sensor(STRONG, 2), perfect_relay(qm, qn), update)
         unit = {**noisier, "alpha": 1.0}
         reference = follow_oracle(unit, 2, oracle.predict_cubature, oracle.known_gains(np.ones(()), np.ones(())), z)
@@ -134,9 +141,9 @@ def test_a_silent_amplifier_leaves_the_inflated_prediction():
     """alpha = 0: K = 0 and Xi = (1 + beta_1) P-."""
     off = {**STRONG, "alpha": 0.0}
     z = machine.data(STRONG, STEPS)[:, 0]
-    scalars = hg.Scalars(1e-3, 1e-2)
+    scalars = hg.filters.Scalars(1e-3, 1e-2)
     item = hg.cubature_filter(
-        machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(off), hg.Polytope(scalars)
+        machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(off), hg.filters.Polytope(scalars)
     )
     state = item.init()
     for row in z:
@@ -150,7 +157,10 @@ def test_known_laws_make_all_updates_equal():
     """rho = kappa = 0: tight = polytope = zero mean."""
     z = machine.data(STRONG, STEPS)[:, 0]
     parts = (machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(STRONG, radius=0.0))
-    agree(follow(hg.cubature_filter(*parts, hg.Polytope()), z), follow(hg.cubature_filter(*parts, hg.ZeroMean()), z))
+    agree(
+        follow(hg.cubature_filter(*parts, hg.filters.Polytope()), z),
+        follow(hg.cubature_filter(*parts, hg.filters.ZeroMean()), z),
+    )
 
 
 LINEAR = hg.LinearPlant([[0.9, 0.2], [-0.1, 0.8]], 0.1, [1.0, -1.0], 0.5)
@@ -191,7 +201,7 @@ def test_claims_name_what_is_true():
 FILTERS = {
     "cubature": lambda c: hg.cubature_filter(LINEAR, SENSOR, c),
     "extended": lambda c: hg.extended_filter(LINEAR, SENSOR, c),
-    "zero mean": lambda c: hg.cubature_filter(LINEAR, SENSOR, c, hg.ZeroMean()),
+    "zero mean": lambda c: hg.cubature_filter(LINEAR, SENSOR, c, hg.filters.ZeroMean()),
     "linear": lambda c: hg.linear_filter(LINEAR, SENSOR, c),
 }
 PARALLEL = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.Nakagami(2.0), 0.2)])
@@ -205,7 +215,7 @@ def test_contract(name):
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_missing_component_equals_a_channel_that_is_off(name):
     """Deleting a row of z and switching its channel off are the same thing."""
-    off = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.silent(1, 1, 7.0)])
+    off = hg.parallel([hg.hop(hg.Rayleigh(1.0), 0.1), hg.model.silent(1, 1, 7.0)])
     z = np.random.default_rng(1).normal(size=(STEPS, 2))
     missing = z.copy()
     missing[:, 1] = np.nan
@@ -236,8 +246,8 @@ def test_a_component_known_exactly_is_no_error():
             lambda: hg.cubature_filter(LINEAR, SENSOR, PARALLEL, initial_mean=[1.0]),
             r"initial mean: expected shape \(2\)",
         ),
-        (lambda: hg.Scalars(0.0, 1.0), "two positive numbers"),
-        (lambda: hg.ZeroMean(-1.0), "a positive number"),
+        (lambda: hg.filters.Scalars(0.0, 1.0), "two positive numbers"),
+        (lambda: hg.filters.ZeroMean(-1.0), "a positive number"),
     ],
 )
 def test_parts_that_do_not_fit_are_refused(make, message):
@@ -259,13 +269,16 @@ def test_known_laws_make_the_interval_bound_the_polytope():
     """rho = kappa = 0: tight = polytope."""
     z = machine.data(STRONG, STEPS)[:, 0]
     parts = (machine.plant(STRONG), machine.sensor(STRONG, 0), machine.channel(STRONG, radius=0.0))
-    agree(follow(hg.cubature_filter(*parts, hg.Interval()), z), follow(hg.cubature_filter(*parts, hg.Polytope()), z))
+    agree(
+        follow(hg.cubature_filter(*parts, hg.filters.Interval()), z),
+        follow(hg.cubature_filter(*parts, hg.filters.Polytope()), z),
+    )
 
 
 def test_every_transform_is_the_same_for_linear_plants():
     z = np.random.default_rng(2).normal(size=(STEPS, 2))
     parts = (LINEAR, SENSOR, PARALLEL)
-    rules = [hg.Cubature(), hg.Linearization(), hg.PolynomialMoments(1)]
-    first, *others = (follow(hg.gaussian_filter(*parts, rule), z) for rule in rules)
+    rules = [hg.filters.Cubature(), hg.filters.Linearization(), hg.filters.PolynomialMoments(1)]
+    first, *others = (follow(hg.filters.gaussian_filter(*parts, rule), z) for rule in rules)
     for other in others:
         agree(other, first)

@@ -55,7 +55,7 @@ def test_an_indefinite_covariance_gives_nan():
 
 def test_a_silent_channel_says_nothing():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
-    item = hg.linear_filter(plant, sensor, hg.silent())
+    item = hg.linear_filter(plant, sensor, hg.model.silent())
     heard = item.correct(item.predict(item.init()), [0.0])[1]
     assert heard.value[0] == 0 and heard.covariance[0, 0] == 0 and heard.log_likelihood == 0
 

@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine import GainAndNoise, Series
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.combine import Series
 
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
 SENSOR = hg.LinearSensor([[1.0, 0.0], [0.5, 1.0]], 0.02)
-SKEWED = hg.FiniteSupport([[0.9, 0.0], [-0.1, 0.1], [-0.1, -0.05]], [0.1, 0.3, 0.6])
-FADING = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), SKEWED), hg.hop(hg.bernoulli(0.85), 0.01, dimension=2)])
+SKEWED = hg.random_affine.FiniteSupport([[0.9, 0.0], [-0.1, 0.1], [-0.1, -0.05]], [0.1, 0.3, 0.6])
+FADING = hg.amplify_and_forward(
+    [hg.hop(hg.Rayleigh(0.8), SKEWED), hg.hop(hg.random_affine.bernoulli(0.85), 0.01, dimension=2)]
+)
 P, R = np.array([0.2, 0.3, 0.5]), 0.1
 LAW = hg.Discrete([0.2, 0.8, 1.3], P, R)
 Z_LIMIT = 4.0  # one number in 30,000 beyond it by chance; seeds are fixed and a few dozen numbers are compared

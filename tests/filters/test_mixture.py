@@ -9,7 +9,7 @@ from heliograph.filters.mixture import atoms_of
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model
 
-TWO = hg.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+TWO = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 
 
 def one_step(plant, sensor, channel, z, **options):
@@ -50,7 +50,7 @@ def test_first_step_is_bayes_rule_on_a_grid():
 
 def test_atoms_have_the_channels_moments():
     s = model(oracle.paper_example(), 1)
-    stacked = hg.Stack([s.channel, hg.dropout(hg.hop(0.9, TWO), 0.7)])
+    stacked = hg.random_affine.Stack([s.channel, hg.dropout(hg.hop(0.9, TWO), 0.7)])
     atoms = atoms_of(stacked)
     assert sum(a.weight for a in atoms) == pytest.approx(1.0, abs=1e-14)
     x = np.array([0.8])
@@ -68,7 +68,7 @@ def test_a_missing_measurement_is_a_prediction():
 
 def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
-    cubic = hg.lmmse(hg.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
+    cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.mixture_filter(*s)})})
     found = hg.monte_carlo(network, 30, 192, 0, keep=hg.Statistics())["node"]["mixture"]
     assert found.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
@@ -79,11 +79,11 @@ def test_what_has_no_atoms_is_refused():
     with pytest.raises(ValueError, match="gains of finitely many values, got Rayleigh"):
         hg.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
     with pytest.raises(ValueError, match="resolution above 0"):
-        hg.mixture_filter(plant, sensor, hg.hop(hg.bernoulli(0.5), TWO))
-    hg.mixture_filter(plant, sensor, hg.hop(hg.bernoulli(0.5), TWO), resolution=0.01)
-    many = hg.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
+        hg.mixture_filter(plant, sensor, hg.hop(hg.random_affine.bernoulli(0.5), TWO))
+    hg.mixture_filter(plant, sensor, hg.hop(hg.random_affine.bernoulli(0.5), TWO), resolution=0.01)
+    many = hg.random_affine.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
     with pytest.raises(ValueError, match="at most 4,096 combinations of atoms, got 10,000"):
         hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, many), hg.hop(1.0, many)]))
-    moments = hg.NoiseMoments([0.0, 1.0, 0.5, 2.0])
+    moments = hg.random_affine.NoiseMoments([0.0, 1.0, 0.5, 2.0])
     with pytest.raises(ValueError, match="finite support or Gaussian, got NoiseMoments"):
         hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())

@@ -13,7 +13,7 @@ PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1
 STILL = hg.LinearPlant(PLANT.matrix, 0.05, PLANT.initial_mean, PLANT.initial_covariance)
 SENSORS = hg.over_time([hg.LinearSensor([[1.0, 0.1 * k], [0.5, 1.0]], 0.02) for k in range(STEPS)])
 FADING = hg.amplify_and_forward(
-    [hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2), hg.hop(hg.bernoulli(0.85), 0.01, dimension=2)]
+    [hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2), hg.hop(hg.random_affine.bernoulli(0.85), 0.01, dimension=2)]
 )
 SURE = hg.hop(0.7, hg.Gaussian([[0.2, 0.1], [0.1, 0.3]], [0.5, -1.0]))
 UNSURE = hg.hop(hg.Discrete([0.2, 1.3], [0.4, 0.6], 0.05), 0.1, dimension=2)
@@ -23,8 +23,8 @@ ORIGINALS = {
     "linear, uncertain": hg.linear_filter(PLANT, SENSORS, UNSURE),
     "Kalman": hg.kalman_filter(PLANT, SENSORS, initial_covariance=3.0),
     "cubature": hg.cubature_filter(PLANT, SENSORS, SURE),
-    "tighter": hg.cubature_filter(PLANT, SENSORS, SURE, hg.ZeroMean()),
-    "system": hg.LinearSystemFilter(hg.lifted_system(STILL, SENSOR, FADING, 1, STEPS)),
+    "tighter": hg.cubature_filter(PLANT, SENSORS, SURE, hg.filters.ZeroMean()),
+    "system": hg.filters.LinearSystemFilter(hg.linear.lifted_system(STILL, SENSOR, FADING, 1, STEPS)),
     "quadratic": hg.polynomial_filter(STILL, SENSOR, SURE, STEPS),
 }
 

@@ -8,7 +8,7 @@ from heliograph.filters.prediction import prediction_of
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1 * np.eye(2), [1.0, -1.0], np.eye(2))
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.5)
-CHANNEL = hg.hop(hg.bernoulli(0.8), 0.1)
+CHANNEL = hg.hop(hg.random_affine.bernoulli(0.8), 0.1)
 
 
 def filtered():

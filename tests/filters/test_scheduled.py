@@ -41,7 +41,7 @@ def test_estimates_are_the_papers():
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_saved_gains_are_the_recursion(degree):
     s, data = model(EXAMPLE, HORIZON), measurements(1)
-    saved = run(hg.scheduled_polynomial_filter(*s, HORIZON, degree), data)
+    saved = run(hg.filters.scheduled_polynomial_filter(*s, HORIZON, degree), data)
     online = run(hg.polynomial_filter(*s, HORIZON, degree), data)
     for a, b in zip(saved, online, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * max(np.abs(b).max(), 1))
@@ -50,7 +50,7 @@ def test_saved_gains_are_the_recursion(degree):
 def single(s, keep):
     """The same model with one of its measurements only."""
     row = np.eye(2)[[keep]]
-    return s._replace(channel=hg.Series([s.channel, hg.known(row)]))
+    return s._replace(channel=hg.random_affine.Series([s.channel, hg.random_affine.known(row)]))
 
 
 @pytest.mark.parametrize("missing", [0, 1])
@@ -69,10 +69,10 @@ def test_nothing_arrives_for_a_while():
     """A gap is a stretch behind a silent channel, whose saved gains are then exact again."""
     horizon, gap = 8, range(3, 5)
     s, data = model(EXAMPLE, horizon), measurements(1)[:horizon]
-    silent = hg.Series([hg.known(np.zeros((1, 1))), s.channel])
-    live = hg.Series([hg.known(np.eye(1)), s.channel])
+    silent = hg.random_affine.Series([hg.random_affine.known(np.zeros((1, 1))), s.channel])
+    live = hg.random_affine.Series([hg.random_affine.known(np.eye(1)), s.channel])
     varying = hg.over_time([silent if k in gap else live for k in range(horizon)])
-    expected = hg.lmmse(hg.lifted_system(s.plant, s.sensor, varying, 2, horizon)).gains.covariance
+    expected = hg.linear.lmmse(hg.linear.lifted_system(s.plant, s.sensor, varying, 2, horizon)).gains.covariance
     holes = data.copy()
     holes[list(gap)] = np.nan
     _, bounds = run(hg.polynomial_filter(*s, horizon), holes)
@@ -82,7 +82,7 @@ def test_nothing_arrives_for_a_while():
 def test_saved_gains_tell_that_their_covariance_is_lost():
     s, data = model(EXAMPLE, HORIZON), measurements(1)
     data[4] = np.nan
-    for item in (hg.scheduled_polynomial_filter(*s, HORIZON), hg.memory_filter(*s, HORIZON)):
+    for item in (hg.filters.scheduled_polynomial_filter(*s, HORIZON), hg.filters.memory_filter(*s, HORIZON)):
         means, bounds = run(item, data)
         assert np.all(np.isfinite(means))
         assert np.all(np.isfinite(bounds[:4])) and np.all(np.isnan(bounds[4:]))
@@ -95,7 +95,7 @@ def test_saved_gains_tell_that_their_covariance_is_lost():
 def test_a_missing_measurement_counts_as_expected():
     """Saved gains with a gap: the same state as if the filter's own prediction had arrived."""
     s, data = model(EXAMPLE, HORIZON), measurements(1)
-    item = hg.ScheduledFilter(hg.lmmse(hg.lifted_system(*s, 1, HORIZON)))
+    item = hg.filters.ScheduledFilter(hg.linear.lmmse(hg.linear.lifted_system(*s, 1, HORIZON)))
     state = item.init()
     for k in range(4):
         state, _ = item.step(state, data[k], (), k)
@@ -109,13 +109,13 @@ def test_a_missing_measurement_counts_as_expected():
 def test_filters_keep_the_contract():
     s = model(two_sensors(), HORIZON)
     check_filter(hg.polynomial_filter(*s, HORIZON))
-    check_filter(hg.LinearSystemFilter(hg.lifted_system(*s, 1, HORIZON)))
+    check_filter(hg.filters.LinearSystemFilter(hg.linear.lifted_system(*s, 1, HORIZON)))
     check_filter(hg.mixture_filter(*s, resolution=0.1))
 
 
 def test_horizon_beyond_the_schedule_is_refused_by_the_driver():
     s = model(EXAMPLE, HORIZON)
-    item = hg.scheduled_polynomial_filter(*s, 5)
+    item = hg.filters.scheduled_polynomial_filter(*s, 5)
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"saved": item})})
     with pytest.raises(ValueError, match="horizon: expected at most 5 steps"):
         hg.monte_carlo(network, HORIZON, 1, 0)
@@ -134,14 +134,16 @@ def test_a_stream_beyond_the_horizon_keeps_the_last_matrices():
 def test_uncertain_probabilities_make_the_claim_nominal():
     plant, sensor = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0)
     for radius, claim in ((0.0, "exact"), (0.1, "nominal")):
-        assert hg.polynomial_filter(plant, sensor, hg.hop(hg.bernoulli(0.6, radius), 0.1), 3).claim == claim
+        assert (
+            hg.polynomial_filter(plant, sensor, hg.hop(hg.random_affine.bernoulli(0.6, radius), 0.1), 3).claim == claim
+        )
 
 
 def test_claims_hold_in_the_drivers_monte_carlo():
     """Exact claims of every degree and of memory, in one network on one data set: NEES and covariances."""
     horizon, s = 10, model(EXAMPLE, 10, initial=0.01 * np.eye(2))
-    filters = {f"degree {d}": hg.scheduled_polynomial_filter(*s, horizon, d) for d in (2, 3)}
-    filters["memory"] = hg.memory_filter(*s, horizon)
+    filters = {f"degree {d}": hg.filters.scheduled_polynomial_filter(*s, horizon, d) for d in (2, 3)}
+    filters["memory"] = hg.filters.memory_filter(*s, horizon)
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, filters)})
     found = hg.monte_carlo(network, horizon, 1024, 1, keep=hg.Statistics())["node"]
     for name, statistics in found.items():

@@ -37,7 +37,7 @@ def test_weights_agree_with_slsqp():
     bounds = np.stack([covariances(seed, 4, 5) for seed in range(20)])
     reference = oracle.trace_weights(bounds)
     for b, w in zip(bounds, reference, strict=True):
-        fused = hg.fuse(hg.CovarianceIntersection(), estimates(b))
+        fused = hg.fusion.fuse(hg.CovarianceIntersection(), estimates(b))
         theirs = np.linalg.inv(np.einsum("k,kij->ij", w, np.linalg.inv(b)))
         # Two minima of one convex function: ours is certified to 1e-10, SLSQP's is no better than its own tolerance.
         assert np.trace(fused.covariance) <= np.trace(theirs) * (1 + 1e-10)
@@ -51,5 +51,5 @@ def test_weights_agree_with_a_semidefinite_programme():
     lifted = cp.bmat([[p, np.eye(3)], [np.eye(3), information]])
     problem = cp.Problem(cp.Minimize(cp.trace(p)), [lifted >> 0, cp.sum(w) == 1])
     problem.solve(solver=cp.CLARABEL)
-    fused = hg.fuse(hg.CovarianceIntersection(), estimates(bounds))
+    fused = hg.fusion.fuse(hg.CovarianceIntersection(), estimates(bounds))
     assert np.trace(fused.covariance) == pytest.approx(problem.value, rel=1e-6)  # the solver's tolerance

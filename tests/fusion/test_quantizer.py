@@ -8,12 +8,12 @@ import heliograph as hg
 from heliograph.fusion.quantizer import Symbols, widen
 from heliograph.testing import check_quantizer
 
-ESCAPE = hg.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
+ESCAPE = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
 QUANTIZERS = {
-    "uniform": hg.UniformQuantizer(8, 3.0),
-    "uniform by component": hg.UniformQuantizer(5, [1.0, 2.0], [0.5, 2.0]),
+    "uniform": hg.fusion.UniformQuantizer(8, 3.0),
+    "uniform by component": hg.fusion.UniformQuantizer(5, [1.0, 2.0], [0.5, 2.0]),
     "escape": ESCAPE,
-    "escape by component": hg.EscapeQuantizer(3, [1e-2, 10.0], [0.3, 0.9], 0.0, [1e-3, 1.0]),
+    "escape by component": hg.fusion.EscapeQuantizer(3, [1e-2, 10.0], [0.3, 0.9], 0.0, [1e-3, 1.0]),
 }
 ROUNDING = 1e-15  # a few operations on numbers of the size of the amplitude
 
@@ -38,7 +38,7 @@ def printed(x, d, p):
 @settings(max_examples=100)
 @given(x=st.floats(-5, 5), levels=st.integers(2, 12), amplitude=st.floats(0.1, 4), scale=st.floats(0.2, 3))
 def test_uniform_is_the_printed_one(x, levels, amplitude, scale):
-    sent = hg.UniformQuantizer(levels, amplitude, scale).step((), [x])[1]
+    sent = hg.fusion.UniformQuantizer(levels, amplitude, scale).step((), [x])[1]
     boundary = (x / scale / amplitude + 1) * levels / 2
     if abs(boundary - round(boundary)) > 1e-9:  # on a boundary rounding decides
         assert sent.value[0] == pytest.approx(scale * printed(x / scale, amplitude, levels), abs=20 * ROUNDING)
@@ -49,13 +49,13 @@ def test_uniform_is_the_printed_one(x, levels, amplitude, scale):
 
 
 def test_the_bound_is_attained():
-    sent = hg.UniformQuantizer(4, 2.0).step((), [0.0, 1.0, -2.0])[1]
+    sent = hg.fusion.UniformQuantizer(4, 2.0).step((), [0.0, 1.0, -2.0])[1]
     np.testing.assert_array_equal(np.abs(sent.value - [0.0, 1.0, -2.0]), sent.error)
 
 
 def test_many_levels_clip():
     x = np.linspace(-5, 5, 101)
-    sent = hg.UniformQuantizer(10**9, 3.0).step((), x)[1]
+    sent = hg.fusion.UniformQuantizer(10**9, 3.0).step((), x)[1]
     np.testing.assert_allclose(sent.value, np.clip(x, -3, 3), rtol=0, atol=3e-9 + 3 * ROUNDING)  # d / p
 
 
@@ -66,7 +66,7 @@ def test_many_levels_clip():
     growth=st.sampled_from([0.0, 0.6]),
 )
 def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, growth):
-    quantizer = hg.EscapeQuantizer(levels, 1.0, 0.6, growth, 1e-3)
+    quantizer = hg.fusion.EscapeQuantizer(levels, 1.0, 0.6, growth, 1e-3)
     here, there, stepped = quantizer.init(1), quantizer.init(1), quantizer.init(1)
     for x in values:
         symbols = quantizer.encode(here, [x])
@@ -158,7 +158,7 @@ def test_an_amplitude_that_follows_the_data_can_understate():
     with jax.enable_x64(True):
         bounds = [float(widen(np.array([[q * k**2]]), np.array([d]))[0, 0]) for d in (k, 0.0)]
     assert q * bounds[0] + (1 - q) * bounds[1] < 0.6 * 4 * q * k**2
-    assert hg.UniformQuantizer(8, 1.0).claim("exact") == "upper"
+    assert hg.fusion.UniformQuantizer(8, 1.0).claim("exact") == "upper"
     assert ESCAPE.claim("upper") == "nominal"
     assert {item.claim("none") for item in QUANTIZERS.values()} == {"none"}
 
@@ -166,18 +166,21 @@ def test_an_amplitude_that_follows_the_data_can_understate():
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: hg.UniformQuantizer(1, 1.0), "levels: expected a whole number of at least 2, got 1"),
-        (lambda: hg.UniformQuantizer(2.5, 1.0), "levels: expected a whole number of at least 2"),
-        (lambda: hg.UniformQuantizer(8, 0.0), "amplitude: expected positive numbers, got 0.0"),
-        (lambda: hg.UniformQuantizer(8, [1.0, np.inf]), "amplitude: expected finite numbers"),
-        (lambda: hg.UniformQuantizer(8, [[1.0], [2.0, 3.0]]), "amplitude: expected an array of numbers"),
-        (lambda: hg.UniformQuantizer(8, 1.0, -1.0), "scale: expected positive numbers"),
-        (lambda: hg.UniformQuantizer(8, "wide"), "amplitude: expected an array of numbers"),
-        (lambda: hg.EscapeQuantizer(9, 1.0, 1.0, 0.1, 1e-3), "decay: expected numbers between 0 and 1, got 1.0"),
-        (lambda: hg.EscapeQuantizer(9, 1.0, 0.5, -0.1, 1e-3), "growth: expected no negative number"),
-        (lambda: hg.EscapeQuantizer(8, 1.0, 0.5, 0.1, 1e-3), "levels: expected an odd number, so that zero is a level"),
-        (lambda: hg.EscapeQuantizer(9, 1.0, 0.5, 0.1, 0.0), "smallest amplitude: expected positive numbers"),
-        (lambda: hg.UniformQuantizer(8, [1.0, 2.0]).check(3), r"quantizer: expected numbers or shape \(3,\)"),
+        (lambda: hg.fusion.UniformQuantizer(1, 1.0), "levels: expected a whole number of at least 2, got 1"),
+        (lambda: hg.fusion.UniformQuantizer(2.5, 1.0), "levels: expected a whole number of at least 2"),
+        (lambda: hg.fusion.UniformQuantizer(8, 0.0), "amplitude: expected positive numbers, got 0.0"),
+        (lambda: hg.fusion.UniformQuantizer(8, [1.0, np.inf]), "amplitude: expected finite numbers"),
+        (lambda: hg.fusion.UniformQuantizer(8, [[1.0], [2.0, 3.0]]), "amplitude: expected an array of numbers"),
+        (lambda: hg.fusion.UniformQuantizer(8, 1.0, -1.0), "scale: expected positive numbers"),
+        (lambda: hg.fusion.UniformQuantizer(8, "wide"), "amplitude: expected an array of numbers"),
+        (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 1.0, 0.1, 1e-3), "decay: expected numbers between 0 and 1, got 1.0"),
+        (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 0.5, -0.1, 1e-3), "growth: expected no negative number"),
+        (
+            lambda: hg.fusion.EscapeQuantizer(8, 1.0, 0.5, 0.1, 1e-3),
+            "levels: expected an odd number, so that zero is a level",
+        ),
+        (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 0.0), "smallest amplitude: expected positive numbers"),
+        (lambda: hg.fusion.UniformQuantizer(8, [1.0, 2.0]).check(3), r"quantizer: expected numbers or shape \(3,\)"),
     ],
 )
 def test_bad_quantizers(call, message):
@@ -185,7 +188,7 @@ def test_bad_quantizers(call, message):
         call()
 
 
-class _Optimist(hg.UniformQuantizer):
+class _Optimist(hg.fusion.UniformQuantizer):
     """A quantizer that states half its error."""
 
     def step(self, state, value):

@@ -12,9 +12,9 @@ from tests.oracles import cubature_fusion as oracle
 RULES = {
     "optimal": hg.CovarianceIntersection(),
     "equal": hg.EqualIntersection(),
-    "fixed": hg.FixedIntersection([0.2, 0.3, 0.5]),
-    "weighted": hg.WeightedFusion([0.2, 0.3, 0.5]),
-    "inverse": hg.InverseCovarianceIntersection(),
+    "fixed": hg.fusion.FixedIntersection([0.2, 0.3, 0.5]),
+    "weighted": hg.fusion.WeightedFusion([0.2, 0.3, 0.5]),
+    "inverse": hg.fusion.InverseCovarianceIntersection(),
 }
 
 
@@ -23,7 +23,7 @@ def test_contract(name):
     check_fusion(RULES[name])
 
 
-class _Overconfident(hg.WeightedFusion):
+class _Overconfident(hg.fusion.WeightedFusion):
     """Takes correlated errors for independent ones."""
 
     def combine(self, means, bounds):
@@ -38,7 +38,7 @@ def test_the_check_finds_a_bound_that_is_none():
 
 def test_weighted_fusion_by_hand():
     pair = estimates(np.array([[[1.0]], [[3.0]]]), "exact")
-    fused = hg.fuse(hg.WeightedFusion([0.25, 0.75]), pair)
+    fused = hg.fusion.fuse(hg.fusion.WeightedFusion([0.25, 0.75]), pair)
     np.testing.assert_allclose(fused.mean, 0.25 * pair[0].mean + 0.75 * pair[1].mean, rtol=1e-15)
     assert fused.covariance[0, 0] == 2.5 and fused.claim == "upper"
 
@@ -47,28 +47,28 @@ def test_estimates_that_claim_no_covariance():
     """A weighted mean needs none; rules that weigh by covariances say so."""
     some = estimates(covariances(0, 2, 2), "exact")
     mixed = [some[0], hg.Estimate(some[1].mean, np.full((2, 2), np.nan), "none")]
-    fused = hg.fuse(hg.WeightedFusion([0.5, 0.5]), mixed)
+    fused = hg.fusion.fuse(hg.fusion.WeightedFusion([0.5, 0.5]), mixed)
     assert fused.claim == "none" and np.all(np.isfinite(fused.mean)) and np.all(np.isnan(fused.covariance))
-    rules = (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.InverseCovarianceIntersection())
-    for rule in (*rules, hg.FixedIntersection([0.5, 0.5])):
+    rules = (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.InverseCovarianceIntersection())
+    for rule in (*rules, hg.fusion.FixedIntersection([0.5, 0.5])):
         with pytest.raises(ValueError, match="estimates that claim one, got the claim 'none'"):
-            hg.fuse(rule, mixed)
+            hg.fusion.fuse(rule, mixed)
     assert [weakest([a, "none"]) for a in STRENGTH] == ["none"] * 4
 
 
 @pytest.mark.parametrize(
-    "rule", [hg.CovarianceIntersection(), hg.EqualIntersection(), hg.FixedIntersection([0.5, 0.5])]
+    "rule", [hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
 )
 def test_equal_inputs_are_returned(rule):
     one = estimates(covariances(0, 1, 3))[0]
-    fused = hg.fuse(rule, [one, one])
+    fused = hg.fusion.fuse(rule, [one, one])
     np.testing.assert_allclose(fused.mean, one.mean, rtol=1e-9)
     np.testing.assert_allclose(fused.covariance, one.covariance, rtol=1e-9)
 
 
 def test_a_dominating_sensor_is_returned():
     good, bad = np.diag([1.0, 2.0]), np.diag([3.0, 5.0])
-    fused = hg.fuse(hg.CovarianceIntersection(), estimates(np.stack([good, bad])))
+    fused = hg.fusion.fuse(hg.CovarianceIntersection(), estimates(np.stack([good, bad])))
     np.testing.assert_allclose(fused.covariance, good, rtol=1e-8)  # weight 1 is approached from inside: gap 1e-10
 
 
@@ -77,8 +77,8 @@ def test_a_dominating_sensor_is_returned():
 def test_optimal_is_best_and_no_worse_than_any_input(seed):
     bounds = covariances(seed, 3, 3)
     trace = {
-        type(rule).__name__: np.trace(hg.fuse(rule, estimates(bounds)).covariance)
-        for rule in (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.InverseCovarianceIntersection())
+        type(rule).__name__: np.trace(hg.fusion.fuse(rule, estimates(bounds)).covariance)
+        for rule in (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.InverseCovarianceIntersection())
     }
     best_input = min(np.trace(b) for b in bounds)
     assert trace["CovarianceIntersection"] <= min(trace["EqualIntersection"], best_input) * (1 + 1e-9)
@@ -88,7 +88,7 @@ def test_optimal_is_best_and_no_worse_than_any_input(seed):
 def test_inverse_covariance_intersection_is_the_oracles():
     bounds = covariances(5, 2, 3, spread=0.3)
     pair = estimates(bounds)
-    fused = hg.fuse(hg.InverseCovarianceIntersection(), pair)
+    fused = hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), pair)
     grid = [
         oracle.inverse_intersection(pair[0].mean, bounds[0], pair[1].mean, bounds[1], w)
         for w in np.linspace(0, 1, 20001)
@@ -106,7 +106,7 @@ def test_upper_bounds_stay_upper_for_any_correlation():
         blocks = [joint[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(2)]
         bounds = np.stack(blocks)
         w = rng.uniform()
-        fused = hg.fuse(hg.FixedIntersection([w, 1 - w]), estimates(bounds))
+        fused = hg.fusion.fuse(hg.fusion.FixedIntersection([w, 1 - w]), estimates(bounds))
         gains = [share * fused.covariance @ np.linalg.inv(b) for share, b in zip((w, 1 - w), bounds, strict=True)]
         actual = np.hstack(gains) @ joint @ np.hstack(gains).T
         assert np.linalg.eigvalsh(fused.covariance - actual)[0] >= -1e-9 * np.trace(fused.covariance)
@@ -115,15 +115,15 @@ def test_upper_bounds_stay_upper_for_any_correlation():
 def test_a_fused_claim_is_never_stronger_than_its_weakest_input():
     bounds = covariances(0, 2, 2)
     mixed = [*estimates(bounds[:1], "nominal"), *estimates(bounds[1:], "exact")]
-    assert hg.fuse(hg.CovarianceIntersection(), mixed).claim == "nominal"
-    assert hg.fuse(hg.EqualIntersection(), estimates(bounds, "exact")).claim == "upper"
-    assert hg.fuse(hg.InverseCovarianceIntersection(), estimates(bounds, "exact")).claim == "nominal"
+    assert hg.fusion.fuse(hg.CovarianceIntersection(), mixed).claim == "nominal"
+    assert hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds, "exact")).claim == "upper"
+    assert hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), estimates(bounds, "exact")).claim == "nominal"
 
 
 def test_leading_axes_are_carried_along():
     bounds = np.stack([covariances(s, 3, 2) for s in range(4)])
-    together = hg.fuse(hg.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))
-    alone = hg.fuse(hg.EqualIntersection(), estimates(bounds[2]))
+    together = hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))
+    alone = hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds[2]))
     np.testing.assert_allclose(together.covariance[2], alone.covariance, rtol=1e-12)
 
 
@@ -146,7 +146,7 @@ def test_the_central_filter_is_the_joint_kalman_filter():
     """Behind known gains, using nodes in turn equals one update with all measurements."""
     gain = hg.hop(1.2, 0.05)
     found = network(
-        gain, lambda n: {"central": hg.sequential_filter([node.filters["cubature"] for node in n.values()])}
+        gain, lambda n: {"central": hg.filters.sequential_filter([node.filters["cubature"] for node in n.values()])}
     )
     joint_sensor = hg.LinearSensor(list(ROWS.values()), 0.1)
     joint = hg.cubature_filter(PLANT, joint_sensor, hg.parallel([gain] * 3))
@@ -171,7 +171,7 @@ def test_fusion_inside_the_scan_is_fusion_outside():
     found = network(fading, lambda n: rules)
     record = hg.monte_carlo(found, 5, 4, 0)
     for name, fusion in rules.items():
-        outside = hg.fuse(fusion.rule, [record.estimates[node][fusion.filter] for node in ROWS])
+        outside = hg.fusion.fuse(fusion.rule, [record.estimates[node][fusion.filter] for node in ROWS])
         inside = record.estimates["fused"][name]
         np.testing.assert_allclose(inside.mean, outside.mean, atol=1e-12)
         np.testing.assert_allclose(inside.covariance, outside.covariance, atol=1e-12)
@@ -188,11 +188,11 @@ def test_nodes_keep_their_order():
     }
     weights = [0.9, 0.1]
     fused = {
-        "fixed": hg.Fusion("f", hg.FixedIntersection(weights)),
-        "central": hg.sequential_filter([n.filters["f"] for n in nodes.values()]),
+        "fixed": hg.Fusion("f", hg.fusion.FixedIntersection(weights)),
+        "central": hg.filters.sequential_filter([n.filters["f"] for n in nodes.values()]),
     }
     record = hg.monte_carlo(hg.Network(PLANT, nodes, fused), 4, 2, 0)
-    outside = hg.fuse(hg.FixedIntersection(weights), [record.estimates[name]["f"] for name in nodes])
+    outside = hg.fusion.fuse(hg.fusion.FixedIntersection(weights), [record.estimates[name]["f"] for name in nodes])
     np.testing.assert_allclose(record.estimates["fused"]["fixed"].mean, outside.mean, atol=1e-12)
     stream = hg.Stream(fused["central"])
     for k in range(4):
@@ -207,7 +207,7 @@ def test_an_upper_claim_of_fusion_holds():
     assert s.claim == "upper" and s.worst_direction().z < 4
 
 
-QUANTIZER = hg.UniformQuantizer(8, 3.0)
+QUANTIZER = hg.fusion.UniformQuantizer(8, 3.0)
 
 
 def quantized(quantizer):
@@ -217,42 +217,45 @@ def quantized(quantizer):
 
 def test_a_claim_through_a_quantizer():
     assert quantized(None).claims()["fused"]["x"] == quantized(QUANTIZER).claims()["fused"]["x"] == "upper"
-    following = hg.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
+    following = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
     assert quantized(following).claims()["fused"]["x"] == "nominal"
     assert quantized({name: following for name in ROWS}).claims()["fused"]["x"] == "nominal"
-    varying = hg.over_time([QUANTIZER, hg.UniformQuantizer(16, 3.0)])
+    varying = hg.over_time([QUANTIZER, hg.fusion.UniformQuantizer(16, 3.0)])
     assert quantized(varying).claims()["fused"]["x"] == "upper"
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: hg.FixedIntersection([0.5, 0.6]), "sum to 1"),
-        (lambda: hg.FixedIntersection([1.5, -0.5]), "no negative"),
-        (lambda: hg.fuse(hg.FixedIntersection([0.5, 0.5]), estimates(covariances(0, 3, 2))), r"shape \(3\)"),
+        (lambda: hg.fusion.FixedIntersection([0.5, 0.6]), "sum to 1"),
+        (lambda: hg.fusion.FixedIntersection([1.5, -0.5]), "no negative"),
         (
-            lambda: hg.fuse(
+            lambda: hg.fusion.fuse(hg.fusion.FixedIntersection([0.5, 0.5]), estimates(covariances(0, 3, 2))),
+            r"shape \(3\)",
+        ),
+        (
+            lambda: hg.fusion.fuse(
                 hg.EqualIntersection(), [*estimates(covariances(0, 1, 2)), *estimates(covariances(0, 1, 3))]
             ),
             "one state dimension",
         ),
-        (lambda: hg.fuse(hg.EqualIntersection(), []), "one state dimension, got"),
+        (lambda: hg.fusion.fuse(hg.EqualIntersection(), []), "one state dimension, got"),
         (
             lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("missing", hg.EqualIntersection())}),
             r"a filter that some node has \['cubature', 'linear'\], got 'missing'",
         ),
         (
-            lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("linear", hg.FixedIntersection([1.0]))}),
+            lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("linear", hg.fusion.FixedIntersection([1.0]))}),
             r"shape \(3\)",
         ),
-        (lambda: hg.sequential_filter([]), "one state dimension"),
-        (lambda: hg.WeightedFusion([0.5, 0.6]), "sum to 1"),
-        (lambda: hg.fuse(hg.WeightedFusion([0.5, 0.5]), estimates(covariances(0, 3, 2))), r"shape \(3\)"),
+        (lambda: hg.filters.sequential_filter([]), "one state dimension"),
+        (lambda: hg.fusion.WeightedFusion([0.5, 0.6]), "sum to 1"),
+        (lambda: hg.fusion.fuse(hg.fusion.WeightedFusion([0.5, 0.5]), estimates(covariances(0, 3, 2))), r"shape \(3\)"),
         (lambda: quantized({"a": QUANTIZER}), r"quantizers: expected one for each node of \['a', 'b', 'c'\]"),
         (lambda: quantized(3.0), "quantizer: expected an AbstractQuantizer, got float"),
-        (lambda: quantized(hg.UniformQuantizer(8, [1.0, 2.0, 3.0])), r"numbers or shape \(2,\)"),
+        (lambda: quantized(hg.fusion.UniformQuantizer(8, [1.0, 2.0, 3.0])), r"numbers or shape \(2,\)"),
         (
-            lambda: quantized({"a": QUANTIZER, "b": QUANTIZER, "c": hg.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)}),
+            lambda: quantized({"a": QUANTIZER, "b": QUANTIZER, "c": hg.fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)}),
             "objects of one structure",
         ),
     ],

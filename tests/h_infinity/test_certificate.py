@@ -34,7 +34,7 @@ def test_theorem_1_three_times_over(seed, i, beta):
 
 @pytest.mark.parametrize("i", range(4))
 def test_designed_gains_satisfy_both_published_theorems(i):
-    design, g = hg.recursive_design(node(i), paper.gamma[i], START), paper.gamma[i]
+    design, g = hg.h_infinity.recursive_design(node(i), paper.gamma[i], START), paper.gamma[i]
     for s in range(16):
         K, P, P_next, (l1, l2) = design.gains[s], design.weights[s], design.weights[s + 1], design.multipliers[s]
         assert np.linalg.eigvalsh(paper.Phi(i, K, P, P_next, l1, l2, g))[-1] < 0
@@ -49,13 +49,13 @@ def test_theorem_2_is_the_schur_complement_of_theorem_1():
 
 
 def certificate(design, level=None, growth=(), i=0):
-    return hg.certify_level(
+    return hg.h_infinity.certify_level(
         node(i), design.gains, design.weights, design.multipliers, level or design.level, growth=growth
     )
 
 
 def test_it_says_by_how_much_and_what_fails():
-    design = hg.recursive_design(node(0), 1.8, START)
+    design = hg.h_infinity.recursive_design(node(0), 1.8, START)
     assert certificate(design).margin > 0 and certificate(design).steps_certified == 16
     low = certificate(design, level=0.8)
     assert not low.certified and any(reason.startswith("initial condition") for reason in low.reasons)
@@ -71,24 +71,24 @@ def f(s):
 
 
 def test_the_papers_growth_constant_is_false_and_the_certificate_is_refused():
-    design = hg.recursive_design(node(0), 1.8, START)
-    findings = [hg.check_growth(f(s), 0.7, [-2.2, -2.2], [2.2, 2.2], name=f"f at step {s}") for s in (0, 15)]
+    design = hg.h_infinity.recursive_design(node(0), 1.8, START)
+    findings = [hg.h_infinity.check_growth(f(s), 0.7, [-2.2, -2.2], [2.2, 2.2], name=f"f at step {s}") for s in (0, 15)]
     assert not findings[0].refuted and findings[1].refuted and findings[1].ratio > 15.7
     x, y = findings[1].pair
     ratio = np.linalg.norm(np.asarray(f(15)(x)) - np.asarray(f(15)(y))) / np.linalg.norm(x - y)
     np.testing.assert_allclose(ratio, findings[1].ratio, rtol=1e-2)  # recomputed in single precision
     refused = certificate(design, growth=findings)
     assert not refused.certified and "f at step 15: constant 0.7 is false" in refused.reasons[-1]
-    assert not hg.check_size(f(15), 0.7, [-2.2, -2.2], [2.2, 2.2]).refuted  # |f(x)| <= .7 |x| alone is true
+    assert not hg.h_infinity.check_size(f(15), 0.7, [-2.2, -2.2], [2.2, 2.2]).refuted  # |f(x)| <= .7 |x| alone is true
 
 
 def test_true_constants_give_a_level_that_is_certified():
     """|f| <= .7 |x| everywhere; .8 bounds every slope over the visited box, so the level may be called certified."""
     system = node(0, growth=(0.7, 0.8))
-    design = hg.horizon_design(system)
-    finding = hg.check_growth(f(9), 0.8, [-0.1, -0.03], [0.12, 0.06])
+    design = hg.h_infinity.horizon_design(system)
+    finding = hg.h_infinity.check_growth(f(9), 0.8, [-0.1, -0.03], [0.12, 0.06])
     assert not finding.refuted and finding.slope > 0.7
-    assert hg.certify_level(
+    assert hg.h_infinity.certify_level(
         system, design.gains, design.weights, design.multipliers, design.level, growth=[finding]
     ).certified
     np.testing.assert_allclose(design.level, 0.0328, rtol=2e-3)
@@ -97,7 +97,7 @@ def test_true_constants_give_a_level_that_is_certified():
 def test_a_guarantee_is_kept_by_simulation():
     """J1 < 0 over the eight-fold outcomes is the promise: energy ratios of 200 random disturbances."""
     system = node(0, growth=0.5)
-    design = hg.horizon_design(system)
+    design = hg.h_infinity.horizon_design(system)
     generator = np.random.default_rng(0)
     worst = 0.0
     for _ in range(200):
@@ -127,12 +127,17 @@ def test_a_guarantee_is_kept_by_simulation():
         (lambda d: certificate(d, level=-1.0), "level: expected a positive number"),
         (lambda d: certificate(d._replace(multipliers=d.multipliers[:, :1])), "multipliers: expected 2 or 4"),
         (lambda d: certificate(d._replace(weights=d.weights[1:])), r"weights: expected shape \(17, 4, 4\)"),
-        (lambda d: hg.check_growth(f(0), 0.7, [1.0, 1.0], [0.0, 0.0]), "region: expected a low corner below"),
-        (lambda d: hg.check_growth(f(0), -0.7, [0.0, 0.0], [1.0, 1.0]), "growth constant"),
-        (lambda d: hg.check_size(f(0), 0.7, [1.0, 1.0], [2.0, 2.0]), "region: expected a box around 0"),
+        (
+            lambda d: hg.h_infinity.check_growth(f(0), 0.7, [1.0, 1.0], [0.0, 0.0]),
+            "region: expected a low corner below",
+        ),
+        (lambda d: hg.h_infinity.check_growth(f(0), -0.7, [0.0, 0.0], [1.0, 1.0]), "growth constant"),
+        (lambda d: hg.h_infinity.check_size(f(0), 0.7, [1.0, 1.0], [2.0, 2.0]), "region: expected a box around 0"),
     ],
 )
 def test_bad_input(call, message):
-    design = hg.HInfinityDesign(1.8, np.zeros((16, 2, 2)), np.tile(START, (17, 1, 1)), np.ones((16, 2)), True, "")
+    design = hg.h_infinity.HInfinityDesign(
+        1.8, np.zeros((16, 2, 2)), np.tile(START, (17, 1, 1)), np.ones((16, 2)), True, ""
+    )
     with pytest.raises(ValueError, match=message):
         call(design)

@@ -13,34 +13,36 @@ START = 10 * np.eye(4)  # the paper's P_0
 @pytest.mark.parametrize("objective", ["trace", "largest_eigenvalue", "log_determinant"])
 @pytest.mark.parametrize("i", range(4))
 def test_the_published_levels_can_be_designed_at_every_step(i, objective):
-    design = hg.recursive_design(node(i), paper.gamma[i], START, objective=objective)
+    design = hg.h_infinity.recursive_design(node(i), paper.gamma[i], START, objective=objective)
     assert design.feasible and design.failed_step is None
-    assert hg.certify_level(node(i), design.gains, design.weights, design.multipliers, paper.gamma[i]).certified
+    assert hg.h_infinity.certify_level(
+        node(i), design.gains, design.weights, design.multipliers, paper.gamma[i]
+    ).certified
 
 
 def test_any_feasible_point_is_a_dead_end():
-    design = hg.recursive_design(node(0), paper.gamma[0], START, objective="none", search=False)
+    design = hg.h_infinity.recursive_design(node(0), paper.gamma[0], START, objective="none", search=False)
     assert not design.feasible
     assert 0 < design.failed_step < 16
     assert np.isfinite(design.gains[: design.failed_step]).all() and np.isnan(design.gains[design.failed_step :]).all()
 
 
 def test_a_level_too_low_says_where_it_fails_and_what_would_work():
-    design = hg.recursive_design(node(0), 0.02)
+    design = hg.h_infinity.recursive_design(node(0), 0.02)
     assert not design.feasible
     assert design.status.startswith(f"no gain found at step {design.failed_step} of 16")
     np.testing.assert_allclose(design.smallest_level, 0.02696, rtol=5e-4)  # bisection to 1e-4
     with pytest.raises(ValueError, match=r"design: expected one that is feasible, got no gain found at step"):
         plant = hg.Plant(lambda x, u: 0.7 * x, 0.0, np.zeros(2), np.eye(2))
-        hg.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
+        hg.filters.h_infinity_filter(plant, hg.LinearSensor([[0.15, 0.15]], 0.0), node(0), design)
 
 
 def test_the_initial_weight_alone_sets_the_smallest_level_of_the_paper():
     """(19), 10 I < gamma^2 15 I: sqrt(10/15); the solver's margin is 1e-6 of the level squared."""
-    design = hg.recursive_design(node(2), 0.5, START)
+    design = hg.h_infinity.recursive_design(node(2), 0.5, START)
     assert design.failed_step == 0 and "initial condition" in design.status
     np.testing.assert_allclose(design.smallest_level, np.sqrt(10 / 15), rtol=2e-4)
-    np.testing.assert_allclose(hg.horizon_design(node(2), initial=START).level, np.sqrt(10 / 15), rtol=2e-6)
+    np.testing.assert_allclose(hg.h_infinity.horizon_design(node(2), initial=START).level, np.sqrt(10 / 15), rtol=2e-6)
 
 
 HORIZON = (0.025931, 0.028873, 0.029031, 0.028674)
@@ -49,47 +51,53 @@ HORIZON = (0.025931, 0.028873, 0.029031, 0.028674)
 @pytest.mark.parametrize("i", range(4))
 def test_smallest_levels_over_the_horizon(i):
     """Two solvers and an independent derivation agree to the digits given; separate multipliers have a closed form."""
-    design, separate = hg.horizon_design(node(i)), hg.horizon_design(node(i), separate=True)
+    design, separate = hg.h_infinity.horizon_design(node(i)), hg.h_infinity.horizon_design(node(i), separate=True)
     np.testing.assert_allclose(design.level, HORIZON[i], rtol=3e-5)
     closed = np.sqrt(0.05**2 * 2 * (1 - 0.7**32) / ((1 - 0.7**2) * 15))
     np.testing.assert_allclose(separate.level, closed, rtol=1e-5)
     for found in (design, separate):
-        assert hg.certify_level(node(i), found.gains, found.weights, found.multipliers, found.level).certified
+        assert hg.h_infinity.certify_level(
+            node(i), found.gains, found.weights, found.multipliers, found.level
+        ).certified
 
 
 def test_the_recursion_cannot_look_ahead():
-    found = hg.smallest_recursive_level(node(0))
+    found = hg.h_infinity.smallest_recursive_level(node(0))
     np.testing.assert_allclose(found.level, 0.02696, rtol=5e-4)
     assert found.level > HORIZON[0]
-    assert hg.certify_level(node(0), found.gains, found.weights, found.multipliers, found.level).certified
+    assert hg.h_infinity.certify_level(node(0), found.gains, found.weights, found.multipliers, found.level).certified
 
 
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
     short = node(0, steps=5)
-    np.testing.assert_allclose(hg.horizon_design(short, solver="scs").level, hg.horizon_design(short).level, rtol=1e-5)
-    design = hg.recursive_design(short, 1.8, START, solver="scs")
-    assert hg.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
+    np.testing.assert_allclose(
+        hg.h_infinity.horizon_design(short, solver="scs").level, hg.h_infinity.horizon_design(short).level, rtol=1e-5
+    )
+    design = hg.h_infinity.recursive_design(short, 1.8, START, solver="scs")
+    assert hg.h_infinity.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
 
 
 def test_without_measurements_the_channel_plays_no_part():
-    closed = hg.level_without_measurements(node(0))
+    closed = hg.h_infinity.level_without_measurements(node(0))
     np.testing.assert_allclose(closed, 0.029031, rtol=3e-5)
     zero = np.zeros((16, 2, 2))
     for system in (node(0), node(2), node(0, beta=(0.1, 0.2, 0.3)), node(0, beta=(1.0, 1.0, 1.0))):
-        np.testing.assert_allclose(hg.horizon_design(system, gains=zero).level, closed, rtol=3e-6)  # the margin
+        np.testing.assert_allclose(
+            hg.h_infinity.horizon_design(system, gains=zero).level, closed, rtol=3e-6
+        )  # the margin
 
 
 def test_without_feedthrough_a_gain_of_zero_is_optimal():
-    system = hg.growth_system(16, paper.B, [[0.0]], paper.M, channel(), 0.7, 0.3, initial_weight=paper.W)
-    zero = hg.horizon_design(system, gains=np.zeros((16, 2, 2))).level
-    np.testing.assert_allclose(hg.horizon_design(system).level, zero, rtol=1e-6)
+    system = hg.h_infinity.growth_system(16, paper.B, [[0.0]], paper.M, channel(), 0.7, 0.3, initial_weight=paper.W)
+    zero = hg.h_infinity.horizon_design(system, gains=np.zeros((16, 2, 2))).level
+    np.testing.assert_allclose(hg.h_infinity.horizon_design(system).level, zero, rtol=1e-6)
 
 
 def test_no_division_where_a_link_always_delivers():
     for beta in ((1.0, 1.0, 1.0), (1.0, 0.75, 0.7), (0.8, 1.0, 1.0)):
-        design = hg.horizon_design(node(0, beta=beta))
-        assert hg.certify_level(
+        design = hg.h_infinity.horizon_design(node(0, beta=beta))
+        assert hg.h_infinity.certify_level(
             node(0, beta=beta), design.gains, design.weights, design.multipliers, design.level
         ).certified
         assert design.level < HORIZON[0] * (1 + 1e-5)  # better links, no worse level
@@ -100,19 +108,19 @@ def test_known_channel_in_closed_form_is_the_textbook_filter():
     system, low, high = linear_system(), 1e-3, 10.0
     while high / low > 1 + 1e-8:
         middle = np.sqrt(low * high)
-        low, high = (low, middle) if hg.known_channel_design(system, middle).feasible else (middle, high)
-    np.testing.assert_allclose(high, hg.horizon_design(system).level, rtol=1e-5)
-    design = hg.known_channel_design(system, 1.001 * high)
-    assert hg.certify_level(system, design.gains, design.weights, design.multipliers, design.level).certified
-    assert not hg.known_channel_design(system, 0.99 * high).feasible
+        low, high = (low, middle) if hg.h_infinity.known_channel_design(system, middle).feasible else (middle, high)
+    np.testing.assert_allclose(high, hg.h_infinity.horizon_design(system).level, rtol=1e-5)
+    design = hg.h_infinity.known_channel_design(system, 1.001 * high)
+    assert hg.h_infinity.certify_level(system, design.gains, design.weights, design.multipliers, design.level).certified
+    assert not hg.h_infinity.known_channel_design(system, 0.99 * high).feasible
 
 
 def test_known_channel_with_growth_needs_no_more_than_the_solver_found():
     system = node(0, beta=(1.0, 1.0, 1.0))
-    best = hg.horizon_design(system, separate=True)
+    best = hg.h_infinity.horizon_design(system, separate=True)
     multipliers = best.multipliers[:, [1, 3]] * (1 + 1e-4) ** 2  # scaled with the level
-    design = hg.known_channel_design(system, best.level * (1 + 1e-4), multipliers)
-    assert hg.certify_level(system, design.gains, design.weights, design.multipliers, design.level).certified
+    design = hg.h_infinity.known_channel_design(system, best.level * (1 + 1e-4), multipliers)
+    assert hg.h_infinity.certify_level(system, design.gains, design.weights, design.multipliers, design.level).certified
     larger = np.linalg.eigvalsh(design.weights[1:, 2:, 2:] - best.weights[1:, 2:, 2:])
     assert (larger > -1e-4 * best.weights[1:, 2:, 2:].max()).all()  # P2 at least that of any other gain
 
@@ -123,52 +131,60 @@ def test_structure_pays():
     common = dict(
         disturbance=0.1 * np.eye(2), feedthrough=np.zeros((1, 2)), wanted=np.eye(2), channel=hg.hop(1.0, 0.01)
     )
-    known = hg.growth_system(12, growth=0.05, transition=a, output=[[1.0, 0.0]], **common)
-    unknown = hg.growth_system(12, growth=0.05 + np.linalg.norm(a, 2), output_growth=1.0, **common)
-    assert hg.horizon_design(known).level < 0.6 * hg.horizon_design(unknown).level
+    known = hg.h_infinity.growth_system(12, growth=0.05, transition=a, output=[[1.0, 0.0]], **common)
+    unknown = hg.h_infinity.growth_system(12, growth=0.05 + np.linalg.norm(a, 2), output_growth=1.0, **common)
+    assert hg.h_infinity.horizon_design(known).level < 0.6 * hg.h_infinity.horizon_design(unknown).level
 
 
 def test_what_varies_over_time_and_what_does_not():
     constant = np.full(16, 0.7)
-    varying = hg.growth_system(
+    varying = hg.h_infinity.growth_system(
         16,
-        hg.OverTime(np.broadcast_to(paper.B, (16, 2, 1))),
+        hg.model.OverTime(np.broadcast_to(paper.B, (16, 2, 1))),
         [[paper.D[0]]],
         paper.M,
         hg.over_time([channel()] * 16),
-        hg.OverTime(constant),
+        hg.model.OverTime(constant),
         paper.b[0],
         initial_weight=paper.W,
     )
-    np.testing.assert_allclose(hg.horizon_design(varying).level, hg.horizon_design(node(0)).level, rtol=1e-9)
-    slower = hg.growth_system(
+    np.testing.assert_allclose(
+        hg.h_infinity.horizon_design(varying).level, hg.h_infinity.horizon_design(node(0)).level, rtol=1e-9
+    )
+    slower = hg.h_infinity.growth_system(
         16,
         paper.B,
         [[paper.D[0]]],
         paper.M,
         channel(),
-        (0.5, hg.OverTime(constant)),
+        (0.5, hg.model.OverTime(constant)),
         paper.b[0],
         initial_weight=paper.W,
     )
-    assert hg.horizon_design(slower).level < HORIZON[0]
+    assert hg.h_infinity.horizon_design(slower).level < HORIZON[0]
 
 
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda: hg.recursive_design(node(0), -1.0), "level: expected a positive number, got -1.0"),
-        (lambda: hg.recursive_design(node(0), 1.0, objective="norm"), "objective: expected one of trace, "),
-        (lambda: hg.horizon_design(node(0), solver="mosek"), "solver: expected one of clarabel, scs, got 'mosek'"),
-        (lambda: hg.horizon_design(node(0), gains=np.zeros((3, 2, 2))), r"gains: expected shape \(16, 2, 2\)"),
+        (lambda: hg.h_infinity.recursive_design(node(0), -1.0), "level: expected a positive number, got -1.0"),
+        (lambda: hg.h_infinity.recursive_design(node(0), 1.0, objective="norm"), "objective: expected one of trace, "),
+        (
+            lambda: hg.h_infinity.horizon_design(node(0), solver="mosek"),
+            "solver: expected one of clarabel, scs, got 'mosek'",
+        ),
+        (
+            lambda: hg.h_infinity.horizon_design(node(0), gains=np.zeros((3, 2, 2))),
+            r"gains: expected shape \(16, 2, 2\)",
+        ),
         (lambda: node(0, growth=-0.7), "growth: expected no negative constant, got -0.7"),
         (lambda: node(0, beta=(1.2, 0.5, 0.5)), "probabilit"),
         (lambda: node(0, steps=0), "steps: expected a positive whole number, got 0"),
         (
-            lambda: hg.known_channel_design(node(0), 1.0),
+            lambda: hg.h_infinity.known_channel_design(node(0), 1.0),
             "channel of a closed-form design: expected gains that are certain",
         ),
-        (lambda: hg.level_without_measurements(linear_system()), "dynamics are all in f"),
+        (lambda: hg.h_infinity.level_without_measurements(linear_system()), "dynamics are all in f"),
     ],
 )
 def test_bad_input(call, message):
@@ -188,4 +204,4 @@ def test_a_missing_solver_names_the_extra(monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ModuleNotFoundError, match=r'pip install "heliograph\[lmi\]"'):
-        hg.recursive_design(node(0), 1.8)
+        hg.h_infinity.recursive_design(node(0), 1.8)

@@ -15,15 +15,15 @@ ONE_VALUE = oracle.Atoms(np.array([[1.3]]), np.array([1.0]))
 
 
 def designed(system, degree, horizon=20):
-    return hg.lmmse(hg.lifted_system(*model(system, horizon), degree, horizon)).gains.covariance
+    return hg.linear.lmmse(hg.linear.lifted_system(*model(system, horizon), degree, horizon)).gains.covariance
 
 
 @pytest.mark.parametrize(("system", "horizon"), [(EXAMPLE, 10), (two_sensors(), 10)], ids=["example", "two sensors"])
 def test_system_is_lemmas_3_and_4(system, horizon):
-    ours = hg.lifted_system(*model(system, horizon), 2, horizon)
+    ours = hg.linear.lifted_system(*model(system, horizon), 2, horizon)
     steps, means, seconds = oracle.lifted(system, horizon)
     (x, spread), (z, _) = half(len(system.F) + system.C.shape[1]), half(len(system.C))
-    before = hg.state_moments(ours)
+    before = hg.linear.state_moments(ours)
     for k in range(horizon):
         plant, heard, s = steps[k], steps[k + 1], ours.step(k)
         scale = np.abs(seconds[k + 1]).max()
@@ -49,10 +49,10 @@ def test_half_vectorised_filter_is_the_full_one_with_pseudo_inverse(system):
 def test_noise_covariances_have_the_rank_they_can():
     """Half-vectorised R_V and P are positive definite where the full ones never are; R_W lacks what B lacks."""
     system = two_sensors()
-    s = hg.lifted_system(*model(system, 5), 2, 5).step(4)
+    s = hg.linear.lifted_system(*model(system, 5), 2, 5).step(4)
     assert np.linalg.matrix_rank(s.noise, 1e-10 * np.abs(s.noise).max()) == 5
     assert np.linalg.matrix_rank(oracle.lifted(system, 5)[0][5].R_Vc, 1e-10) == 5  # of 6
-    example = hg.lifted_system(*model(EXAMPLE, 5), 2, 5).step(4)
+    example = hg.linear.lifted_system(*model(EXAMPLE, 5), 2, 5).step(4)
     assert (
         np.linalg.matrix_rank(example.process, 1e-10) == 12
     )  # of 14: B is 2 x 1, so k + k (k + 1) / 2 = 2 are missing
@@ -102,28 +102,31 @@ def test_without_coupling_the_bias_does_not_matter():
     alone = replace(EXAMPLE, E=lambda t: np.zeros((2, 2)))
     horizon = 20
     s = model(alone, horizon)
+    shaped = hg.random_affine.Shaped(EXAMPLE.B, hg.random_affine.FiniteSupport(*EXAMPLE.w))
     plants = [
-        hg.LinearPlant(EXAMPLE.A(t), hg.Shaped(EXAMPLE.B, hg.FiniteSupport(*EXAMPLE.w)), np.zeros(2),
-                       hg.FiniteSupport(*EXAMPLE.x0)) for t in range(horizon)
-    ]  # fmt: skip
+        hg.LinearPlant(EXAMPLE.A(t), shaped, np.zeros(2), hg.random_affine.FiniteSupport(*EXAMPLE.x0))
+        for t in range(horizon)
+    ]
     sensor = hg.LinearSensor(EXAMPLE.C, s.sensor.noise)
-    by_itself = hg.lmmse(hg.lifted_system(hg.over_time(plants), sensor, s.channel, 2, horizon)).gains.covariance
+    by_itself = hg.linear.lmmse(
+        hg.linear.lifted_system(hg.over_time(plants), sensor, s.channel, 2, horizon)
+    ).gains.covariance
     np.testing.assert_allclose(designed(alone, 2)[:, :2, :2], by_itself, rtol=0, atol=1e-14)
 
 
 def test_a_sensor_that_sees_nothing_leaves_the_open_loop():
-    system = hg.lifted_system(*model(replace(EXAMPLE, C=np.zeros((1, 2))), 20), 2, 20)
-    spread = hg.state_moments(system).covariance[1:]
+    system = hg.linear.lifted_system(*model(replace(EXAMPLE, C=np.zeros((1, 2))), 20), 2, 20)
+    spread = hg.linear.state_moments(system).covariance[1:]
     expected = system.want @ spread @ system.want.T
-    np.testing.assert_allclose(hg.lmmse(system).gains.covariance, expected, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(hg.linear.lmmse(system).gains.covariance, expected, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("mix", [3.7 * np.eye(2), np.diag([3.0, -0.2]), np.eye(2)[::-1], [[1.0, 0.4], [-0.3, 2.0]]])
 def test_any_invertible_mix_of_the_measurements_gives_the_same_filter(mix):
     s = model(two_sensors(), 10)
-    mixed = hg.Series([s.channel, hg.known(mix)])
-    expected = hg.lmmse(hg.lifted_system(*s, 2, 10)).gains.covariance
-    found = hg.lmmse(hg.lifted_system(s.plant, s.sensor, mixed, 2, 10)).gains.covariance
+    mixed = hg.random_affine.Series([s.channel, hg.random_affine.known(mix)])
+    expected = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, 10)).gains.covariance
+    found = hg.linear.lmmse(hg.linear.lifted_system(s.plant, s.sensor, mixed, 2, 10)).gains.covariance
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
@@ -156,7 +159,7 @@ def test_a_large_lift_is_refused_with_the_number_and_what_to_do():
     with pytest.raises(
         ValueError, match=r"at most 50,000,000 entries, got .*,.* \(4844 monomials .*; use a lower degree"
     ):
-        hg.lifted_system(plant, sensor, hg.perfect(), 4, 100)
+        hg.linear.lifted_system(plant, sensor, hg.perfect(), 4, 100)
 
 
 @pytest.mark.parametrize(
@@ -175,13 +178,16 @@ def test_bad_input_is_named(change, message):
     usual = {"plant": plant, "sensor": hg.LinearSensor(np.ones((1, 3)), 1.0), "channel": hg.perfect(), "degree": 2,
              "horizon": 5}  # fmt: skip
     with pytest.raises(ValueError, match=message):
-        hg.lifted_system(**(usual | change))
+        hg.linear.lifted_system(**(usual | change))
 
 
 def test_skewed_vector_noise_gains_in_every_direction():
     g = np.random.default_rng(1)
     law = random_law(g, 2, 5)
-    plant = hg.LinearPlant(0.7 * np.eye(2), hg.FiniteSupport(*law), np.zeros(2), np.eye(2))
-    sensor = hg.LinearSensor(np.eye(2), hg.FiniteSupport(*law))
-    both = [hg.lmmse(hg.lifted_system(plant, sensor, hg.perfect(2), d, 10)).gains.covariance[-1] for d in (1, 2)]
+    plant = hg.LinearPlant(0.7 * np.eye(2), hg.random_affine.FiniteSupport(*law), np.zeros(2), np.eye(2))
+    sensor = hg.LinearSensor(np.eye(2), hg.random_affine.FiniteSupport(*law))
+    both = [
+        hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(2), d, 10)).gains.covariance[-1]
+        for d in (1, 2)
+    ]
     assert np.linalg.eigvalsh(both[0] - both[1]).min() > 0

@@ -10,8 +10,8 @@ from tests.relay_bias import model, scalar_system, two_sensors
 
 def designs(system, horizon):
     s = model(system, horizon)
-    linear = hg.lmmse(hg.lifted_system(*s, 1, horizon))
-    quadratic = hg.lmmse(hg.lifted_system(*s, 2, horizon)).gains.covariance
+    linear = hg.linear.lmmse(hg.linear.lifted_system(*s, 1, horizon))
+    quadratic = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, horizon)).gains.covariance
     memory = memory_system(*s, linear)
     return linear.gains.covariance, quadratic, memory
 
@@ -19,16 +19,16 @@ def designs(system, horizon):
 def test_memory_is_never_worse_than_the_square_and_claims_the_truth():
     for system in (oracle.paper_example(), two_sensors()):
         _, quadratic, memory = designs(system, 8)
-        schedule = hg.lmmse(memory)
+        schedule = hg.linear.lmmse(memory)
         covariance = schedule.gains.covariance
         scale = np.abs(covariance).max()
         assert np.linalg.eigvalsh(quadratic - covariance).min() >= -1e-10 * scale
-        np.testing.assert_allclose(hg.true_covariance(memory, schedule), covariance, rtol=0, atol=1e-10 * scale)
+        np.testing.assert_allclose(hg.linear.true_covariance(memory, schedule), covariance, rtol=0, atol=1e-10 * scale)
 
 
 def test_first_step_has_no_past_to_multiply_with():
     _, quadratic, memory = designs(oracle.paper_example(), 3)
-    covariance = hg.lmmse(memory).gains.covariance
+    covariance = hg.linear.lmmse(memory).gains.covariance
     np.testing.assert_allclose(covariance[0], quadratic[0], rtol=0, atol=1e-14)
     assert covariance[2, 0, 0] < (1 - 1e-4) * quadratic[2, 0, 0]
 
@@ -52,5 +52,5 @@ def test_second_step_is_regression_on_all_products_of_all_paths():
     features = np.column_stack([np.ones(len(p)), one, one**2, two, two**2, one * two])
     root = np.sqrt(p)[:, None]
     residual = x - features @ np.linalg.lstsq(root * features, root * x, rcond=None)[0]
-    covariance = hg.lmmse(designs(s, 2)[2]).gains.covariance
+    covariance = hg.linear.lmmse(designs(s, 2)[2]).gains.covariance
     np.testing.assert_allclose(covariance[1], (residual.T * p) @ residual, rtol=0, atol=1e-12)

@@ -14,8 +14,8 @@ EXAMPLE = oracle.paper_example()
 
 def scalar(process=1.0, noise=1.0, horizon=5):
     one = np.ones((horizon, 1, 1))
-    steps = hg.Steps(one, one[:, 0], process * one, one, np.zeros((horizon, 1)), noise * one)
-    return hg.LinearSystem(steps, [0.0], [[2.0]], [[1.0]])
+    steps = hg.linear.Steps(one, one[:, 0], process * one, one, np.zeros((horizon, 1)), noise * one)
+    return hg.linear.LinearSystem(steps, [0.0], [[2.0]], [[1.0]])
 
 
 def test_scalar_recursion_by_hand():
@@ -23,16 +23,16 @@ def test_scalar_recursion_by_hand():
     for _ in range(5):
         p = 1 / (1 / (p + 1.0) + 1.0)
         expected.append(p)
-    schedule = hg.lmmse(scalar())
+    schedule = hg.linear.lmmse(scalar())
     np.testing.assert_allclose(schedule.gains.covariance[:, 0, 0], expected, rtol=1e-14)
     np.testing.assert_allclose(schedule.gains.gain[:, 0, 0], expected, rtol=1e-14)  # R = 1: the gain is P
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_claim_is_the_true_error(degree):
-    system = hg.lifted_system(*model(two_sensors(), 10), degree, 10)
-    schedule = hg.lmmse(system)
-    true = hg.true_covariance(system, schedule)
+    system = hg.linear.lifted_system(*model(two_sensors(), 10), degree, 10)
+    schedule = hg.linear.lmmse(system)
+    true = hg.linear.true_covariance(system, schedule)
     np.testing.assert_allclose(schedule.gains.covariance, true, rtol=0, atol=1e-11 * np.abs(true).max())
 
 
@@ -48,7 +48,7 @@ def test_printed_filter_claims_and_has_what_the_oracle_says(system):
 def test_with_known_powers_the_printed_filter_is_the_best():
     one = oracle.Atoms(np.array([[1.3]]), np.array([1.0]))
     s = model(EXAMPLE.__class__(**{**EXAMPLE.__dict__, "l": one, "m": one}), 20)
-    best = hg.lmmse(hg.lifted_system(*s, 2, 20)).gains.covariance
+    best = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, 20)).gains.covariance
     found = printed.printed_quadratic(*s, 20)
     np.testing.assert_allclose(found.true_covariance, best, rtol=0, atol=1e-14)
     np.testing.assert_allclose(found.schedule.gains.covariance, best, rtol=0, atol=1e-14)
@@ -58,13 +58,13 @@ def test_true_error_of_wrong_gains_counts_bias_and_spread():
     """xhat = 0.5 z + 0.2 without memory: error x - 0.5 (x + v) - 0.2."""
     system = scalar(horizon=1)
     zero = np.zeros((1, 1))
-    gains = hg.Gains(
+    gains = hg.linear.Gains(
         zero[None], zero[None], zero, zero[None], 0.5 + zero[None], 0.2 + zero, zero[None], zero, zero[None],
         np.nan + zero[None], np.nan + zero[None],
     )  # fmt: skip
     # x+ = x + 1 + w has mean 1 and variance 3
     expected = 0.25 * 3 + 0.25 + (0.5 - 0.2) ** 2
-    found = hg.true_covariance(system, hg.Schedule(gains, [0.0], "nominal"))
+    found = hg.linear.true_covariance(system, hg.linear.Schedule(gains, [0.0], "nominal"))
     assert found[0, 0, 0] == pytest.approx(expected, rel=1e-14)
 
 
@@ -92,17 +92,17 @@ def test_units_of_a_measurement_do_not_matter_to_a_singular_innovation():
 
 def test_lost_digits_are_told():
     """A plant that grows by half at each step behind a known channel: the moments outgrow the error's."""
-    skewed = hg.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+    skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
     plant, sensor = hg.LinearPlant([[1.5]], skewed, [0.0], 1.0), hg.LinearSensor([[1.0]], skewed)
-    hg.lmmse(hg.lifted_system(plant, sensor, hg.perfect(), 2, 15))
+    hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), 2, 15))
     with pytest.warns(UserWarning, match=r"rounding is .* of a claimed variance .*; use a shorter horizon"):
-        hg.lmmse(hg.lifted_system(plant, sensor, hg.perfect(), 2, 60))
+        hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), 2, 60))
 
 
 def test_schedules_are_saved_and_loaded(tmp_path):
-    schedule = hg.lmmse(scalar())
+    schedule = hg.linear.lmmse(scalar())
     schedule.save(tmp_path / "gains.npz")
-    loaded = hg.load_schedule(tmp_path / "gains.npz")
+    loaded = hg.linear.load_schedule(tmp_path / "gains.npz")
     assert loaded.claim == "exact"
     for mine, read in zip([*schedule.gains, schedule.start], [*loaded.gains, loaded.start], strict=True):
         np.testing.assert_array_equal(read, mine)
@@ -111,26 +111,26 @@ def test_schedules_are_saved_and_loaded(tmp_path):
 def test_what_is_no_schedule_is_refused(tmp_path):
     (tmp_path / "text.npz").write_text("no arrays")
     with pytest.raises(ValueError, match=r"expected a file written by Schedule\.save"):
-        hg.load_schedule(tmp_path / "text.npz")
+        hg.linear.load_schedule(tmp_path / "text.npz")
     np.savez(tmp_path / "other.npz", gain=np.eye(2))
     with pytest.raises(ValueError, match="all arrays of a schedule"):
-        hg.load_schedule(tmp_path / "other.npz")
-    gains = hg.lmmse(scalar()).gains
+        hg.linear.load_schedule(tmp_path / "other.npz")
+    gains = hg.linear.lmmse(scalar()).gains
     with pytest.raises(ValueError, match=r"schedule gain: expected finite numbers"):
-        hg.Schedule(gains._replace(gain=gains.gain * np.nan), [0.0], "exact")
+        hg.linear.Schedule(gains._replace(gain=gains.gain * np.nan), [0.0], "exact")
     with pytest.raises(ValueError, match=r"schedule direct: expected shape \(5, 1, 1\), got shape \(5, 1, 2\)"):
-        hg.Schedule(gains._replace(direct=np.zeros((5, 1, 2))), [0.0], "exact")
+        hg.linear.Schedule(gains._replace(direct=np.zeros((5, 1, 2))), [0.0], "exact")
     with pytest.raises(ValueError, match="one of"):
-        hg.Schedule(gains, [0.0], "sure")
+        hg.linear.Schedule(gains, [0.0], "sure")
     with pytest.raises(ValueError, match=r"start of the schedule: expected shape \(1,\)"):
-        hg.Schedule(gains, [0.0, 1.0], "exact")
+        hg.linear.Schedule(gains, [0.0, 1.0], "exact")
 
 
 def test_systems_and_schedules_that_do_not_fit_are_refused():
     with pytest.raises(ValueError, match="5 steps of 1 measurements, got 4 steps"):
-        hg.true_covariance(scalar(), hg.lmmse(scalar(horizon=4)))
+        hg.linear.true_covariance(scalar(), hg.linear.lmmse(scalar(horizon=4)))
     steps = scalar().steps
     with pytest.raises(ValueError, match=r"system noise: expected shape \(5, 1, 1\)"):
-        hg.LinearSystem(steps._replace(noise=np.ones((5, 2, 2))), [0.0], [[1.0]], [[1.0]])
+        hg.linear.LinearSystem(steps._replace(noise=np.ones((5, 2, 2))), [0.0], [[1.0]], [[1.0]])
     with pytest.raises(ValueError, match="positive semidefinite"):
-        hg.LinearSystem(steps, [0.0], [[-1.0]], [[1.0]])
+        hg.linear.LinearSystem(steps, [0.0], [[-1.0]], [[1.0]])

@@ -7,7 +7,7 @@ import pytest
 from scipy import special
 
 import heliograph as hg
-from heliograph.random_affine import push
+from heliograph.random_affine.push import push
 
 STEPS = 6
 STEP = 1e-5  # of the central differences: their own error is of the order of STEP^2, that of rounding 1e-11
@@ -41,7 +41,7 @@ def dropout(p):
 def discrete(p):
     """Gains of two values, noise of two atoms; the probabilities are parameters."""
     law = hg.Discrete([p[0], 1.0], [p[1], 1 - p[1]])
-    return hg.hop(law, hg.FiniteSupport([[p[2]], [-0.2]], [p[3], 1 - p[3]]))
+    return hg.hop(law, hg.random_affine.FiniteSupport([[p[2]], [-0.2]], [p[3], 1 - p[3]]))
 
 
 MODEL = [0.95, 0.4, 0.8, 0.2]
@@ -102,8 +102,8 @@ LAWS = {
     "nakagami": (hg.Nakagami, [1.7, 2.0]),
     "log-normal": (hg.LogNormal, [-0.2, 0.3]),
     "discrete": (lambda a, p: hg.Discrete([a, 1.0], [p, 1 - p]), [0.0, 0.3]),
-    "bernoulli": (hg.bernoulli, [0.8]),
-    "moments": (lambda m, s: hg.GivenMoments([m, s, 2.0, 5.0]), [1.0, 1.5]),
+    "bernoulli": (hg.random_affine.bernoulli, [0.8]),
+    "moments": (lambda m, s: hg.random_affine.GivenMoments([m, s, 2.0, 5.0]), [1.0, 1.5]),
 }
 
 
@@ -143,11 +143,16 @@ def test_noises_and_moments_of_every_map_can_be_traced():
     """Joint moments to order four of a channel made of everything, and its draws, against their concrete numbers."""
 
     def make(p):
-        noise = hg.Shaped(
-            [[1.0, p[0]], [0.0, 1.0]], hg.Independent([hg.Gaussian([[p[1]]]), hg.Gaussian([[0.2]], [p[2]])])
+        noise = hg.random_affine.Shaped(
+            [[1.0, p[0]], [0.0, 1.0]],
+            hg.random_affine.Independent([hg.Gaussian([[p[1]]]), hg.Gaussian([[0.2]], [p[2]])]),
         )
-        relayed = hg.Series([hg.hop(hg.Rayleigh(p[3]), noise), hg.hop(hg.Rician(1.0, p[4]), [[p[1], 0.0], [0.0, 0.3]])])
-        return hg.Stack([hg.dropout(relayed, p[5]), hg.erasure(hg.known([[1.0, p[0]]], [p[2]]), 1.0).base])
+        relayed = hg.random_affine.Series(
+            [hg.hop(hg.Rayleigh(p[3]), noise), hg.hop(hg.Rician(1.0, p[4]), [[p[1], 0.0], [0.0, 0.3]])]
+        )
+        return hg.random_affine.Stack(
+            [hg.dropout(relayed, p[5]), hg.erasure(hg.random_affine.known([[1.0, p[0]]], [p[2]]), 1.0).base]
+        )
 
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
     with jax.enable_x64(True):
@@ -170,17 +175,17 @@ def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     p = np.array([0.2, 1.3, 0.9])
     for index in range(2):
         with jax.enable_x64(True):
-            traced = jax.jit(lambda p, index=index: hg.second_order(make(p)[index]))(p)
-        known = hg.second_order(make(p)[index])
+            traced = jax.jit(lambda p, index=index: hg.random_affine.second_order(make(p)[index]))(p)
+        known = hg.random_affine.second_order(make(p)[index])
         for ours, theirs in zip(jax.tree.leaves(traced), jax.tree.leaves(known), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-14)
 
 
 def test_what_is_decided_by_numbers_refuses_a_trace_in_one_line():
     with jax.enable_x64(True), pytest.raises(ValueError, match="probability radius: expected zero, where"):
-        jax.jit(lambda p: hg.bernoulli(p, 0.1).moment(1))(0.5)
+        jax.jit(lambda p: hg.random_affine.bernoulli(p, 0.1).moment(1))(0.5)
     with jax.enable_x64(True), pytest.raises(ValueError, match="probability radius: expected a number, since"):
-        jax.jit(lambda r: hg.bernoulli(0.5, r).moment(1))(0.1)
+        jax.jit(lambda r: hg.random_affine.bernoulli(0.5, r).moment(1))(0.1)
     with jax.enable_x64(True), pytest.raises(ValueError, match=r"plant matrix: expected shape \(2, 2\)"):
         jax.jit(lambda a: hg.LinearPlant(a, np.eye(2), [0, 0], np.eye(2)).matrix)(np.eye(3))
 

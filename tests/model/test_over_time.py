@@ -12,14 +12,14 @@ def test_an_unmarked_array_never_varies():
 
 def test_a_marked_array_is_read_at_its_step():
     values = np.arange(6.0).reshape(3, 2)
-    assert np.array_equal(at({"a": hg.OverTime(values)}, 2)["a"], values[2])
-    assert steps_covered({"a": hg.OverTime(values)}) == 3
+    assert np.array_equal(at({"a": hg.model.OverTime(values)}, 2)["a"], values[2])
+    assert steps_covered({"a": hg.model.OverTime(values)}) == 3
 
 
 @pytest.mark.parametrize("k", [1, np.int64(1)])
 def test_a_number_over_time_is_an_array_at_its_step(k):
     """So that what is read can be stacked again: a NumPy number is no array."""
-    read = at(hg.OverTime(np.arange(3.0)), k)
+    read = at(hg.model.OverTime(np.arange(3.0)), k)
     assert isinstance(read, np.ndarray) and read.shape == () and read == 1.0
     assert np.array_equal(hg.over_time(unstack(hg.over_time([read, read + 1]))).values, [1.0, 2.0])
 
@@ -41,4 +41,4 @@ def test_nothing_over_time_is_refused():
     with pytest.raises(ValueError, match="at least one item"):
         hg.over_time([])
     with pytest.raises(ValueError, match="leading time axis"):
-        hg.OverTime(np.float64(3.0))
+        hg.model.OverTime(np.float64(3.0))

@@ -89,7 +89,10 @@ def test_the_enumeration_finds_a_term_that_is_too_small(monkeypatch, term, share
 
 
 def test_the_cubature_prediction_misses_the_bilinear_terms():
-    gap = one_step.predicted(PRINTED, hg.Cubature())[1] - one_step.predicted(PRINTED, hg.PolynomialMoments(2))[1]
+    gap = (
+        one_step.predicted(PRINTED, hg.filters.Cubature())[1]
+        - one_step.predicted(PRINTED, hg.filters.PolynomialMoments(2))[1]
+    )
     assert np.linalg.eigvalsh(gap)[0] == pytest.approx(-((0.1 * 1.25) ** 2), rel=1e-10)  # -(h Xi)^2, by hand
 
 
@@ -100,7 +103,9 @@ def test_through_a_perfect_channel_the_printed_bound_is_off():
 
 def test_mixed_points_do_no_harm_where_propagation_moves_nothing():
     still = hg.Plant(lambda x, u: jnp.asarray(x), np.zeros((5, 5)), np.zeros(5), np.eye(5))
-    base = hg.cubature_filter(still, sensor(STRONG, 0), channel(STRONG), hg.Polytope(hg.Scalars(*STRONG.beta)))
+    base = hg.cubature_filter(
+        still, sensor(STRONG, 0), channel(STRONG), hg.filters.Polytope(hg.filters.Scalars(*STRONG.beta))
+    )
     z = np.array([0.3, -0.2])
     mixed = MixedCross(base)
     (state, _), (expected, _) = mixed.step(mixed.init(), z), base.step(base.init(), z)
@@ -112,12 +117,12 @@ def test_a_small_run_agrees_with_the_note():
     nodes = {
         name: hg.Node(sensor(STRONG, i), channel(STRONG), {
             "mean_gain": filters(STRONG, i)["mean_gain"],
-            "polytope": cubature(STRONG, i, hg.Polytope(hg.Scalars(*STRONG.beta))),
+            "polytope": cubature(STRONG, i, hg.filters.Polytope(hg.filters.Scalars(*STRONG.beta))),
         }) for i, name in enumerate(NODES)
     }  # fmt: skip
     found = hg.monte_carlo(hg.Network(plant(STRONG), nodes), STRONG.horizon, 128, 0, hg.Statistics())
     for name, expected in (("mean_gain", 0.1963), ("polytope", 0.0789)):  # of an independent implementation
-        rmse, error = hg.pool([found[node][name] for node in NODES]).rmse()
+        rmse, error = hg.simulation.pool([found[node][name] for node in NODES]).rmse()
         assert abs(rmse - expected) < 4 * error, (name, rmse, error)
 
 
@@ -132,7 +137,7 @@ def made_up(s, names, fused, steps, runs=64):
         deal = (np.arange(runs)[:, None] % batches == np.arange(batches)).astype(float)
         sums = np.einsum("rb,rtij->btij", deal, outer)
         bounds = deal.sum(0)[:, None, None, None] * bound
-        return hg.ErrorStatistics(deal.sum(0), sums, bounds, np.zeros((batches, steps)), "nominal")
+        return hg.simulation.ErrorStatistics(deal.sum(0), sums, bounds, np.zeros((batches, steps)), "nominal")
 
     def estimate():
         return hg.Estimate(rng.normal(size=(1, steps, 5)), np.tile(np.eye(5), (1, steps, 1, 1)), "nominal")

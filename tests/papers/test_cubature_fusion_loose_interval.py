@@ -28,7 +28,7 @@ def test_the_extended_filter_takes_it():
 
 
 def test_one_step_is_looser_than_the_right_sign():
-    printed, tight = (one_step(rule(FIXED))[3] for rule in (LooseInterval, hg.Interval))
+    printed, tight = (one_step(rule(FIXED))[3] for rule in (LooseInterval, hg.filters.Interval))
     assert np.trace(printed) == pytest.approx(0.082413, abs=6e-7)  # six printed digits
     assert np.linalg.eigvalsh(printed - tight)[0] >= -1e-15
 

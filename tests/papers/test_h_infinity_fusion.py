@@ -126,7 +126,7 @@ def test_separate_multipliers_have_a_closed_form(nodes):
 
 
 def test_with_the_papers_start_only_the_start_counts():
-    level = hg.horizon_design(setting.system(0), initial=10 * np.eye(4)).level
+    level = hg.h_infinity.horizon_design(setting.system(0), initial=10 * np.eye(4)).level
     assert level == pytest.approx(np.sqrt(10 / 15), rel=2e-6)  # (19), with the solver's margin
 
 
@@ -140,17 +140,17 @@ def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(m
 
 def test_the_growth_constant_is_false_for_differences_and_true_for_sizes():
     f, side = setting.dynamics(15), np.full(2, 2.0)
-    found = hg.check_growth(f, 0.7, -side, side)
+    found = hg.h_infinity.check_growth(f, 0.7, -side, side)
     assert found.refuted and 15 < found.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
     x, y = found.pair
     with jax.enable_x64(True):
         moved = np.linalg.norm(np.asarray(f(jnp.asarray(x))) - np.asarray(f(jnp.asarray(y))))
     assert moved / np.linalg.norm(x - y) == pytest.approx(found.ratio, rel=1e-9)
-    assert not hg.check_size(f, 0.7, -side, side).refuted
+    assert not hg.h_infinity.check_size(f, 0.7, -side, side).refuted
 
 
 def test_fused_levels():
-    weights = hg.level_weights(setting.LEVELS)
+    weights = hg.fusion.level_weights(setting.LEVELS)
     np.testing.assert_allclose(weights, [0.248842, 0.278979, 0.248842, 0.223337], atol=5.1e-7)  # printed digits
     assert published_level.published_fused_level(setting.LEVELS, weights) == pytest.approx(2.539682, abs=5.1e-7)
 
@@ -217,8 +217,8 @@ def test_losses_are_read_off_what_was_received(outcome):
 def test_the_search_finds_the_norm_of_a_linear_system():
     """With phi = 0 and no gain, the largest ratio is a singular value."""
     rotation, steps = structured.ROTATION, structured.STEPS
-    nothing = hg.GrowthSystem(*structured.system("1"))
-    design = hg.HInfinityDesign(
+    nothing = hg.h_infinity.GrowthSystem(*structured.system("1"))
+    design = hg.h_infinity.HInfinityDesign(
         1.0, np.zeros((steps, 2, 2)), np.zeros((steps + 1, 4, 4)), np.zeros((steps, 2)), True, ""
     )
 
@@ -226,7 +226,7 @@ def test_the_search_finds_the_norm_of_a_linear_system():
         return jnp.where(u[1] > 0, rotation @ x, x)
 
     plant = hg.Plant(transition, np.zeros((2, 2)), np.zeros(2), np.eye(2), inputs=structured.INPUTS)
-    item = hg.h_infinity_filter(plant, structured.sensor("1"), nothing, design)
+    item = hg.filters.h_infinity_filter(plant, structured.sensor("1"), nothing, design)
     world = worst_disturbance.World(
         lambda x, k: rotation @ x, lambda x: x[:1], structured.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
         structured.inputs("bias"),
@@ -246,9 +246,9 @@ def test_the_search_finds_the_norm_of_a_linear_system():
 
 def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_should():
     system = structured.system("1")
-    design = hg.horizon_design(system, separate=True)
+    design = hg.h_infinity.horizon_design(system, separate=True)
     side = np.full(2, structured.BOX)
-    finding = hg.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
+    finding = hg.h_infinity.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
     assert not finding.refuted and levels.certify(system, design, [finding]).certified
     assert design.level == pytest.approx(7.2578, rel=1e-4)  # what a first run found
     with pytest.MonkeyPatch.context() as patch:
@@ -258,7 +258,7 @@ def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_shou
         patch.setattr(discriminating, "JUDGE_DRAWS", 1_000)
         worst = discriminating.worst_cases({})["ekf"]
     assert worst.level - 4 * worst.standard_error > design.level
-    assert hg.horizon_design(structured.system("1", False), separate=True).level > 4 * design.level
+    assert hg.h_infinity.horizon_design(structured.system("1", False), separate=True).level > 4 * design.level
 
 
 def kalman(node):
@@ -274,8 +274,8 @@ def test_the_guarantee_from_a_false_constant_is_broken(nodes):
 @pytest.fixture(scope="module")
 def result(nodes, outcome):
     """Everything, with made-up numbers where the real ones take minutes."""
-    finding = hg.check_growth(setting.dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
-    size = hg.check_size(setting.dynamics(15), 0.7, [-2.0, -2.0], [2.0, 2.0])
+    finding = hg.h_infinity.check_growth(setting.dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
+    size = hg.h_infinity.check_size(setting.dynamics(15), 0.7, [-2.0, -2.0], [2.0, 2.0])
     filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told"]
     errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
     over = {

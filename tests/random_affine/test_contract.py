@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine import AbstractLaw, GainAndNoise, Moments
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.law import AbstractLaw
 from heliograph.testing import check_random_affine
 
 COVARIANCE = np.array([[0.2, 0.05], [0.05, 0.1]])
-SKEWED = hg.FiniteSupport([[1.8, 0.0], [-0.2, 0.3], [-0.2, -0.1]], [0.1, 0.3, 0.6])
+SKEWED = hg.random_affine.FiniteSupport([[1.8, 0.0], [-0.2, 0.3], [-0.2, -0.1]], [0.1, 0.3, 0.6])
 TWO_HOPS = hg.amplify_and_forward(
     [
         hg.hop(hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02), COVARIANCE, power=0.5),
@@ -20,19 +21,19 @@ TWO_HOPS = hg.amplify_and_forward(
 SCALAR = hg.amplify_and_forward([hg.hop(hg.Rician(1.0, 0.3), 0.2), hg.hop(hg.Nakagami(2.0), 0.1)])
 
 CHANNELS = {
-    "known": hg.known([[1.0, 2.0]], [0.5]),
+    "known": hg.random_affine.known([[1.0, 2.0]], [0.5]),
     "discrete": GainAndNoise(hg.Discrete([0.5, 1.0], [0.3, 0.7]), [[1.0, 0.5]], 0.3),
     "log-normal": hg.hop(hg.LogNormal(-0.1, 0.2), 0.2),
-    "skewed noise": hg.hop(hg.bernoulli(0.8), SKEWED),
+    "skewed noise": hg.hop(hg.random_affine.bernoulli(0.8), SKEWED),
     "two hops": TWO_HOPS,
-    "three hops": hg.amplify_and_forward([*TWO_HOPS.maps, hg.hop(hg.bernoulli(0.9), COVARIANCE)]),
+    "three hops": hg.amplify_and_forward([*TWO_HOPS.maps, hg.hop(hg.random_affine.bernoulli(0.9), COVARIANCE)]),
     "dropout": hg.dropout(TWO_HOPS, 0.7),
     "direct link": hg.with_direct_link(TWO_HOPS, hg.hop(hg.Nakagami(1.5), 0.1, dimension=2)),
     "parallel": hg.parallel([SCALAR, hg.hop(hg.Rayleigh(1.0), 0.1)]),
-    "dropout of a direct link in series": hg.Series(
-        [hg.dropout(hg.with_direct_link(SCALAR, SCALAR), 0.6), hg.known([[1.0, -0.5]])]
+    "dropout of a direct link in series": hg.random_affine.Series(
+        [hg.dropout(hg.with_direct_link(SCALAR, SCALAR), 0.6), hg.random_affine.known([[1.0, -0.5]])]
     ),
-    "silent": hg.silent(2, 3, 0.5),
+    "silent": hg.model.silent(2, 3, 0.5),
 }
 
 
@@ -43,11 +44,11 @@ def test_samples_match_moments_to_order_four(name):
 
 @pytest.mark.parametrize("degree", [2, 3])
 def test_lifted_maps_match_to_order_two(degree):
-    check_random_affine(hg.Lift(SCALAR, degree), highest=2)
+    check_random_affine(hg.random_affine.Lift(SCALAR, degree), highest=2)
 
 
 def test_square_of_a_channel_with_two_outputs():
-    check_random_affine(hg.square(CHANNELS["direct link"]), highest=2)
+    check_random_affine(hg.random_affine.square(CHANNELS["direct link"]), highest=2)
 
 
 class _WrongVariance(AbstractRandomAffine):
@@ -103,4 +104,4 @@ def test_a_shared_second_hop_makes_gain_and_noise_dependent():
 
 def test_series_of_maps_that_do_not_fit_is_refused():
     with pytest.raises(ValueError, match="a map that takes 1 inputs, got one that takes 2"):
-        hg.Series([hg.hop(1.0, 0.1), hg.hop(1.0, 0.1, dimension=2)])
+        hg.random_affine.Series([hg.hop(1.0, 0.1), hg.hop(1.0, 0.1, dimension=2)])

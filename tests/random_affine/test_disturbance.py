@@ -49,7 +49,7 @@ def test_nothing_is_spread_where_every_link_always_delivers():
 
 def test_signal_columns_agree_with_the_algebra():
     relay = hg.amplify_and_forward(
-        [hg.hop(hg.Rayleigh(1.0), np.diag([0.2, 0.1])), hg.hop(hg.bernoulli(0.4), np.diag([0.3, 0.2]))]
+        [hg.hop(hg.Rayleigh(1.0), np.diag([0.2, 0.1])), hg.hop(hg.random_affine.bernoulli(0.4), np.diag([0.3, 0.2]))]
     )
     for item in (relay, hg.dropout(relay, 0.7), hg.with_direct_link(relay, hg.hop(1.0, np.diag([0.1, 0.4])))):
         found = disturbed_gain(item)
@@ -58,7 +58,9 @@ def test_signal_columns_agree_with_the_algebra():
 
 def test_noise_power_agrees_with_the_algebra_and_with_samples():
     """E[n n'] = E[N N'] for independent sources of unit variance; 4 standard errors of 40,000 draws."""
-    item = hg.dropout(hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.2), hg.hop(hg.bernoulli(0.4), 0.3)]), 0.7)
+    item = hg.dropout(
+        hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.2), hg.hop(hg.random_affine.bernoulli(0.4), 0.3)]), 0.7
+    )
     found = disturbed_gain(item)
     power = np.einsum("abib->ai", found.second[:, found.inputs :, :, found.inputs :])[0, 0]
     np.testing.assert_allclose(power, item.moments(2).matrix[0, -1], rtol=1e-13)
@@ -70,4 +72,4 @@ def test_noise_power_agrees_with_the_algebra_and_with_samples():
 
 def test_a_lifted_channel_is_refused():
     with pytest.raises(ValueError, match=r"channel: expected hops, series, mixtures and stacks of them, got Lift"):
-        disturbed_gain(hg.square(hg.hop(1.0, 0.1)))
+        disturbed_gain(hg.random_affine.square(hg.hop(1.0, 0.1)))

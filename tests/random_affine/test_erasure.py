@@ -21,7 +21,7 @@ def received(channel, y, seed=0):
 
 
 def test_all_components_are_lost_together_and_the_rest_is_the_channel():
-    z = received(hg.erasure(hg.known([[2.0, 0.0], [0.0, 3.0]]), 0.7), [1.0, 1.0])
+    z = received(hg.erasure(hg.random_affine.known([[2.0, 0.0], [0.0, 3.0]]), 0.7), [1.0, 1.0])
     lost = np.isnan(z).all(axis=1)
     assert np.array_equal(np.isnan(z).any(axis=1), lost) and abs(lost.mean() - 0.3) < LIMIT
     assert np.all(z[~lost] == [2.0, 3.0])
@@ -36,14 +36,14 @@ def test_a_relay_forwards_what_was_lost_as_lost():
     chain = hg.amplify_and_forward([hg.hop(1.0, 0.0), hg.erasure(hg.hop(2.0, 0.0), 0.8), hg.hop(3.0, 0.0)])
     z = received(chain, [1.0])
     assert abs(np.isnan(z).mean() - 0.2) < LIMIT and np.all(z[~np.isnan(z)] == 6.0)
-    twice = hg.Series([hg.erasure(hg.perfect(), 0.8), hg.erasure(hg.perfect(), 0.5)])
+    twice = hg.random_affine.Series([hg.erasure(hg.perfect(), 0.8), hg.erasure(hg.perfect(), 0.5)])
     assert abs(np.isnan(received(twice, [1.0])).mean() - 0.6) < LIMIT
 
 
 def test_components_are_lost_one_by_one():
     """A matrix behind them loses what it makes of lost components, and nothing else."""
     pair = hg.with_direct_link(hg.erasure(hg.perfect(), 0.5), hg.perfect())
-    z = received(hg.Series([pair, hg.known([[1.0, 0.0], [0.0, 2.0], [1.0, 1.0]])]), [1.0])
+    z = received(hg.random_affine.Series([pair, hg.random_affine.known([[1.0, 0.0], [0.0, 2.0], [1.0, 1.0]])]), [1.0])
     lost = np.isnan(z)
     assert np.array_equal(lost[:, 0], lost[:, 2]) and not lost[:, 1].any() and np.all(z[:, 1] == 2.0)
     assert abs(lost[:, 0].mean() - 0.5) < LIMIT
@@ -56,11 +56,14 @@ def test_a_loss_behind_an_erasure_that_nobody_is_told_of_reads_zero():
 
 
 def test_moments_say_what_to_do():
-    for channel in (hg.erasure(hg.perfect(), 0.5), hg.Series([hg.erasure(hg.perfect(), 0.5), hg.hop(1.0, 0.1)])):
+    for channel in (
+        hg.erasure(hg.perfect(), 0.5),
+        hg.random_affine.Series([hg.erasure(hg.perfect(), 0.5), hg.hop(1.0, 0.1)]),
+    ):
         with pytest.raises(ValueError, match=r"without erasures \(give the filter what is inside\), got an erasure"):
             channel.moments(2)
     with pytest.raises(ValueError, match="lift: expected a channel without erasures"):
-        hg.square(hg.erasure(hg.perfect(), 0.5))
+        hg.random_affine.square(hg.erasure(hg.perfect(), 0.5))
     with pytest.raises(ValueError, match=r"arrival probability: expected a number from 0 to 1, got 1.5"):
         hg.erasure(hg.perfect(), 1.5)
 
@@ -70,7 +73,7 @@ def test_the_parts_of_an_erasure():
     channel = hg.erasure(fading, 0.7)
     assert channel.corner_count() == len(channel.extremes()) == fading.corner_count() > 1
     assert all(part.erases for part in channel.extremes()) and not fading.erases
-    mean = hg.mean_gain(channel)
+    mean = hg.model.mean_gain(channel)
     assert mean.erases and mean.base.law.moment(1) == 1.0 and mean.arrival == 0.7
 
 

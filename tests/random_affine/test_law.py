@@ -80,8 +80,8 @@ def test_one_uncertain_probability_alone_cannot_move():
         (lambda: Discrete([1, 2, 3], [0.5, 0.5]), r"shape \(3\), got shape \(2,\)"),
         (lambda: Discrete([1, 2], [0.5, 0.5], 0.6), "what its probability allows"),
         (lambda: Discrete([1, np.nan], [0.5, 0.5]), "finite numbers"),
-        (lambda: hg.bernoulli(1.2), "from 0 to 1, got 1.2"),
-        (lambda: hg.GivenMoments([1.0, 0.5]), "which none has"),
+        (lambda: hg.random_affine.bernoulli(1.2), "from 0 to 1, got 1.2"),
+        (lambda: hg.random_affine.GivenMoments([1.0, 0.5]), "which none has"),
         (lambda: hg.Nakagami(0.2), "Nakagami shape"),
     ],
 )
@@ -91,7 +91,7 @@ def test_impossible_laws_are_refused(make, message):
 
 
 def test_given_moments_design_but_do_not_sample():
-    law = hg.GivenMoments([1.0, 1.2])
+    law = hg.random_affine.GivenMoments([1.0, 1.2])
     assert law.moment(2) == 1.2
     with pytest.raises(ValueError, match="law that can be sampled"):
         law.sample(jax.random.key(0))

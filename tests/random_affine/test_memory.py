@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine import moment_interval, push
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.disturbance import disturbed_gain
+from heliograph.random_affine.interval import moment_interval
+from heliograph.random_affine.push import push
 from heliograph.testing import check_random_affine
 
 GAINS = np.array([0.2, 1.0])
@@ -74,16 +75,18 @@ HOP = hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.1)  # E g = 1
 MEAN = float(STATIONARY @ GAINS)
 COMBINED = {  # channel, entry of H, E[entry_k entry_(k+1)]
     "itself": (Switching(), (0, 0), lagged()),
-    "series": (hg.Series([HOP, Switching()]), (0, 0), lagged()),
-    "series of two chains": (hg.Series([Switching(), Switching()]), (0, 0), lagged() ** 2),
-    "stack": (hg.Stack([HOP, Switching()]), (1, 0), lagged()),
-    "mixture": (hg.Mixture([hg.silent(), Switching()], [0.2, 0.8]), (0, 0), 0.64 * lagged()),
-    "dropout": (hg.dropout(hg.Series([Switching(), HOP]), 0.8), (0, 0), 0.64 * lagged()),
+    "series": (hg.random_affine.Series([HOP, Switching()]), (0, 0), lagged()),
+    "series of two chains": (hg.random_affine.Series([Switching(), Switching()]), (0, 0), lagged() ** 2),
+    "stack": (hg.random_affine.Stack([HOP, Switching()]), (1, 0), lagged()),
+    "mixture": (hg.random_affine.Mixture([hg.model.silent(), Switching()], [0.2, 0.8]), (0, 0), 0.64 * lagged()),
+    "dropout": (hg.dropout(hg.random_affine.Series([Switching(), HOP]), 0.8), (0, 0), 0.64 * lagged()),
     "erasure": (hg.erasure(Switching(), 0.8), (0, 0), lagged()),
-    "lift": (hg.square(Switching()), (0, 0), lagged(2)),
+    "lift": (hg.random_affine.square(Switching()), (0, 0), lagged(2)),
     "parallel": (hg.parallel([HOP, Switching()]), (1, 1), lagged()),
     "all of them": (
-        hg.erasure(hg.Stack([hg.dropout(hg.Series([HOP, Switching()]), 0.5), Switching()]), 0.9),
+        hg.erasure(
+            hg.random_affine.Stack([hg.dropout(hg.random_affine.Series([HOP, Switching()]), 0.5), Switching()]), 0.9
+        ),
         (0, 0), 0.25 * lagged(),
     ),
 }  # fmt: skip
@@ -115,7 +118,9 @@ def test_the_contract_holds(name):
 
 
 def test_a_map_that_forgets_has_no_state_and_draws_what_it_samples():
-    channel = hg.dropout(hg.Stack([HOP, hg.Series([HOP, hg.hop(hg.Rayleigh(1.0), 0.2)])]), 0.7)
+    channel = hg.dropout(
+        hg.random_affine.Stack([HOP, hg.random_affine.Series([HOP, hg.hop(hg.Rayleigh(1.0), 0.2)])]), 0.7
+    )
     key = jax.random.key(3)
     assert not channel.remembers and channel.init(key) == ()
     state, drawn = channel.draw((), key)
@@ -130,8 +135,11 @@ def test_a_map_that_forgets_has_no_state_and_draws_what_it_samples():
         (lambda key: Forgetful([Switching()]).draw((), key), "draw of Forgetful"),
         (lambda key: Forgetful([Switching()]).sample(key), "sample of Switching"),
         (lambda key: HalfThreaded([Switching()]).init(key), "init of HalfThreaded"),
-        (lambda key: hg.Series([HOP, Forgetful([hg.Series([Switching()])])]).init(key), "init of Forgetful"),
-        (lambda key: hg.Series([HOP, Switching()]).sample(key), "sample of Series"),
+        (
+            lambda key: hg.random_affine.Series([HOP, Forgetful([hg.random_affine.Series([Switching()])])]).init(key),
+            "init of Forgetful",
+        ),
+        (lambda key: hg.random_affine.Series([HOP, Switching()]).sample(key), "sample of Series"),
         (lambda key: check_random_affine(Forgetful([Switching()])), "init of Forgetful"),
     ],
 )
@@ -145,17 +153,24 @@ PLANT = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
 
 
-@pytest.mark.parametrize("channel", [Switching(), hg.erasure(hg.Series([HOP, Switching()]), 0.5),
-                                     hg.Stack([HOP, Switching()]), hg.dropout(Switching(), 0.5)])  # fmt: skip
+@pytest.mark.parametrize(
+    "channel",
+    [
+        Switching(),
+        hg.erasure(hg.random_affine.Series([HOP, Switching()]), 0.5),
+        hg.random_affine.Stack([HOP, Switching()]),
+        hg.dropout(Switching(), 0.5),
+    ],
+)
 @pytest.mark.parametrize(
     "use",
     [
         lambda c: c.moments(2),
         lambda c: push(c, 2, np.ones(3)),
         lambda c: moment_interval(c, 2),
-        hg.second_order,
+        hg.random_affine.second_order,
         disturbed_gain,
-        hg.mean_gain,
+        hg.model.mean_gain,
         lambda c: hg.linear_filter(PLANT, SENSOR, c),
         lambda c: hg.cubature_filter(PLANT, SENSOR, c),
         lambda c: hg.mean_gain_filter(PLANT, SENSOR, c),

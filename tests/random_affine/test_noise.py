@@ -21,7 +21,7 @@ def test_gaussian_moments_are_gauss_hermite_quadrature():
 
 
 def test_finite_support_knows_its_mean_and_covariance():
-    noise = hg.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
+    noise = hg.random_affine.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
     np.testing.assert_allclose(noise.mean, [-0.5, 1.5], rtol=1e-15)
     np.testing.assert_allclose(noise.covariance, [[0.75, -0.75], [-0.75, 0.75]], rtol=1e-14)
 

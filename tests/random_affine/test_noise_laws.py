@@ -12,29 +12,31 @@ from heliograph.papers.quadratic_bias.setting import TABLE_1
 from heliograph.random_affine.moment_noise import MOMENT_ERROR
 from heliograph.testing import check_random_affine
 
-SKEWED = hg.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+SKEWED = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 
 
 def test_independent_and_shaped_noises_are_what_they_sample():
-    joint = hg.Independent([SKEWED, hg.Gaussian([[0.5, 0.2], [0.2, 0.3]], [0.1, -0.2])])
-    check_random_affine(hg.GainAndNoise(hg.Constant(1.0), np.ones((3, 1)), joint))
-    mixed = hg.Shaped([[1.0, 0.5, 0.0], [0.0, -1.0, 2.0]], joint)
-    check_random_affine(hg.GainAndNoise(hg.Constant(1.0), np.ones((2, 1)), mixed))
+    joint = hg.random_affine.Independent([SKEWED, hg.Gaussian([[0.5, 0.2], [0.2, 0.3]], [0.1, -0.2])])
+    check_random_affine(hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), np.ones((3, 1)), joint))
+    mixed = hg.random_affine.Shaped([[1.0, 0.5, 0.0], [0.0, -1.0, 2.0]], joint)
+    check_random_affine(hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), np.ones((2, 1)), mixed))
     np.testing.assert_allclose(mixed.mean, [mixed.moment((1, 0)), mixed.moment((0, 1))], rtol=1e-14)
     second = np.array([[mixed.moment((2, 0)), mixed.moment((1, 1))], [mixed.moment((1, 1)), mixed.moment((0, 2))]])
     np.testing.assert_allclose(mixed.covariance, second - np.outer(mixed.mean, mixed.mean), rtol=1e-13)
 
 
 def test_given_moments_design_the_same_filter_as_the_law():
-    given_ = hg.NoiseMoments([SKEWED.moment((k,)) for k in range(1, 5)])
+    given_ = hg.random_affine.NoiseMoments([SKEWED.moment((k,)) for k in range(1, 5)])
     designs = []
     for noise in (SKEWED, given_):
         plant = hg.LinearPlant([[0.8]], noise, [0.0], 1.0)
-        system = hg.lifted_system(plant, hg.LinearSensor([[1.0]], noise), hg.perfect(), 2, 5)
-        designs.append(hg.lmmse(system).gains.covariance)
+        system = hg.linear.lifted_system(plant, hg.LinearSensor([[1.0]], noise), hg.perfect(), 2, 5)
+        designs.append(hg.linear.lmmse(system).gains.covariance)
     np.testing.assert_allclose(designs[1], designs[0], rtol=1e-12)
     with pytest.raises(ValueError, match="moments up to order 6, got 4 of them"):
-        hg.lifted_system(hg.LinearPlant([[0.8]], given_, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0), hg.perfect(), 3, 5)
+        hg.linear.lifted_system(
+            hg.LinearPlant([[0.8]], given_, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0), hg.perfect(), 3, 5
+        )
     with pytest.raises(ValueError, match="a law that can be sampled"):
         given_.sample(None)
 
@@ -46,8 +48,8 @@ def test_given_moments_design_the_same_filter_as_the_law():
 )
 def test_moments_of_any_law_are_accepted(values, weights, order):
     chance = np.array(weights[: len(values)])
-    law = hg.FiniteSupport(np.array(values)[:, None], chance / chance.sum())
-    hg.NoiseMoments([law.moment((k,)) for k in range(1, order + 1)])
+    law = hg.random_affine.FiniteSupport(np.array(values)[:, None], chance / chance.sum())
+    hg.random_affine.NoiseMoments([law.moment((k,)) for k in range(1, order + 1)])
 
 
 @pytest.mark.parametrize(
@@ -64,7 +66,7 @@ def test_moments_of_any_law_are_accepted(values, weights, order):
 )
 def test_moments_of_no_law_are_refused_with_the_reason(moments, message):
     with pytest.raises(ValueError, match=message):
-        hg.NoiseMoments(moments)
+        hg.random_affine.NoiseMoments(moments)
 
 
 def test_a_rounded_table_of_moments_can_belong_to_no_law():
@@ -72,12 +74,12 @@ def test_a_rounded_table_of_moments_can_belong_to_no_law():
     second, third, fourth = TABLE_1["eps2"]
     assert second**2 + third**2 / second - fourth == pytest.approx(8.1e-5, abs=1e-6)
     with pytest.raises(ValueError, match="which no distribution has"):
-        hg.NoiseMoments([0.0, second, third, fourth])
+        hg.random_affine.NoiseMoments([0.0, second, third, fourth])
 
 
 def test_recorded_noise_has_the_samples_moments():
     samples = np.random.default_rng(0).normal(size=(4000, 2)) @ [[1.0, 0.3], [0.0, 0.5]]
-    law = hg.recorded_noise(samples, 4)
+    law = hg.random_affine.recorded_noise(samples, 4)
     assert law.moment((1, 3)) == pytest.approx(np.mean(samples[:, 0] * samples[:, 1] ** 3), rel=1e-12)
     np.testing.assert_allclose(law.covariance, np.cov(samples.T, bias=True), rtol=1e-12)
 
@@ -85,12 +87,12 @@ def test_recorded_noise_has_the_samples_moments():
 def test_a_sample_too_small_for_the_order_is_told_and_the_number_named_is_enough():
     g = np.random.default_rng(0)
     with pytest.warns(UserWarning, match=r"order 4 is known to \d+ % only; about [\d,]+ samples instead of 100"):
-        hg.recorded_noise(g.normal(size=100), 4)
+        hg.random_affine.recorded_noise(g.normal(size=100), 4)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        hg.recorded_noise(g.normal(size=500), 2)
+        hg.random_affine.recorded_noise(g.normal(size=500), 2)
         enough = int(1.5 * (96 / 9) / MOMENT_ERROR**2)  # Gaussian: Var(n^4) / (E n^4)^2 = 96 / 9
-        hg.recorded_noise(g.normal(size=enough), 4)
+        hg.random_affine.recorded_noise(g.normal(size=enough), 4)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +101,7 @@ def test_a_sample_too_small_for_the_order_is_told_and_the_number_named_is_enough
 )
 def test_samples_that_are_none_are_refused(samples, order, message):
     with pytest.raises(ValueError, match=message):
-        hg.recorded_noise(samples, order)
+        hg.random_affine.recorded_noise(samples, order)
 
 
 def test_a_plant_draws_its_initial_state_from_the_law():
@@ -114,7 +116,7 @@ def test_a_plant_draws_its_initial_state_from_the_law():
 def test_with_bias_refuses_what_does_not_fit():
     plant = hg.LinearPlant(np.eye(2), 1.0, np.zeros(2), 1.0)
     with pytest.raises(ValueError, match=r"coupling of the bias: expected shape \(2, 2\), got shape \(2, 1\)"):
-        hg.with_bias(plant, np.ones((2, 1)), plant)
+        hg.model.with_bias(plant, np.ones((2, 1)), plant)
     driven = hg.LinearPlant(np.eye(1), 1.0, np.zeros(1), 1.0, np.ones((1, 1)))
     with pytest.raises(ValueError, match="a plant without inputs"):
-        hg.with_bias(plant, np.ones((2, 1)), driven)
+        hg.model.with_bias(plant, np.ones((2, 1)), driven)

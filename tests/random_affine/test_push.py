@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine import push
 from heliograph.random_affine.monomials import count, exponents, monomials
 from heliograph.random_affine.noise import noise_vector
-from heliograph.random_affine.push import Tabulated, push_known, second_moments
+from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
 from tests.random_affine.test_contract import CHANNELS
 
 
@@ -28,7 +27,7 @@ def test_pushed_moments_are_those_of_the_matrix(name, order):
 
 
 def test_lifted_maps_are_pushed_by_their_matrix():
-    square = hg.square(CHANNELS["discrete"])
+    square = hg.random_affine.square(CHANNELS["discrete"])
     point = monomials(np.array([0.3, -0.7]), 2)[:-1]
     before = monomials(point, 2)
     np.testing.assert_allclose(push(square, 2, before), square.moments(2).expect(before), rtol=1e-14)
@@ -49,7 +48,9 @@ def test_second_moments_are_gathered_from_the_vector():
 
 
 def test_a_table_knows_what_the_law_knows():
-    law = hg.Shaped([[1.0, 0.5], [0.0, 2.0]], hg.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75]))
+    law = hg.random_affine.Shaped(
+        [[1.0, 0.5], [0.0, 2.0]], hg.random_affine.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
+    )
     table = Tabulated(law, 4)
     np.testing.assert_array_equal(noise_vector(table, 4), noise_vector(law, 4))
     assert all(table.moment(a) == law.moment(a) for k in range(5) for a in exponents(2, k))
@@ -57,7 +58,7 @@ def test_a_table_knows_what_the_law_knows():
 
 def test_a_large_order_needs_no_large_matrix():
     """16 states, order 4: the vector has 4845 entries; the matrix that is not formed has 23 million."""
-    plant = hg.GainAndNoise(hg.Constant(1.0), 0.5 * np.eye(16), 0.3)
+    plant = hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), 0.5 * np.eye(16), 0.3)
     gaussian = noise_vector(hg.Gaussian(np.eye(16)), 4)
     assert len(gaussian) == count(17, 4) == 4845
     expected = noise_vector(hg.Gaussian((0.25 + 0.3) * np.eye(16)), 4)

@@ -18,7 +18,7 @@ HORIZON = 4
 def network():
     plant = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1 * np.eye(2), np.zeros(2), np.eye(2))
     sensor = hg.LinearSensor([[1.0, 0.0]], 0.1)
-    channel = hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.bernoulli(0.8), 0.1)])
+    channel = hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.1), hg.hop(hg.random_affine.bernoulli(0.8), 0.1)])
     return hg.Network(plant, {"a": hg.Node(sensor, channel, {"f": hg.linear_filter(plant, sensor, channel)})})
 
 

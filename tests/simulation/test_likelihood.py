@@ -53,7 +53,7 @@ def test_it_is_the_density_of_all_measurements_together(holes):
 
 def test_nodes_one_after_another_are_the_nodes_together():
     rows = [hg.LinearSensor(C[[i]], R[i, i]) for i in range(2)]
-    apart = hg.sequential_filter([hg.kalman_filter(PLANT, row) for row in rows])
+    apart = hg.filters.sequential_filter([hg.kalman_filter(PLANT, row) for row in rows])
     together = hg.kalman_filter(PLANT, SENSOR)
     found, expected = (hg.log_likelihood(item, data(True), INPUTS) for item in (apart, together))
     assert found == pytest.approx(expected, rel=1e-12)

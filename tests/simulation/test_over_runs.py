@@ -45,7 +45,7 @@ def test_every_run_is_the_textbooks_filter(monkeypatch, runs, cores):
     monkeypatch.setattr(os, "cpu_count", lambda: cores)
     random = np.random.default_rng(runs)
     gains, z = random.uniform(0.5, 1.5, (runs, STEPS)), random.normal(size=(runs, STEPS, 1))
-    means, last = hg.over_runs(follow, gains, z, width=64)
+    means, last = hg.simulation.over_runs(follow, gains, z, width=64)
     assert means.shape == (runs, STEPS, 2) and last.shape == (runs, 2, 2) and means.dtype == np.float64
     for i in {0, runs // 2, runs - 1}:
         expected = one_by_one(gains[i], z[i])
@@ -56,4 +56,4 @@ def test_every_run_is_the_textbooks_filter(monkeypatch, runs, cores):
 def test_arrays_without_a_common_axis_are_refused():
     for arrays in ((), (np.zeros((3, 2)), np.zeros((4, 2))), (np.zeros((0, 2)),), (1.0,)):
         with pytest.raises(ValueError, match=r"arrays over runs: expected one leading axis of runs, at least one"):
-            hg.over_runs(follow, *arrays)
+            hg.simulation.over_runs(follow, *arrays)

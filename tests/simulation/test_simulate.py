@@ -7,7 +7,7 @@ from heliograph.filters.base import corrects, predicts
 from heliograph.testing import check_filter
 
 PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], 0.1, [0.0, 1.0], 0.3, input_matrix=[[1.0], [0.5]])
-CHANNEL = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.7), 0.1), hg.hop(hg.bernoulli(0.8), 0.05)])
+CHANNEL = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.7), 0.1), hg.hop(hg.random_affine.bernoulli(0.8), 0.05)])
 HORIZON, RUNS = 7, 70  # more than one block of runs, and not a multiple of it
 INPUTS = np.linspace(-1, 1, HORIZON)[:, None]
 
@@ -84,7 +84,7 @@ def test_run_equals_step_by_step(record):
 def test_the_true_channel_makes_the_data_and_the_filter_believes_another():
     sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
     item = hg.linear_filter(PLANT, sensor, CHANNEL)
-    worlds = [hg.Network(PLANT, {"n": hg.Node(sensor, c, {"f": item})}) for c in (CHANNEL, hg.silent())]
+    worlds = [hg.Network(PLANT, {"n": hg.Node(sensor, c, {"f": item})}) for c in (CHANNEL, hg.model.silent())]
     rmse = [
         hg.monte_carlo(w, HORIZON, 500, 1, hg.Statistics(), INPUTS)["n"]["f"].rmse()[0] for w in worlds
     ]  # fmt: skip
@@ -108,19 +108,19 @@ LINEAR = {
     name: hg.Node(item.sensor, item.channel, {"linear": item.filters["linear"]}) for name, item in NETWORK.nodes.items()
 }
 STATIC = {
-    "b": hg.UniformQuantizer(32, 0.8),  # saturates now and then
-    "a": hg.UniformQuantizer(16, 12.0),
-    "direct": hg.UniformQuantizer(64, 10.0),
+    "b": hg.fusion.UniformQuantizer(32, 0.8),  # saturates now and then
+    "a": hg.fusion.UniformQuantizer(16, 12.0),
+    "direct": hg.fusion.UniformQuantizer(64, 10.0),
 }
 LINKED = hg.Network(
     PLANT,
     LINEAR,
     {
-        "plain": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5])),
-        "static": hg.Fusion("linear", hg.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
-        "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
+        "plain": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5])),
+        "static": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
+        "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.fusion.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
         "by component": hg.Fusion(
-            "linear", hg.EqualIntersection(), hg.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
+            "linear", hg.EqualIntersection(), hg.fusion.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
         ),
     },
 )
@@ -159,7 +159,7 @@ def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
             p, d = linked.estimates[node][fusion.filter].covariance[run, k], error[k, i]
             s, r = d.sum(), np.sqrt(np.trace(p))
             local.append(hg.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
-        outside, inside = hg.fuse(fusion.rule, local), linked.estimates["fused"][name]
+        outside, inside = hg.fusion.fuse(fusion.rule, local), linked.estimates["fused"][name]
         # The same arithmetic in another compilation; searched weights agree to the root of rounding.
         np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
         np.testing.assert_allclose(inside.covariance[run, k], outside.covariance, rtol=0, atol=1e-7)
@@ -196,7 +196,7 @@ def test_statistics_count_what_the_record_shows(linked):
     found = some[0]
     assert found["plain"].uplink is None
     for name in linked.uplinks:
-        kept, counted = hg.error_statistics(linked, "fused", name).uplink, found[name].uplink
+        kept, counted = hg.simulation.error_statistics(linked, "fused", name).uplink, found[name].uplink
         assert kept.nodes == counted.nodes
         np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
         np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
@@ -221,7 +221,7 @@ def test_a_recording_goes_through_the_same_links(linked):
 
 def test_quantizers_over_time_and_the_claim_of_a_static_one():
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
-    each = hg.over_time([hg.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
+    each = hg.over_time([hg.fusion.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
     network = hg.Network(PLANT, LINEAR, {"ci": hg.Fusion("linear", hg.CovarianceIntersection(), each)})
     found = hg.monte_carlo(network, 5, 2000, 3, hg.Statistics(), INPUTS[:5])["fused"]["ci"]
     assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
@@ -249,7 +249,7 @@ class Silent(hg.AbstractFilter):
     @corrects
     def correct(self, state, z, k=0):
         nothing = jax.numpy.where(jax.numpy.isnan(z[0]), 0.0, jax.numpy.nan)
-        return state, hg.Innovation(z, jax.numpy.full((1, 1), jax.numpy.nan), nothing)
+        return state, hg.model.Innovation(z, jax.numpy.full((1, 1), jax.numpy.nan), nothing)
 
     def estimate(self, state):
         return hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
@@ -259,7 +259,7 @@ def test_a_filter_that_claims_no_covariance_harms_no_other():
     sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
     filters = {"silent": Silent(), "linear": hg.linear_filter(PLANT, sensor, CHANNEL)}
     nodes = {name: hg.Node(sensor, CHANNEL, filters) for name in ("p", "q")}
-    network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.WeightedFusion([0.5, 0.5]))})
+    network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.fusion.WeightedFusion([0.5, 0.5]))})
     check_filter(Silent(), [0.0])
     assert hg.monte_carlo(network, 4, 8, 0, inputs=INPUTS[:4]).failures() == []
     found = hg.monte_carlo(network, 4, 200, 0, hg.Statistics(), INPUTS[:4])
@@ -268,7 +268,7 @@ def test_a_filter_that_claims_no_covariance_harms_no_other():
     assert silent.rmse()[0] > linear.rmse()[0] and linear.nees_per_dimension()[0] == pytest.approx(1, abs=0.3)
     assert np.isnan(silent.nees_per_dimension()[0]) and np.isnan(silent.mean_trace())
     assert np.isnan(silent.worst_direction().ratio) and np.isnan(silent.worst_direction().z)
-    assert hg.pool([silent, linear]).claim == "none"
+    assert hg.simulation.pool([silent, linear]).claim == "none"
     with pytest.raises(ValueError, match="got the claim 'none'"):
         hg.Network(PLANT, nodes, {"ci": hg.Fusion("silent", hg.CovarianceIntersection())})
 

@@ -79,4 +79,4 @@ def test_a_network_refuses_filters_that_do_not_fit_it():
         hg.Network(still, {"a": node})
     with pytest.raises(ValueError, match="fused 'all': expected one that hears the 4 numbers that arrive"):
         hg.Network(PLANT, {"a": node, "b": node}, {"all": item})
-    hg.Network(PLANT, {"a": node, "b": node}, {"all": hg.sequential_filter([item, item])})
+    hg.Network(PLANT, {"a": node, "b": node}, {"all": hg.filters.sequential_filter([item, item])})

@@ -80,7 +80,7 @@ def _reading(campaign: Campaign) -> Section:
     lines = [
         "import heliograph as hg",
         "",
-        'results = hg.open_results("THIS FOLDER")  # an xarray.Dataset',
+        'results = hg.campaign.open_results("THIS FOLDER")  # an xarray.Dataset',
         'results.error.sel(setting=0).mean("run")',
     ]
     text = f"The errors of every run are in the store; axes: {', '.join(['setting', 'run', 'time', 'node', 'filter'])}."

@@ -24,7 +24,7 @@ from heliograph.numerics.small_matrix import (
     trace,
     transpose,
 )
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder
 
 SWEEPS = 200  # most steps towards the scalars; about 5 are needed
 LONGEST = 5.0  # Newton step in the logarithm of a scalar: a longer one is not trusted

@@ -23,7 +23,7 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_order import SecondOrder, has_random_gain
+from heliograph.random_affine.second_moments import SecondOrder, has_random_gain
 
 Each = TypeVar("Each", AbstractRandomAffine, SecondOrder)
 

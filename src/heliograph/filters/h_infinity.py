@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.h_infinity.design import HInfinityDesign
-from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant

@@ -14,7 +14,7 @@ from heliograph.numerics.small_matrix import (
     runs_last,
 )
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder
 
 OFF_SUPPORT = 1e-6  # standard deviations, and
 OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say

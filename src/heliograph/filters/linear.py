@@ -23,7 +23,7 @@ from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder
 
 
 class LinearBelief(NamedTuple):

@@ -17,7 +17,7 @@ from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Discrete
-from heliograph.random_affine.second_order import (
+from heliograph.random_affine.second_moments import (
     QuadraticMap,
     SecondOrder,
     nominal_spread,

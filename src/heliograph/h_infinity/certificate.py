@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.growth_check import GrowthFinding
-from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.types import ArrayLike, Float
 

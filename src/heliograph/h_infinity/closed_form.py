@@ -4,7 +4,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.h_infinity.design import HInfinityDesign
-from heliograph.h_infinity.growth_system import GrowthSystem
+from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.types import ArrayLike, Float
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.h_infinity.growth_system import GrowthSystem
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -28,6 +27,7 @@ from heliograph.h_infinity.step import (
     next_energy,
     step_matrices,
 )
+from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.types import ArrayLike, Float
 

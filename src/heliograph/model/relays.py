@@ -12,7 +12,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_order import second_moment_tensor
+from heliograph.random_affine.second_moments import second_moment_tensor
 
 SENSOR, RECEIVER = "sensor", "receiver"
 

@@ -1,1 +1,5 @@
 """Networks run: simulated, filtered, recorded, and judged by statistics."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -147,9 +147,9 @@ class Slots(AbstractAir):
         for i, numbers in enumerate(kinds.values()):
             kind[numbers], position[numbers] = i, np.arange(len(numbers))
         branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
-        slot = k % len(kind)
+        turn = k % len(kind)
         heard: dict[str, jax.Array] = jax.lax.switch(
-            jnp.asarray(kind)[slot], branches, jnp.asarray(position)[slot], k, sent, key
+            jnp.asarray(kind)[turn], branches, jnp.asarray(position)[turn], k, sent, key
         )
         return heard
 

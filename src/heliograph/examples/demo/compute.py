@@ -15,7 +15,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import AbstractRandomAffine, apply
-from heliograph.random_affine.second_order import second_order
+from heliograph.random_affine.second_moments import second_order
 from heliograph.simulation.network import Network, Node
 from heliograph.simulation.simulate import run
 

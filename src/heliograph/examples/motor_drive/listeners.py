@@ -40,8 +40,8 @@ def network(plant: hg.Plant) -> hg.Network:
     nodes = {}
     for name, channel in CHANNELS.items():
         filters: dict[str, hg.AbstractFilter] = {
-            "zero_mean": hg.cubature_filter(plant, sensor, channel, hg.ZeroMean()),
-            "polytope": hg.cubature_filter(plant, sensor, channel, hg.Polytope()),
+            "zero_mean": hg.cubature_filter(plant, sensor, channel, hg.filters.ZeroMean()),
+            "polytope": hg.cubature_filter(plant, sensor, channel, hg.filters.Polytope()),
             "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
         }
         wired = {"perfect": hg.cubature_filter(plant, sensor, channel), "open_loop": hg.open_loop_filter(plant)}

@@ -28,7 +28,7 @@ RUNS = 5_000  # what the judgement of the worst direction needs
 STAGES = 5  # as `reproduction` tells them
 EARLY, EARLY_FACTOR = 3, 20  # first steps, where fused bounds overstate themselves by little, with 20 times the runs
 
-Statistics = dict[str, dict[str, hg.ErrorStatistics]]
+Statistics = dict[str, dict[str, hg.simulation.ErrorStatistics]]
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class Outcome:
         """Number of runs."""
         return next(iter(self.statistics[NODES[0]].values())).runs
 
-    def pooled(self, name: str) -> hg.ErrorStatistics:
+    def pooled(self, name: str) -> hg.simulation.ErrorStatistics:
         """A filter's statistics over all nodes, steps of node 1 first; a fused one's as they are."""
         if name in self.statistics["fused"]:
             return self.statistics["fused"][name]
-        return hg.pool([self.statistics[node][name] for node in NODES])
+        return hg.simulation.pool([self.statistics[node][name] for node in NODES])
 
     def rmse(self, name: str) -> np.ndarray:
         """Root mean squared error over time, (node, time)."""
@@ -87,7 +87,7 @@ def network(s: Setting) -> hg.Network:
     fused: dict[str, hg.Fusion | hg.AbstractFilter] = {
         "ci_printed": hg.Fusion("cubature_printed_fixed", optimal),
         "ci_open_loop": hg.Fusion("open_loop", optimal),
-        "central_polytope": central(s, hg.Polytope()),
+        "central_polytope": central(s, hg.filters.Polytope()),
     }
     return _assemble(s, [filters(s, i) for i in range(len(NODES))], {**zero_mean_fusion(s), **fused})
 
@@ -113,13 +113,13 @@ def zero_mean_fusion(s: Setting) -> dict[str, hg.Fusion | hg.AbstractFilter]:
     return {
         "ci_optimal": hg.Fusion("cubature_zero_mean", hg.CovarianceIntersection()),
         "ci_equal": hg.Fusion("cubature_zero_mean", hg.EqualIntersection()),
-        "central": central(s, hg.ZeroMean()),
+        "central": central(s, hg.filters.ZeroMean()),
     }
 
 
 def central(s: Setting, update: AbstractUpdate) -> hg.AbstractFilter:
     """All nodes' measurements in turn, each used as that node's filter would."""
-    return hg.sequential_filter([cubature(s, i, update) for i in range(len(NODES))])
+    return hg.filters.sequential_filter([cubature(s, i, update) for i in range(len(NODES))])
 
 
 def _only(s: Setting, name: str) -> list[dict[str, hg.AbstractFilter]]:

@@ -7,7 +7,7 @@ from heliograph.papers.cubature_fusion import one_step
 from heliograph.papers.cubature_fusion.compute import SIGNIFICANT, Outcome, Reproduction
 from heliograph.papers.cubature_fusion.setting import B4, B6, K1, NODES, PRINTED, STRONG, H, Setting
 from heliograph.papers.statement import Statement, holds
-from heliograph.random_affine import Discrete
+from heliograph.random_affine.law import Discrete
 
 DRAWS = 100_000  # of the uniform Delta: their spread is known to a third of a percent
 
@@ -72,7 +72,7 @@ def _raw_minus() -> Statement:
 
 
 def _cross(result: Reproduction) -> Statement:
-    right = one_step.innovation(PRINTED, hg.Cubature()).Pxy
+    right = one_step.innovation(PRINTED, hg.filters.Cubature()).Pxy
     error = 100 * np.max(np.abs(one_step.mixed_cross(PRINTED) - right)) / np.max(np.abs(right))
     strong = result.strong
     ours = (
@@ -138,7 +138,7 @@ def _relay_energy() -> Statement:
 
 def _process_noise(result: Reproduction) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()[9]
-    gap = one_step.predicted(PRINTED, hg.Linearization(), claimed)[1]
+    gap = one_step.predicted(PRINTED, hg.filters.Linearization(), claimed)[1]
     ours = (
         f"The cross terms are E[Φeω′] = 0; with e e′ as printed they would double ΦΞΦ′, {np.trace(gap):.2f} of "
         f"trace at "
@@ -150,9 +150,9 @@ def _process_noise(result: Reproduction) -> Statement:
 def _offset(result: Reproduction) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()
     gaps = []
-    for rule in (hg.Cubature(), hg.PolynomialMoments(2)):
-        gaps.append([one_step.predicted(PRINTED, rule, c)[0] - one_step.predicted(PRINTED, hg.Linearization(), c)[0]
-                     for c in claimed])  # fmt: skip
+    for rule in (hg.filters.Cubature(), hg.filters.PolynomialMoments(2)):
+        pairs = [(one_step.predicted(PRINTED, r, c)[0] for r in (rule, hg.filters.Linearization())) for c in claimed]
+        gaps.append([ours - linear for ours, linear in pairs])
     size = np.linalg.norm(gaps[0], axis=1)
     same = float(np.max(np.abs(np.array(gaps[0]) - gaps[1])))
     ours = (
@@ -165,8 +165,8 @@ def _offset(result: Reproduction) -> Statement:
 
 
 def _prediction() -> Statement:
-    exact = one_step.predicted(PRINTED, hg.PolynomialMoments(2))[1]
-    least = np.linalg.eigvalsh(one_step.predicted(PRINTED, hg.Cubature())[1] - exact)[0]
+    exact = one_step.predicted(PRINTED, hg.filters.PolynomialMoments(2))[1]
+    least = np.linalg.eigvalsh(one_step.predicted(PRINTED, hg.filters.Cubature())[1] - exact)[0]
     start = PRINTED.claimed_initial_variance
     ours = (
         f"Theorem 1 needs P̂⁻ ≥ P⁻. At Ξ = {start:g} I the cubature rule misses the products of two states: the least "

@@ -5,11 +5,11 @@ import jax
 import heliograph as hg
 from heliograph.filters.correction import Signal, young_correction
 from heliograph.filters.update import AbstractUpdate, interval_description
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder
 
 
 class LooseInterval(AbstractUpdate):
-    """`hg.Interval` with the squared mean added where it should be subtracted: var g <= s + q + (m - r)^2.
+    """`hg.filters.Interval` with the squared mean added where it should be subtracted: var g <= s + q + (m - r)^2.
 
     A bound still, but of the power of g instead of its variance, so it trusts a good channel too little: with a perfect
     channel it does not become the filter without one.
@@ -17,7 +17,7 @@ class LooseInterval(AbstractUpdate):
     Source: cubature fusion under amplify-and-forward relays, equation (11) as printed.
     """
 
-    scalars: hg.Scalars | None = None
+    scalars: hg.filters.Scalars | None = None
 
     def describe(self, channel: hg.AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.
@@ -29,7 +29,7 @@ class LooseInterval(AbstractUpdate):
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""
-        return hg.Polytope(self.scalars)
+        return hg.filters.Polytope(self.scalars)
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array

@@ -122,7 +122,7 @@ def cubature_points(x: Array, P: Array) -> Array:
 
 def mixed_cross(s: Setting) -> Array:
     """Step 3's Pxy as printed: propagated points with outputs of redrawn ones, for node 1's first step."""
-    f, m, P = transition(s), *predicted(s, hg.Cubature())
+    f, m, P = transition(s), *predicted(s, hg.filters.Cubature())
     with jax.enable_x64(True):
         points = jnp.asarray(cubature_points(np.array(s.guesses[0]), s.claimed_initial_variance * np.eye(5)))
         propagated = to_numpy(jax.vmap(lambda x: f(x, ()))(points))
@@ -184,7 +184,7 @@ def perfect_channel_excess(s: Setting) -> float:
     """Relative excess of the printed bound's one-step trace over the right one through a perfect channel."""
     one = hg.Discrete([1.0], [1.0])
     ch = Channel(1.0, 1.0, s.relay_noise * np.eye(2), s.receiver_noise * np.eye(2), one, one)
-    v = innovation(s, hg.Cubature())
+    v = innovation(s, hg.filters.Cubature())
     traces = []
     for sign in (1, -1):
         t = box_terms(ch, sign)

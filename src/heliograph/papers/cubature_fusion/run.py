@@ -115,7 +115,7 @@ def _scenario_record(o: Outcome, length: int) -> "xarray.Dataset":
     return xarray.Dataset(data, coordinates).reindex(time=np.arange(1, length + 1))
 
 
-def _over_time(statistics: list[hg.ErrorStatistics]) -> dict[str, np.ndarray]:
+def _over_time(statistics: list[hg.simulation.ErrorStatistics]) -> dict[str, np.ndarray]:
     """Quantities by name, (item, time) or (item, time, state)."""
     actual = np.array([s.actual() for s in statistics])
     claimed = np.array([s.claimed() for s in statistics])

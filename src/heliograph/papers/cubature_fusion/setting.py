@@ -132,29 +132,29 @@ def cubature(
     s: Setting, node: int, update: AbstractUpdate, transform: AbstractTransform | None = None
 ) -> GaussianFilter:
     """A node's filter with one update and, unless given, the cubature transform."""
-    rule = hg.Cubature() if transform is None else transform
+    rule = hg.filters.Cubature() if transform is None else transform
     start = s.guesses[node], s.claimed_initial_variance * np.eye(5)
-    return hg.gaussian_filter(plant(s), sensor(s, node), channel(s), rule, update, *start)
+    return hg.filters.gaussian_filter(plant(s), sensor(s, node), channel(s), rule, update, *start)
 
 
 def filters(s: Setting, node: int) -> dict[str, hg.AbstractFilter]:
     """All filters of one node: scalars optimal at each step, or fixed where the name says so."""
     start = s.guesses[node], s.claimed_initial_variance * np.eye(5)
     parts = plant(s), sensor(s, node), channel(s)
-    fixed = hg.Scalars(*s.beta)
+    fixed = hg.filters.Scalars(*s.beta)
     return {
         "open_loop": hg.open_loop_filter(parts[0], *start),
         "mean_gain": hg.mean_gain_filter(*parts, *start),
-        "extended_polytope": cubature(s, node, hg.Polytope(), hg.Linearization()),
+        "extended_polytope": cubature(s, node, hg.filters.Polytope(), hg.filters.Linearization()),
         "cubature_printed": cubature(s, node, LooseInterval()),
-        "cubature_tight": cubature(s, node, hg.Interval()),
-        "cubature_polytope": cubature(s, node, hg.Polytope()),
-        "cubature_zero_mean": cubature(s, node, hg.ZeroMean()),
-        "extended_polytope_fixed": cubature(s, node, hg.Polytope(fixed), hg.Linearization()),
+        "cubature_tight": cubature(s, node, hg.filters.Interval()),
+        "cubature_polytope": cubature(s, node, hg.filters.Polytope()),
+        "cubature_zero_mean": cubature(s, node, hg.filters.ZeroMean()),
+        "extended_polytope_fixed": cubature(s, node, hg.filters.Polytope(fixed), hg.filters.Linearization()),
         "cubature_printed_fixed": cubature(s, node, LooseInterval(fixed)),
-        "cubature_tight_fixed": cubature(s, node, hg.Interval(fixed)),
-        "cubature_polytope_fixed": cubature(s, node, hg.Polytope(fixed)),
-        "cubature_zero_mean_fixed": cubature(s, node, hg.ZeroMean(FIXED_ZERO_MEAN_SCALAR)),
-        "extended_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.Linearization()),
-        "exact_moments_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.PolynomialMoments(2)),
+        "cubature_tight_fixed": cubature(s, node, hg.filters.Interval(fixed)),
+        "cubature_polytope_fixed": cubature(s, node, hg.filters.Polytope(fixed)),
+        "cubature_zero_mean_fixed": cubature(s, node, hg.filters.ZeroMean(FIXED_ZERO_MEAN_SCALAR)),
+        "extended_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.filters.Linearization()),
+        "exact_moments_printed_fixed": cubature(s, node, LooseInterval(fixed), hg.filters.PolynomialMoments(2)),
     }

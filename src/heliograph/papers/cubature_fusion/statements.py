@@ -54,7 +54,7 @@ def _whole_filter(result: Reproduction) -> Statement:
 
 
 def _gain() -> Statement:
-    ch, rule = one_step.channel_of(PRINTED), hg.Cubature()
+    ch, rule = one_step.channel_of(PRINTED), hg.filters.Cubature()
     gradient = one_step.trace_gradient(one_step.innovation(PRINTED, rule), PRINTED.beta, one_step.box_terms(ch, 1), ch)
     ours = f"tr Ξ is a convex quadratic of K; its gradient at (29) is {gradient:.0e} of its terms"
     return Statement("(29) minimises the trace", f"{THEOREM}, Theorem 2", "", ours, holds(gradient < 1e-12))

@@ -18,7 +18,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.papers.cubature_fusion.loose_interval import LooseInterval
 from heliograph.papers.cubature_fusion.setting import Setting, cubature
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_order import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder
 
 
 class AbstractReading(AbstractUpdate):
@@ -124,7 +124,7 @@ class MixedCross(AbstractFilter):
 
 def variants(s: Setting, node: int) -> dict[str, AbstractFilter]:
     """The literal readings of one node, all with the scenario's fixed scalars."""
-    printed, polytope = (rule(hg.Scalars(*s.beta)) for rule in (LooseInterval, hg.Polytope))
+    printed, polytope = (rule(hg.filters.Scalars(*s.beta)) for rule in (LooseInterval, hg.filters.Polytope))
     return {
         "step_four_gain": cubature(s, node, StepFourGain(printed, s.mean_gain**-0.5)),
         "mixed_cross": MixedCross(cubature(s, node, polytope)),

@@ -55,12 +55,12 @@ class Reproduction:
     @property
     def fused_level(self) -> float:
         """The smallest level that Theorem 4 can give, in closed form."""
-        return published_fused_level(setting.LEVELS, hg.level_weights(setting.LEVELS))
+        return published_fused_level(setting.LEVELS, hg.fusion.level_weights(setting.LEVELS))
 
     @property
     def minkowski(self) -> float:
         """What the triangle inequality gives for the same weights, without quantization."""
-        return hg.fused_level(setting.LEVELS, hg.level_weights(setting.LEVELS))
+        return hg.fusion.fused_level(setting.LEVELS, hg.fusion.level_weights(setting.LEVELS))
 
     def level_of_paper_weights(self, normalised: bool = True) -> float:
         """sqrt(2 N sum c^2 gamma^2) for the printed weights, which sum to 0.9999."""

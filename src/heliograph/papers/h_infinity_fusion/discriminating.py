@@ -28,11 +28,11 @@ class Discriminating:
     (time,) the mean of the fused one over runs.
     """
 
-    designs: dict[str, dict[str, hg.HInfinityDesign]]
-    certificates: dict[str, hg.HInfinityCertificate]
+    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
+    certificates: dict[str, hg.h_infinity.HInfinityCertificate]
     without_structure: dict[str, float]
     without_structure_or_gain: float
-    finding: hg.GrowthFinding
+    finding: hg.h_infinity.GrowthFinding
     errors: dict[str, Errors]
     local_errors: dict[str, Errors]
     over_time: dict[str, dict[str, np.ndarray]]
@@ -44,34 +44,38 @@ def discriminate(runs: int, seed: int) -> Discriminating:
     """Everything of the second example."""
     designs = design()
     side = np.full(2, structured.BOX)
-    finding = hg.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
+    finding = hg.h_infinity.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
     certificates = {
-        node: hg.certify_level(structured.system(node), d.gains, d.weights, d.multipliers, d.level, [finding])
+        node: hg.h_infinity.certify_level(
+            structured.system(node), d.gains, d.weights, d.multipliers, d.level, [finding]
+        )
         for node, d in designs["horizon"].items()
     }
-    flat = {node: hg.horizon_design(structured.system(node, False), True).level for node in structured.OUTPUTS}
+    flat = {
+        node: hg.h_infinity.horizon_design(structured.system(node, False), True).level for node in structured.OUTPUTS
+    }
     count = min(runs, RUNS)
     blind = without_gain(structured.system(NODE, False), True).level
     simulated = simulate(designs, count, seed)
     return Discriminating(designs, certificates, flat, blind, finding, *simulated, worst_cases(designs), count)
 
 
-def design() -> dict[str, dict[str, hg.HInfinityDesign]]:
+def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     """The horizon and the recursive design of each node at their smallest levels, and what K = 0 proves."""
-    found: dict[str, dict[str, hg.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
+    found: dict[str, dict[str, hg.h_infinity.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
     for node in structured.OUTPUTS:
         system = structured.system(node)
-        found["horizon"][node] = hg.horizon_design(system, separate=True)
-        found["recursive"][node] = hg.smallest_recursive_level(system, separate=True)
+        found["horizon"][node] = hg.h_infinity.horizon_design(system, separate=True)
+        found["recursive"][node] = hg.h_infinity.smallest_recursive_level(system, separate=True)
         found["zero_gain"][node] = without_gain(system, True)
     return found
 
 
-def filters(node: str, designs: dict[str, dict[str, hg.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
+def filters(node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
     """All filters of a node but the one that is told of losses; each predicts."""
     believed, sensor, system = structured.plant(False), structured.sensor(node), structured.system(node)
     found: dict[str, hg.AbstractFilter] = {
-        name: hg.h_infinity_filter(believed, sensor, system, each[node]) for name, each in designs.items()
+        name: hg.filters.h_infinity_filter(believed, sensor, system, each[node]) for name, each in designs.items()
     }
     found["open_loop"] = hg.open_loop_filter(believed)
     for name, hop in (("ekf_ignoring", structured.lossless), ("ekf_statistics", structured.lossy)):
@@ -79,7 +83,7 @@ def filters(node: str, designs: dict[str, dict[str, hg.HInfinityDesign]]) -> dic
     return found
 
 
-def networks(designs: dict[str, dict[str, hg.HInfinityDesign]]) -> list[hg.Network]:
+def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
     """One whose receivers are not told of losses, and one whose are, with other draws."""
     blind = {
         node: hg.Node(structured.sensor(node), structured.channel(), filters(node, designs))
@@ -99,7 +103,7 @@ def networks(designs: dict[str, dict[str, hg.HInfinityDesign]]) -> list[hg.Netwo
         )
         for node in structured.OUTPUTS
     }
-    rule = hg.WeightedFusion(np.full(len(blind), 1 / len(blind)))
+    rule = hg.fusion.WeightedFusion(np.full(len(blind), 1 / len(blind)))
     return [
         hg.Network(
             structured.plant(), nodes, {name: hg.Fusion(name, rule) for name in next(iter(nodes.values())).filters}
@@ -109,7 +113,7 @@ def networks(designs: dict[str, dict[str, hg.HInfinityDesign]]) -> list[hg.Netwo
 
 
 def simulate(
-    designs: dict[str, dict[str, hg.HInfinityDesign]], runs: int, seed: int
+    designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]], runs: int, seed: int
 ) -> tuple[dict[str, Errors], dict[str, Errors], dict[str, dict[str, np.ndarray]]]:
     """Mean norm of the error by scenario and filter: fused, of one node, and fused over time."""
     errors: dict[str, Errors] = {scenario: {} for scenario in structured.SCENARIOS}
@@ -127,7 +131,7 @@ def simulate(
     return errors, local, over_time
 
 
-def worst_cases(designs: dict[str, dict[str, hg.HInfinityDesign]]) -> dict[str, Worst]:
+def worst_cases(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> dict[str, Worst]:
     """Lower bounds on the true levels of one node's filters; they run on the channel that does not tell."""
     world, draws = structured.world(NODE), structured.draws(SEARCH_DRAWS, 1)
     judges = structured.draws(JUDGE_DRAWS, 2)

@@ -74,7 +74,7 @@ def _spreads(p1: float, p2: float, p3: float) -> tuple[float, ...]:
 
 def _fusion(result: Reproduction) -> list[Statement]:
     gamma = np.array(setting.LEVELS)
-    c = hg.level_weights(gamma)
+    c = hg.fusion.level_weights(gamma)
     best, paper, minkowski = result.fused_level, result.level_of_paper_weights(), result.minkowski
     edge = np.block(
         [[np.full((1, 1), -(best**2) / (2 * len(c))), (c * gamma)[None]], [(c * gamma)[:, None], -np.eye(4)]]

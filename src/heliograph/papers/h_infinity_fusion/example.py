@@ -16,11 +16,11 @@ RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
 QUANTIZERS: dict[str, Quantizer | None] = {
     "none": None,
     "dynamic": ZoomQuantizer(setting.SEGMENTS, setting.AMPLITUDE, setting.DECAY, setting.ZOOM),
-    "static": hg.UniformQuantizer(setting.SEGMENTS, setting.AMPLITUDE),
+    "static": hg.fusion.UniformQuantizer(setting.SEGMENTS, setting.AMPLITUDE),
 }
 MORE_QUANTIZERS: dict[str, Quantizer | None] = {
-    "dynamic_decodable": hg.EscapeQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE, setting.DECAY, 0.6, 1e-3),
-    "static_p41": hg.UniformQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE),
+    "dynamic_decodable": hg.fusion.EscapeQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE, setting.DECAY, 0.6, 1e-3),
+    "static_p41": hg.fusion.UniformQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE),
 }
 
 
@@ -65,7 +65,7 @@ def fused_name(name: str, quantizer: str) -> str:
     return f"{name}.{quantizer}"
 
 
-def simulate(designs: Mapping[str, list[hg.HInfinityDesign]], runs: int, seed: int) -> Outcome:
+def simulate(designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]], runs: int, seed: int) -> Outcome:
     """All filters of one record but those that are told of losses; `designs` by name, one for each node."""
     nodes = {
         node: hg.Node(setting.disturbed_sensor(i), setting.disturbed_channel(), filters(i, designs))
@@ -74,7 +74,7 @@ def simulate(designs: Mapping[str, list[hg.HInfinityDesign]], runs: int, seed: i
     return _run(nodes, runs, seed)
 
 
-def filters(node: int, designs: Mapping[str, list[hg.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
+def filters(node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
     """The filters of one node that hear the losses as they are."""
     return {
         **h_infinity_filters(node, designs),
@@ -84,10 +84,14 @@ def filters(node: int, designs: Mapping[str, list[hg.HInfinityDesign]]) -> dict[
     }
 
 
-def h_infinity_filters(node: int, designs: Mapping[str, list[hg.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
+def h_infinity_filters(
+    node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]
+) -> dict[str, hg.AbstractFilter]:
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
-    return {name: hg.h_infinity_filter(*parts, each[node], setting.GUESSES[node]) for name, each in designs.items()}
+    return {
+        name: hg.filters.h_infinity_filter(*parts, each[node], setting.GUESSES[node]) for name, each in designs.items()
+    }
 
 
 def simulate_told(runs: int, seed: int) -> Outcome:
@@ -123,7 +127,7 @@ def extended(node: int, hop: setting.Hop) -> GaussianFilter:
 
 def _run(nodes: dict[str, hg.Node], runs: int, seed: int) -> Outcome:
     names = tuple(next(iter(nodes.values())).filters)
-    rule = hg.WeightedFusion(hg.level_weights(setting.LEVELS))
+    rule = hg.fusion.WeightedFusion(hg.fusion.level_weights(setting.LEVELS))
     fused = {fused_name(n, q): hg.Fusion(n, rule, each) for n in names for q, each in QUANTIZERS.items()}
     if RECURSIVE in names:
         fused |= {fused_name(RECURSIVE, q): hg.Fusion(RECURSIVE, rule, each) for q, each in MORE_QUANTIZERS.items()}

@@ -19,9 +19,9 @@ class Growth:
     size: whether |f(x)| <= 0.7 |x| there. secant (time,): the largest |f(x) - f(xhat)| / |x - xhat| that happened.
     """
 
-    visited: list[hg.GrowthFinding]
-    whole: hg.GrowthFinding
-    size: hg.GrowthFinding
+    visited: list[hg.h_infinity.GrowthFinding]
+    whole: hg.h_infinity.GrowthFinding
+    size: hg.h_infinity.GrowthFinding
     secant: np.ndarray
 
     @property
@@ -37,11 +37,13 @@ def growth(outcome: Outcome) -> Growth:
         points = np.concatenate([estimates[:, :, s].reshape(-1, 2), truth[s : s + 1]])
         low, high = points.min(axis=0), points.max(axis=0)
         pad = MARGIN * (high - low)
-        visited.append(hg.check_growth(setting.dynamics(s), setting.GROWTH, low - pad, high + pad, f"f at s = {s}"))
+        visited.append(
+            hg.h_infinity.check_growth(setting.dynamics(s), setting.GROWTH, low - pad, high + pad, f"f at s = {s}")
+        )
     side, last = np.full(2, RANGE), setting.STEPS - 1
     f = setting.dynamics(last)
-    whole = hg.check_growth(f, setting.GROWTH, -side, side, f"f at s = {last}")
-    size = hg.check_size(f, setting.GROWTH, -side, side, f"|f| at s = {last}")
+    whole = hg.h_infinity.check_growth(f, setting.GROWTH, -side, side, f"f at s = {last}")
+    size = hg.h_infinity.check_size(f, setting.GROWTH, -side, side, f"|f| at s = {last}")
     return Growth(visited, whole, size, _secant(truth, estimates))
 
 

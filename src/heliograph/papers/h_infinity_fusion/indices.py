@@ -94,7 +94,7 @@ def replay(outcome: Outcome) -> Replayed:
 def _broken(outcome: Outcome, amplitude: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Shares of runs in which |M mu_i|^2 <= Lambda_i fails at a node, and
     |M e_fused|^2 <= 2 N sum c_i^2 (|M e_i|^2 + Lambda_i), by step."""
-    c, n, allowance = hg.level_weights(setting.LEVELS), len(setting.NODES), _allowance(amplitude)
+    c, n, allowance = hg.fusion.level_weights(setting.LEVELS), len(setting.NODES), _allowance(amplitude)
     off = np.sum((error @ setting.WANTED.T) ** 2, axis=-1) > allowance
     local = (outcome.truth - outcome.estimates(RECURSIVE)) @ setting.WANTED.T
     fused = outcome.record.errors("fused", fused_name(RECURSIVE, "dynamic")) @ setting.WANTED.T

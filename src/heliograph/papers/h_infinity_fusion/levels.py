@@ -22,14 +22,14 @@ class NodeDesigns:
     smallest level of the recursion by objective, with P_0 free.
     """
 
-    paper: hg.HInfinityDesign
-    certificate: hg.HInfinityCertificate
+    paper: hg.h_infinity.HInfinityDesign
+    certificate: hg.h_infinity.HInfinityCertificate
     failed: dict[Objective, int | None]
     smallest: dict[Objective, float]
-    horizon: hg.HInfinityDesign
-    horizon_certificate: hg.HInfinityCertificate
-    separate: hg.HInfinityDesign
-    zero_gain: hg.HInfinityDesign
+    horizon: hg.h_infinity.HInfinityDesign
+    horizon_certificate: hg.h_infinity.HInfinityCertificate
+    separate: hg.h_infinity.HInfinityDesign
+    zero_gain: hg.h_infinity.HInfinityDesign
     without_measurements: float
 
 
@@ -51,49 +51,51 @@ def node_designs(node: int) -> NodeDesigns:
     """All of one node."""
     system, level = setting.system(node), setting.LEVELS[node]
     start = setting.INITIAL * np.eye(4)
-    tried = {o: hg.recursive_design(system, level, start, o, search=False) for o in (*OBJECTIVES, "none")}
-    paper, horizon = tried["trace"], hg.horizon_design(system)
+    tried = {o: hg.h_infinity.recursive_design(system, level, start, o, search=False) for o in (*OBJECTIVES, "none")}
+    paper, horizon = tried["trace"], hg.h_infinity.horizon_design(system)
     if not paper.feasible:
         raise fail(f"design of node {node + 1}", "one that is feasible at the paper's level", paper.status)
     return NodeDesigns(
         paper,
         certify(system, paper),
         {o: design.failed_step for o, design in tried.items()},
-        {o: hg.smallest_recursive_level(system, o).level for o in OBJECTIVES},
+        {o: hg.h_infinity.smallest_recursive_level(system, o).level for o in OBJECTIVES},
         horizon,
         certify(system, horizon),
-        hg.horizon_design(system, separate=True),
+        hg.h_infinity.horizon_design(system, separate=True),
         without_gain(system),
-        hg.level_without_measurements(system),
+        hg.h_infinity.level_without_measurements(system),
     )
 
 
 def certify(
-    system: hg.GrowthSystem, design: hg.HInfinityDesign, growth: Sequence[hg.GrowthFinding] = ()
-) -> hg.HInfinityCertificate:
+    system: hg.h_infinity.GrowthSystem,
+    design: hg.h_infinity.HInfinityDesign,
+    growth: Sequence[hg.h_infinity.GrowthFinding] = (),
+) -> hg.h_infinity.HInfinityCertificate:
     """Check a design by Theorem 1."""
-    return hg.certify_level(system, design.gains, design.weights, design.multipliers, design.level, growth)
+    return hg.h_infinity.certify_level(system, design.gains, design.weights, design.multipliers, design.level, growth)
 
 
-def without_gain(system: hg.GrowthSystem, separate: bool = False) -> hg.HInfinityDesign:
+def without_gain(system: hg.h_infinity.GrowthSystem, separate: bool = False) -> hg.h_infinity.HInfinityDesign:
     """The smallest level that can be proven for K = 0."""
     nothing = np.zeros((system.steps, system.states, system.received))
-    return hg.horizon_design(system, separate, gains=nothing)
+    return hg.h_infinity.horizon_design(system, separate, gains=nothing)
 
 
 def readings() -> Readings:
     """Levels of the example read in other ways."""
     larger = [
-        [hg.horizon_design(setting.system(i, LARGER_GROWTH), s).level for s in (False, True)]
+        [hg.h_infinity.horizon_design(setting.system(i, LARGER_GROWTH), s).level for s in (False, True)]
         for i in range(len(setting.NODES))
     ]
     first = setting.system(0)
     plain = first._replace(feedthrough=np.zeros_like(first.feedthrough))
     return Readings(
-        hg.horizon_design(first, initial=setting.INITIAL * np.eye(4)).level,
+        hg.h_infinity.horizon_design(first, initial=setting.INITIAL * np.eye(4)).level,
         np.array(larger),
-        hg.horizon_design(setting.system(0, hop=setting.lossless)).level,
-        (hg.horizon_design(plain).level, without_gain(plain).level),
+        hg.h_infinity.horizon_design(setting.system(0, hop=setting.lossless)).level,
+        (hg.h_infinity.horizon_design(plain).level, without_gain(plain).level),
     )
 
 
@@ -111,20 +113,20 @@ class TrueGrowth:
     certified: bool
 
 
-def true_growth(findings: list[hg.GrowthFinding]) -> TrueGrowth:
+def true_growth(findings: list[hg.h_infinity.GrowthFinding]) -> TrueGrowth:
     """Design with the slopes found in the boxes of the steps, and certify with the findings."""
     allowed = [f._replace(constant=f.slope * (1 + 1e-6)) for f in findings]  # rounding of the largest ratio
     slopes = np.array([f.constant for f in allowed])
     largest = float(slopes.max())
     nominal = np.full(len(slopes), setting.GROWTH)
     given: list[setting.Constant | tuple[setting.Constant, setting.Constant]]
-    given = [largest, (setting.GROWTH, largest), (hg.OverTime(nominal), hg.OverTime(slopes))]
+    given = [largest, (setting.GROWTH, largest), (hg.model.OverTime(nominal), hg.model.OverTime(slopes))]
     levels, certified = np.zeros((3, len(setting.NODES), 2)), True
     for i, growth in enumerate(given):
         for node in range(len(setting.NODES)):
             system = setting.system(node, growth)
             for separate in (False, True):
-                design = hg.horizon_design(system, separate)
+                design = hg.h_infinity.horizon_design(system, separate)
                 certified &= certify(system, design, allowed).certified
                 levels[i, node, int(separate)] = design.level
     return TrueGrowth(levels[0], levels[1], levels[2], certified)

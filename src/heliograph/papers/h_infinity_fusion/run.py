@@ -122,7 +122,7 @@ def certificate(node: NodeDesigns) -> list[dict[str, Json]]:
 def fusion_numbers(result: Reproduction) -> dict[str, Json]:
     """Weights and levels of the fused estimate."""
     return {
-        "weights": hg.level_weights(setting.LEVELS).tolist(),
+        "weights": hg.fusion.level_weights(setting.LEVELS).tolist(),
         "gamma": result.fused_level,
         "gamma_of_paper_weights": result.level_of_paper_weights(),
         "gamma_of_paper_weights_as_printed": result.level_of_paper_weights(normalised=False),
@@ -167,7 +167,7 @@ def growth_numbers(result: Reproduction) -> dict[str, Json]:
     }
 
 
-def finding_numbers(finding: hg.GrowthFinding) -> dict[str, Json]:
+def finding_numbers(finding: hg.h_infinity.GrowthFinding) -> dict[str, Json]:
     """A finding as numbers."""
     values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in finding._asdict().items()}
     return {**values, "pair": [p.tolist() for p in finding.pair], "refuted": bool(finding.refuted)}

@@ -73,19 +73,19 @@ def sensor(node: int, noise: hg.Gaussian | float) -> hg.LinearSensor:
     return hg.LinearSensor(SENSING[node] * np.ones((1, 2)), noise)
 
 
-def disturbed_sensor(node: int) -> hg.OverTime:
+def disturbed_sensor(node: int) -> hg.model.OverTime:
     """y = h_i(x) + D_i v_s, known to nobody."""
     return hg.over_time([sensor(node, hg.Gaussian(np.zeros((1, 1)), [FEEDTHROUGH[node] * v])) for v in DISTURBANCES])
 
 
 Noise = float | hg.Gaussian
-Constant = float | hg.OverTime  # of growth
+Constant = float | hg.model.OverTime  # of growth
 Hop = Callable[[int, Noise], hg.AbstractRandomAffine]  # of a link 0, 1, 2 and its noise
 
 
 def lossy(link: int, noise: Noise) -> hg.AbstractRandomAffine:
     """sqrt(E) beta y + noise, as printed."""
-    return hg.hop(hg.bernoulli(ARRIVAL[link]), noise, power=POWERS[link])
+    return hg.hop(hg.random_affine.bernoulli(ARRIVAL[link]), noise, power=POWERS[link])
 
 
 def lossless(link: int, noise: Noise) -> hg.AbstractRandomAffine:
@@ -104,7 +104,7 @@ def channel(noises: Sequence[Noise], hop: Hop = lossy) -> hg.AbstractRandomAffin
     return hg.with_direct_link(hg.amplify_and_forward(links[:2]), links[2])
 
 
-def disturbed_channel(hop: Hop = lossy) -> hg.OverTime:
+def disturbed_channel(hop: Hop = lossy) -> hg.model.OverTime:
     """With the noises C rho_s of each step, known to nobody."""
     zero, gain = np.zeros((1, 1)), np.array(NOISE_GAIN)
     return hg.over_time([channel([hg.Gaussian(zero, [n]) for n in gain * rho], hop) for rho in CHANNEL_NOISES])
@@ -121,9 +121,11 @@ def white_channel(hop: Hop = lossy) -> hg.AbstractRandomAffine:
     return channel([float(p) for p in powers], hop)
 
 
-def system(node: int, growth: Constant | tuple[Constant, Constant] = GROWTH, hop: Hop = lossy) -> hg.GrowthSystem:
+def system(
+    node: int, growth: Constant | tuple[Constant, Constant] = GROWTH, hop: Hop = lossy
+) -> hg.h_infinity.GrowthSystem:
     """What the design of a node reads; `growth` as in `growth_system`."""
-    return hg.growth_system(
+    return hg.h_infinity.growth_system(
         STEPS, DISTURBANCE, [[FEEDTHROUGH[node]]], WANTED, unit_channel(hop), growth, OUTPUT_GROWTH[node],
         initial_weight=WEIGHT,
     )  # fmt: skip

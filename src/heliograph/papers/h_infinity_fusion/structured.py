@@ -64,7 +64,7 @@ def sensor(node: str) -> hg.LinearSensor:
 
 def lossy(link: int) -> hg.AbstractRandomAffine:
     """A link that loses without telling."""
-    return hg.hop(hg.bernoulli(ARRIVAL[link]), NOISE_GAIN[link] ** 2)
+    return hg.hop(hg.random_affine.bernoulli(ARRIVAL[link]), NOISE_GAIN[link] ** 2)
 
 
 def lossless(link: int) -> hg.AbstractRandomAffine:
@@ -82,10 +82,10 @@ def channel(hop: Callable[[int], hg.AbstractRandomAffine] = lossy) -> hg.Abstrac
     return hg.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
 
 
-def system(node: str, structured: bool = True) -> hg.GrowthSystem:
+def system(node: str, structured: bool = True) -> hg.h_infinity.GrowthSystem:
     """What designs read; not `structured`: all of A x + phi(x) known by its growth |A| + |phi| alone."""
     shape = {"growth": GROWTH, "transition": ROTATION} if structured else {"growth": DAMPING + GROWTH}
-    return hg.growth_system(
+    return hg.h_infinity.growth_system(
         STEPS, DISTURBANCE, [[0.0]], WANTED, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
     )
 

@@ -12,10 +12,10 @@ ENERGIES = (5e4, 1e5, 2e5)  # starts of some 60, where the cosine of f changes i
 SEARCH_DRAWS, JUDGE_DRAWS = 4, 2_000
 
 
-def violation(node: int, design: hg.HInfinityDesign) -> Worst:
+def violation(node: int, design: hg.h_infinity.HInfinityDesign) -> Worst:
     """The worst disturbance found for a node's filter; where its level is above the design's, the theorem is broken."""
     believed, sensor = setting.plant(False), setting.sensor(node, 0.0)
-    item = hg.h_infinity_filter(believed, sensor, setting.system(node), design)
+    item = hg.filters.h_infinity_filter(believed, sensor, setting.system(node), design)
     return worst_disturbance(item, world(node), draws(SEARCH_DRAWS, 1), draws(JUDGE_DRAWS, 2), ENERGIES, starts=16)
 
 

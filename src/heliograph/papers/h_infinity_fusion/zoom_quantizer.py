@@ -18,19 +18,19 @@ class ZoomQuantizer(AbstractQuantizer):
 
     As published: driven by the unquantized x, which a fusion centre does not know, so nobody there can decode it; and d
     saturates for every constant |x| below (1 - decay) / (growth scale), since it tends to growth x^2 / (1 - decay).
-    `hg.EscapeQuantizer` has neither fault.
+    `hg.fusion.EscapeQuantizer` has neither fault.
 
     Raises:
         ValueError: fewer than two levels, an amplitude that is not positive, decay outside (0, 1), negative growth.
     Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10) to (13).
     """
 
-    uniform: hg.UniformQuantizer
+    uniform: hg.fusion.UniformQuantizer
     decay: np.ndarray
     growth: np.ndarray
 
     def __init__(self, levels: int, amplitude: ArrayLike, decay: float, growth: float):
-        self.uniform = hg.UniformQuantizer(levels, amplitude)
+        self.uniform = hg.fusion.UniformQuantizer(levels, amplitude)
         if not 0 < decay < 1:
             raise fail("decay", "a number between 0 and 1", decay)
         if growth < 0:

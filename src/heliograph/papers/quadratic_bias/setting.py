@@ -6,14 +6,10 @@ from heliograph.model.channel import amplify_and_forward
 from heliograph.model.over_time import OverTime, over_time
 from heliograph.model.plant import LinearPlant, with_bias
 from heliograph.model.sensor import LinearSensor
-from heliograph.random_affine import (
-    AbstractRandomAffine,
-    Discrete,
-    FiniteSupport,
-    GainAndNoise,
-    Independent,
-    Shaped,
-)
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.noise import FiniteSupport, Independent, Shaped
 
 HORIZON = 100
 SETTLED = 30  # library step of t = 31: means are over t = 31 ... 100

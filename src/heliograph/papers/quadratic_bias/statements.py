@@ -12,7 +12,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_mean,
 )
 from heliograph.papers.statement import Statement, holds, if_met
-from heliograph.random_affine import NoiseMoments
+from heliograph.random_affine.moment_noise import NoiseMoments
 
 
 def statements(result: Reproduction) -> list[Statement]:

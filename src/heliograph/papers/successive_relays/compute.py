@@ -44,10 +44,10 @@ class Reproduction(NamedTuple):
 
     seed: int
     runs: int
-    network: hg.RelayNetwork
-    paper: hg.RelayDesign
-    tuned: hg.RelayDesign
-    bounded: hg.RelayDesign
+    network: hg.model.RelayNetwork
+    paper: hg.relays.RelayDesign
+    tuned: hg.relays.RelayDesign
+    bounded: hg.relays.RelayDesign
     best_behind: np.ndarray
     steady: dict[str, Steady]
     limits: dict[str, float]
@@ -62,10 +62,10 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     """Compute all of it; `advance` is told what begins."""
     network = setting.network()
     advance("designing over the horizon")
-    paper = hg.own_error_design(network, setting.HORIZON)
-    tuned = hg.receiver_error_design(network, setting.HORIZON)
-    bounded = hg.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power())
-    behind = hg.receiver_behind_relays(network, paper.gains)
+    paper = hg.relays.own_error_design(network, setting.HORIZON)
+    tuned = hg.relays.receiver_error_design(network, setting.HORIZON)
+    bounded = hg.relays.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power())
+    behind = hg.relays.receiver_behind_relays(network, paper.gains)
     advance("designing the steady state")
     states = steady(network)
     advance("certificates and misprints")
@@ -82,51 +82,51 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     )  # fmt: skip
 
 
-def steady(network: hg.RelayNetwork) -> dict[str, Steady]:
+def steady(network: hg.model.RelayNetwork) -> dict[str, Steady]:
     """The two-periodic steady state of each design."""
-    paper = hg.periodic_own_error_design(network)
+    paper = hg.relays.periodic_own_error_design(network)
     listen = {"relay_1": 1, "relay_2": 0}  # slots: odd, even
     start = {name: np.zeros((2, 3, 1)) for name in listen}
     for name, slot in listen.items():
         start[name][slot, :, 0] = setting.QUIET_START[name]
     limited = paper.total_power()
-    tuned = [hg.periodic_relays_for_best_receiver(network, s) for s in (None, start)]
-    quiet = hg.periodic_relays_for_best_receiver(network, tuned[1], power_limit=limited)
+    tuned = [hg.relays.periodic_relays_for_best_receiver(network, s) for s in (None, start)]
+    quiet = hg.relays.periodic_relays_for_best_receiver(network, tuned[1], power_limit=limited)
     relays = {"lmmse": paper.gains, "lmmse_tuned": min(tuned, key=lambda g: _behind(network, g).even
               + _behind(network, g).odd), "lmmse_tuned_from_paper": tuned[0], "lmmse_quiet": quiet}  # fmt: skip
     return {
         "paper": _own(paper),
-        "joint": _own(hg.periodic_receiver_error_design(network)),
-        "joint_quiet": _own(hg.periodic_receiver_error_design(network, power_limit=limited)),
+        "joint": _own(hg.relays.periodic_receiver_error_design(network)),
+        "joint_quiet": _own(hg.relays.periodic_receiver_error_design(network, power_limit=limited)),
         **{name: _behind(network, gains) for name, gains in relays.items()},
         "no_relay": _without_relay(setting.hop_from_sensor()),
         "sensor_itself": _without_relay(hg.perfect()),
     }
 
 
-def _own(design: hg.RelayDesign) -> Steady:
+def _own(design: hg.relays.RelayDesign) -> Steady:
     odd, even = design.trace("receiver")[1:]
     return Steady(float(even), float(odd), design.total_power())
 
 
-def _behind(network: hg.RelayNetwork, gains: GainsByFilter) -> Steady:
-    odd, even = np.trace(hg.periodic_behind_relays(network, gains), axis1=1, axis2=2)
+def _behind(network: hg.model.RelayNetwork, gains: GainsByFilter) -> Steady:
+    odd, even = np.trace(hg.relays.periodic_behind_relays(network, gains), axis1=1, axis2=2)
     silent = {name: gains[name] for name in network.relays} | {"receiver": np.zeros((2, 3, 1))}
-    return Steady(float(even), float(odd), hg.periodic_given_design(network, silent).total_power())
+    return Steady(float(even), float(odd), hg.relays.periodic_given_design(network, silent).total_power())
 
 
-def _without_relay(direct: hg.GainAndNoise) -> Steady:
+def _without_relay(direct: hg.random_affine.GainAndNoise) -> Steady:
     """Trace of the error of x_(k+1) predicted from what was heard up to k: as late as behind a relay."""
-    filtered = hg.periodic_own_error_design(setting.without_relays(direct)).covariance["receiver"][-1]
+    filtered = hg.relays.periodic_own_error_design(setting.without_relays(direct)).covariance["receiver"][-1]
     plant, process = setting.plant(), setting.process_covariance()
     value = float(np.trace(plant.matrix @ filtered @ plant.matrix.T + process))
     return Steady(value, value, np.zeros(2))
 
 
-def limits(paper: hg.RelayDesign) -> dict[str, float]:
+def limits(paper: hg.relays.RelayDesign) -> dict[str, float]:
     """Other steady traces to compare with: filtered without relays, and nothing heard."""
     filtered = {
-        name: float(hg.periodic_own_error_design(setting.without_relays(direct)).trace("receiver")[-1])
+        name: float(hg.relays.periodic_own_error_design(setting.without_relays(direct)).trace("receiver")[-1])
         for name, direct in (("no_relay_filtered", setting.hop_from_sensor()), ("sensor_itself_filtered", hg.perfect()))
     }
     covariance, plant, process = setting.INITIAL_COVARIANCE, setting.plant(), setting.process_covariance()
@@ -139,7 +139,7 @@ def misprinted(name: str, process: float = setting.VARIANCE, sensor: float = set
     """What a misprint does to the trace that is claimed, and to the true one, at k = 0 .. STEADY."""
     right, wrong = recursion("none", STEADY, process, sensor), recursion(name, STEADY, process, sensor)
     network = setting.network(setting.plant(process=process), setting.sensor(sensor))
-    true = hg.given_design(network, by_filter(wrong))
+    true = hg.relays.given_design(network, by_filter(wrong))
     return Misprinted(
         wrong.remote_trace / true.trace("receiver"),
         true.trace("receiver") / right.remote_trace,
@@ -147,10 +147,11 @@ def misprinted(name: str, process: float = setting.VARIANCE, sensor: float = set
     )
 
 
-def world(network: hg.RelayNetwork, design: hg.RelayDesign) -> hg.Network:
+def world(network: hg.model.RelayNetwork, design: hg.relays.RelayDesign) -> hg.Network:
     """The relays with their filters, and the receiver's."""
-    schedules = hg.relay_schedules(network, design)
-    return hg.Network.of_relays(network, schedules, {"own": hg.ScheduledFilter(schedules.pop("receiver"))})
+    schedules = hg.relays.relay_schedules(network, design)
+    receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
+    return hg.Network.of_relays(network, schedules, {"own": receiver})
 
 
 def initial_states(runs: int, seed: int) -> np.ndarray:
@@ -158,10 +159,10 @@ def initial_states(runs: int, seed: int) -> np.ndarray:
     still = hg.LinearPlant(np.eye(3), 0.0, setting.INITIAL_MEAN, setting.INITIAL_COVARIANCE)
     sensor = hg.LinearSensor(setting.SENSING, 0.0)
     found = hg.monte_carlo(hg.Network(still, {"nobody": hg.Node(sensor, hg.perfect(), {})}), 1, runs, seed)
-    return np.asarray(found.truth[:, 0])
+    return np.asarray(found.truth)[:, 0]
 
 
-def simulate(network: hg.RelayNetwork, design: hg.RelayDesign, runs: int, seed: int) -> Simulated:
+def simulate(network: hg.model.RelayNetwork, design: hg.relays.RelayDesign, runs: int, seed: int) -> Simulated:
     """Mean squared errors of relays and receiver, run as filters in the world."""
     found = hg.monte_carlo(world(network, design), setting.HORIZON, runs, seed, hg.Statistics())
     start = np.sum((initial_states(runs, seed) - network.initial()[0]) ** 2, axis=1)
@@ -185,5 +186,5 @@ def counterexample() -> RelayCertificate:
         {"relay_2": {"sensor": noisy, "relay_1": quiet}, "receiver": {"relay_1": noisy}},
         {"relay_1": {"sensor": noisy, "relay_2": quiet}, "receiver": {"relay_2": noisy}},
     ]
-    network = hg.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
-    return certify_relays(network, hg.own_error_design(network, 60).gains)
+    network = hg.model.RelayNetwork(plant, hg.LinearSensor([[1.0]], [[1.0]]), ("relay_1", "relay_2"), slots)
+    return certify_relays(network, hg.relays.own_error_design(network, 60).gains)

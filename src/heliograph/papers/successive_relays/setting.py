@@ -60,10 +60,10 @@ def sensor(variance: float = VARIANCE) -> hg.LinearSensor:
 def network(
     plant: hg.LinearPlant | None = None,
     sensor: hg.LinearSensor | None = None,
-) -> hg.RelayNetwork:
+) -> hg.model.RelayNetwork:
     """Two relays in turn: odd k, relay 2 listens and relay 1 talks; even k, the other way round."""
 
-    def link(coefficient: int, noise: float = VARIANCE) -> hg.GainAndNoise:
+    def link(coefficient: int, noise: float = VARIANCE) -> hg.random_affine.GainAndNoise:
         return hg.hop(shadowing(MEANS[coefficient]), noise)
 
     odd = {
@@ -74,17 +74,17 @@ def network(
         "relay_1": {"sensor": link(1), "relay_2": link(3, 0.0)},
         "receiver": {"relay_2": link(5)},
     }
-    return hg.RelayNetwork(plant or _PLANT, sensor or _SENSOR, ("relay_1", "relay_2"), (odd, even))
+    return hg.model.RelayNetwork(plant or _PLANT, sensor or _SENSOR, ("relay_1", "relay_2"), (odd, even))
 
 
-def without_relays(direct: hg.GainAndNoise) -> hg.RelayNetwork:
+def without_relays(direct: hg.random_affine.GainAndNoise) -> hg.model.RelayNetwork:
     """A receiver that hears the sensor itself."""
-    return hg.RelayNetwork(_PLANT, _SENSOR, (), ({"receiver": {"sensor": direct}},))
+    return hg.model.RelayNetwork(_PLANT, _SENSOR, (), ({"receiver": {"sensor": direct}},))
 
 
 _PLANT, _SENSOR = plant(), sensor()
 
 
-def hop_from_sensor() -> hg.GainAndNoise:
+def hop_from_sensor() -> hg.random_affine.GainAndNoise:
     """The channel from the sensor to relay 1, as if the receiver stood there: gamma_1 y + xi_1."""
     return hg.hop(shadowing(MEANS[1]), VARIANCE)

@@ -104,11 +104,11 @@ def _state_mean(result: Reproduction, k: int) -> np.ndarray:
 def _without_fading() -> float:
     """tr P_10 with every gain at its mean."""
     slots = [
-        {listener: {s: hg.mean_gain(link) for s, link in links.items()} for listener, links in slot.items()}
+        {listener: {s: hg.model.mean_gain(link) for s, link in links.items()} for listener, links in slot.items()}
         for slot in setting.network().slots
     ]
-    network = hg.RelayNetwork(setting.plant(), setting.sensor(), ("relay_1", "relay_2"), slots)
-    return float(hg.own_error_design(network, 10).trace("receiver")[10])
+    network = hg.model.RelayNetwork(setting.plant(), setting.sensor(), ("relay_1", "relay_2"), slots)
+    return float(hg.relays.own_error_design(network, 10).trace("receiver")[10])
 
 
 def _bounds(result: Reproduction) -> list[Statement]:
@@ -201,13 +201,13 @@ def _proofs() -> list[Statement]:
 
 def _alternating(
     plant: hg.LinearPlant, sensor: hg.LinearSensor, law: hg.LogNormal, relay: float, remote: float
-) -> hg.RelayNetwork:
+) -> hg.model.RelayNetwork:
     """Two relays in turn over one law of gains, with these noises at relay and remote filter."""
     slots = [
         {own: {"sensor": hg.hop(law, relay), other: hg.hop(law, 0.0)}, "receiver": {other: hg.hop(law, remote)}}
         for own, other in (("relay_2", "relay_1"), ("relay_1", "relay_2"))
     ]
-    return hg.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), slots)
+    return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), slots)
 
 
 def _largest_noise() -> float:
@@ -215,7 +215,7 @@ def _largest_noise() -> float:
     plant = hg.LinearPlant(0.1 * np.eye(2), np.diag([0.01, 1.0]), np.zeros(2), 0.01 * np.eye(2))
     sensor = hg.LinearSensor([[1.0, 1.0]], [[1.0]])
     network = _alternating(plant, sensor, setting.shadowing(0.5, 0.1), 1e6, 1e6)
-    return float(np.linalg.eigvalsh(hg.own_error_design(network, 40).covariance["relay_1"][-1])[0])
+    return float(np.linalg.eigvalsh(hg.relays.own_error_design(network, 40).covariance["relay_1"][-1])[0])
 
 
 def _noise_squared() -> tuple[float, int, tuple[float, float]]:
@@ -228,7 +228,7 @@ def _noise_squared() -> tuple[float, int, tuple[float, float]]:
         factors = [o / (o + 4 * upper) for o in (noise**2, noise)]
         bounds = [tau * factor * bound + w for factor, bound in zip(factors, bounds, strict=True)]
         upper = tau * upper + w
-    return float(hg.own_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
+    return float(hg.relays.own_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
 
 
 def _below_state(certificate: RelayCertificate, name: str) -> float:
@@ -269,7 +269,7 @@ def _percent(ratio: float) -> str:
 
 def _circuit(result: Reproduction) -> list[Statement]:
     gap = {h: float(np.max(np.abs(setting.circuit(h) - setting.TRANSITION))) for h in (0.5, 5.0)}
-    other = hg.own_error_design(setting.network(setting.plant(setting.circuit(0.5))), 10).trace("receiver")[10]
+    other = hg.relays.own_error_design(setting.network(setting.plant(setting.circuit(0.5))), 10).trace("receiver")[10]
     radius = float(np.max(np.abs(np.linalg.eigvals(setting.circuit(5.0, second_sign=1.0)))))
     own = float(result.paper.trace("receiver")[10])
     return [

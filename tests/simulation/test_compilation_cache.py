@@ -10,7 +10,7 @@ import heliograph as hg
 
 PROGRAM = """
 import sys, heliograph
-heliograph.keep_compilations(sys.argv[1])
+heliograph.simulation.keep_compilations(sys.argv[1])
 import jax, numpy as np
 heard = []
 jax.monitoring.register_event_listener(lambda name, **_: heard.append(name))
@@ -43,7 +43,7 @@ def test_a_second_process_compiles_nothing(tmp_path):
 
 def test_the_users_own_choice_stays(monkeypatch, tmp_path):
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
-    assert hg.keep_compilations(tmp_path / "other") == tmp_path
+    assert hg.simulation.keep_compilations(tmp_path / "other") == tmp_path
     assert not (tmp_path / "other").exists()
 
 
@@ -51,7 +51,7 @@ def test_a_folder_that_cannot_be_made_is_refused(monkeypatch, tmp_path):
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"folder .*file/inside: expected one that can be made"):
-        hg.keep_compilations(tmp_path / "file" / "inside")
+        hg.simulation.keep_compilations(tmp_path / "file" / "inside")
 
 
 def test_import_is_lazy_and_changes_no_configuration():

@@ -4,8 +4,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine import conditional_moments, moment_interval
-from heliograph.random_affine.interval import CORNERS
+from heliograph.random_affine.base import conditional_moments
+from heliograph.random_affine.interval import CORNERS, moment_interval
 
 GAMMA = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
 XI = hg.Discrete([0.8, 0.9, 1.0], [0.2, 0.3, 0.5], 0.02)
@@ -32,7 +32,7 @@ def test_worst_cases_of_a_relay_are_those_of_brute_force():
     shift = max((g.moment(1) * x.moment(1) - mu) ** 2 for g, x in corners)
     noise = max(c**2 * x.moment(2) * 1e-3 + 1e-3 for _, x in corners)
     power = max(g.moment(2) * x.moment(2) for g, x in corners)
-    found = hg.second_order(relay())
+    found = hg.random_affine.second_order(relay())
     y = np.zeros((3, 3))
     y[0, 0] = 1.0
     assert found.mean_gain[0, 0] == pytest.approx(c * mu, rel=1e-14)
@@ -45,7 +45,7 @@ def test_worst_cases_of_a_relay_are_those_of_brute_force():
 
 
 def test_a_known_channel_has_its_own_second_moments():
-    found = hg.second_order(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)))
+    found = hg.random_affine.second_order(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)))
     assert not found.uncertain and not np.any(found.shift.center)
     y = np.array([0.5, -1.0])
     w = np.append(y, 1.0)
@@ -70,13 +70,13 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
     channel = hg.parallel([hg.amplify_and_forward([hg.hop(law(), 0.1), hg.hop(law(), 0.2)]) for _ in range(components)])
     if direct:
         channel = hg.with_direct_link(channel, hg.hop(law(), 0.1, dimension=components))
-    found = hg.second_order(channel)
+    found = hg.random_affine.second_order(channel)
     a = rng.normal(size=(components + 1, components + 1))
     w = a @ a.T
     corners = [m.extremes() for m in channel.maps]
     for _ in range(4):
-        extreme = hg.Stack([options[rng.integers(len(options))] for options in corners])
-        own = hg.second_order(extreme)
+        extreme = hg.random_affine.Stack([options[rng.integers(len(options))] for options in corners])
+        own = hg.random_affine.second_order(extreme)
         shift = np.concatenate([own.mean_gain - found.mean_gain, (own.offset - found.offset)[:, None]], axis=1)
         moved = shift @ w @ shift.T
         cross = np.concatenate([own.mean_gain, own.offset[:, None]], axis=1)
@@ -91,12 +91,16 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
 
 
 def test_interval_arithmetic_takes_over_beyond_the_corner_limit_and_stays_sound():
-    chain = hg.Series([hg.hop(hg.Discrete([0.5, 1.0, 1.5], [0.2, 0.6, 0.2], 0.05), 0.1) for _ in range(5)])
+    chain = hg.random_affine.Series(
+        [hg.hop(hg.Discrete([0.5, 1.0, 1.5], [0.2, 0.6, 0.2], 0.05), 0.1) for _ in range(5)]
+    )
     assert chain.corner_count() > CORNERS
     low, high = moment_interval(chain, 2)
     rng = np.random.default_rng(0)
     for _ in range(50):
-        one = hg.Series([options[rng.integers(len(options))] for options in (m.extremes() for m in chain.maps)])
+        one = hg.random_affine.Series(
+            [options[rng.integers(len(options))] for options in (m.extremes() for m in chain.maps)]
+        )
         inside = one.moments(2).matrix
         assert np.all(inside >= low - 1e-12) and np.all(inside <= high + 1e-12)
 

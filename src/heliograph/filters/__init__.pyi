@@ -1,0 +1,46 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .base import (
+    corrects as corrects,
+    predicts as predicts,
+)
+from .correction import (
+    Scalars as Scalars,
+)
+from .gaussian import (
+    gaussian_filter as gaussian_filter,
+)
+from .h_infinity import (
+    HInfinityFilter as HInfinityFilter,
+    h_infinity_filter as h_infinity_filter,
+)
+from .innovation import (
+    gaussian_innovation as gaussian_innovation,
+)
+from .polynomial import (
+    PolynomialFilter as PolynomialFilter,
+    memory_filter as memory_filter,
+    scheduled_polynomial_filter as scheduled_polynomial_filter,
+)
+from .prediction import (
+    prediction_of as prediction_of,
+)
+from .scheduled import (
+    LinearSystemFilter as LinearSystemFilter,
+    ScheduledFilter as ScheduledFilter,
+)
+from .sequential import (
+    sequential_filter as sequential_filter,
+)
+from .transform import (
+    AbstractTransform as AbstractTransform,
+    Cubature as Cubature,
+    Linearization as Linearization,
+    PolynomialMoments as PolynomialMoments,
+)
+from .update import (
+    AbstractUpdate as AbstractUpdate,
+    Interval as Interval,
+    Polytope as Polytope,
+    ZeroMean as ZeroMean,
+)

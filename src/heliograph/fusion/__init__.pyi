@@ -1,0 +1,20 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .level import (
+    fused_error_norm as fused_error_norm,
+    fused_level as fused_level,
+    level_weights as level_weights,
+)
+from .quantizer import (
+    AbstractQuantizer as AbstractQuantizer,
+    EscapeQuantizer as EscapeQuantizer,
+    Quantized as Quantized,
+    UniformQuantizer as UniformQuantizer,
+)
+from .rules import (
+    AbstractFusion as AbstractFusion,
+    FixedIntersection as FixedIntersection,
+    InverseCovarianceIntersection as InverseCovarianceIntersection,
+    WeightedFusion as WeightedFusion,
+    fuse as fuse,
+)

@@ -1,0 +1,26 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .certificate import (
+    HInfinityCertificate as HInfinityCertificate,
+    certify_level as certify_level,
+)
+from .closed_form import (
+    known_channel_design as known_channel_design,
+    level_without_measurements as level_without_measurements,
+)
+from .design import (
+    HInfinityDesign as HInfinityDesign,
+    horizon_design as horizon_design,
+    recursive_design as recursive_design,
+    smallest_recursive_level as smallest_recursive_level,
+)
+from .growth_check import (
+    GrowthFinding as GrowthFinding,
+    check_growth as check_growth,
+    check_size as check_size,
+)
+from .system import (
+    Growth as Growth,
+    GrowthSystem as GrowthSystem,
+    growth_system as growth_system,
+)

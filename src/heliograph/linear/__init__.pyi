@@ -1,0 +1,23 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .comparison import (
+    GainOverLinear as GainOverLinear,
+    gain_over_linear as gain_over_linear,
+)
+from .lift import (
+    lifted_system as lifted_system,
+)
+from .recursion import (
+    lmmse as lmmse,
+    true_covariance as true_covariance,
+)
+from .schedule import (
+    Gains as Gains,
+    Schedule as Schedule,
+    load_schedule as load_schedule,
+)
+from .system import (
+    LinearSystem as LinearSystem,
+    Steps as Steps,
+    state_moments as state_moments,
+)

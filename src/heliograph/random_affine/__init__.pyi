@@ -1,0 +1,32 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .atoms import (
+    GainAndNoise as GainAndNoise,
+    known as known,
+)
+from .combine import (
+    Lift as Lift,
+    Mixture as Mixture,
+    Series as Series,
+    Stack as Stack,
+    square as square,
+)
+from .law import (
+    AbstractLaw as AbstractLaw,
+    Constant as Constant,
+    GivenMoments as GivenMoments,
+    bernoulli as bernoulli,
+)
+from .moment_noise import (
+    NoiseMoments as NoiseMoments,
+    recorded_noise as recorded_noise,
+)
+from .noise import (
+    AbstractNoise as AbstractNoise,
+    FiniteSupport as FiniteSupport,
+    Independent as Independent,
+    Shaped as Shaped,
+)
+from .second_moments import (
+    second_order as second_order,
+)

@@ -1,0 +1,25 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .design import (
+    RelayDesign as RelayDesign,
+    given_design as given_design,
+    relay_schedules as relay_schedules,
+)
+from .own_error import (
+    own_error_design as own_error_design,
+)
+from .periodic import (
+    periodic_behind_relays as periodic_behind_relays,
+    periodic_given_design as periodic_given_design,
+    periodic_own_error_design as periodic_own_error_design,
+)
+from .periodic_tuning import (
+    periodic_receiver_error_design as periodic_receiver_error_design,
+    periodic_relays_for_best_receiver as periodic_relays_for_best_receiver,
+)
+from .receiver import (
+    receiver_behind_relays as receiver_behind_relays,
+)
+from .receiver_error import (
+    receiver_error_design as receiver_error_design,
+)

@@ -1,0 +1,18 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .compilation_cache import (
+    keep_compilations as keep_compilations,
+)
+from .over_runs import (
+    over_runs as over_runs,
+)
+from .record import (
+    AbstractReducer as AbstractReducer,
+    Trajectories as Trajectories,
+    Uplink as Uplink,
+)
+from .statistics import (
+    ErrorStatistics as ErrorStatistics,
+    error_statistics as error_statistics,
+    pool as pool,
+)
