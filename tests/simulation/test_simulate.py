@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -235,9 +236,9 @@ class Silent(hg.AbstractFilter):
     """Gives the initial mean and claims nothing."""
 
     claim: str = "none"
-    states: tuple = ("p", "v")
-    inputs: tuple = ("u0",)
-    received: int = 1
+    states: tuple = eqx.field(static=True, default=("p", "v"))
+    inputs: tuple = eqx.field(static=True, default=("u0",))
+    received: int = eqx.field(static=True, default=1)
 
     def init(self):
         return np.zeros(2)
