@@ -1,20 +1,39 @@
-"""Compiled programs are shared by the test processes of one session, in a folder that goes with it."""
+"""What the test processes of one session share and let go: compiled programs, compiled in a hurry and kept on disk."""
 
+import gc
 import os
 import shutil
+import sys
 import tempfile
+
+import pytest
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 
 
 def pytest_configure(config):
-    """The first process makes the folder; workers and the commands that tests start find it in their environment."""
+    """The first process sets the environment; workers and the commands that tests start find it there."""
     if FOLDER not in os.environ:
         os.environ[FOLDER] = config.compilations = tempfile.mkdtemp(prefix="heliograph-tests-")
-        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+        os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"  # most programs run once: compiling is what takes time
 
 
 def pytest_unconfigure(config):
-    """Remove it."""
+    """Remove the folder."""
     if hasattr(config, "compilations"):
         shutil.rmtree(config.compilations, ignore_errors=True)
+
+
+def pytest_collection_finish():
+    """What is imported stays: the collector need not look at it again and again while JAX traces."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def forget_compiled_programs():
+    """A module's programs are hardly ever another's; kept, they would add up to gigabytes."""
+    yield
+    if "jax" in sys.modules:
+        sys.modules["jax"].clear_caches()

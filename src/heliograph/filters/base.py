@@ -29,7 +29,7 @@ class AbstractFilter(eqx.Module):
 
     It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
     what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
-    give the four fields (static ones), `init`, `predict` under `@predicts`, `correct` under `@corrects`, `estimate`.
+    give the four static fields, `init`, `predict` under `@predicts`, `correct` under `@corrects`, and `estimate`.
     """
 
     claim: eqx.AbstractVar[Claim]
