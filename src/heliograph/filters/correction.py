@@ -80,8 +80,7 @@ def young_correction(
     def refine(beta: jax.Array) -> jax.Array:
         weight = gain_weight(omega(beta), power)
         moved = inner(weight, shift)
-        ratios = jnp.stack([moved / trace(prior), moved / inner(weight, mean_part)])
-        return jnp.maximum(jnp.sqrt(jnp.nan_to_num(ratios, posinf=0.0)), SMALLEST_SCALAR)
+        return jnp.stack([root_ratio(moved, trace(prior)), root_ratio(moved, inner(weight, mean_part))])
 
     beta = settle(refine, [0.1, 0.1], trace(power)) if scalars is None else jnp.asarray(scalars.values)
     gain, bound = gain_and_bound(prior, cross, omega(beta))
@@ -107,7 +106,7 @@ def zero_mean_correction(
 
     def refine(beta: jax.Array) -> jax.Array:
         moved = inner(gain_weight(omega(beta[0]), power), shift)
-        return jnp.maximum(jnp.sqrt(moved / trace(explained)), SMALLEST_SCALAR)[None]
+        return root_ratio(moved, trace(explained))[None]
 
     beta = settle(refine, [0.1], trace(power))[0] if scalar is None else jnp.asarray(scalar)
     gain, bound = gain_and_bound(prior, cross, omega(beta))
@@ -119,11 +118,22 @@ def gain_weight(omega: jax.Array, power: jax.Array) -> jax.Array:
     return solve(omega, transpose(solve(omega, power)))
 
 
+def root_ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
+    """sqrt(part / whole), at least SMALLEST_SCALAR, which it is where nothing arrives and both are zero.
+
+    No quotient or root of zero is taken, so that there are derivatives.
+    """
+    some = (part > 0) & (whole > 0)
+    ratio = jnp.where(some, part, 0.0) / jnp.where(some, whole, 1.0)
+    return jnp.sqrt(jnp.maximum(ratio, SMALLEST_SCALAR**2))
+
+
 def settle(refine: Callable[[jax.Array], jax.Array], start: list[float], like: jax.Array) -> jax.Array:
     """Scalars (count, runs) that `refine` leaves as they are, each run's own.
 
     Alternating minimisation creeps, so this is Newton's method on t = log refine(exp t), from one sweep after `start`.
-    Where a step leads astray the sweep itself is taken; a run that has settled is left as it is.
+    Where a step leads astray the sweep itself is taken; a run that has settled is left as it is. The derivative is that
+    of the root, by the implicit function theorem, so that the loop has one in reverse too.
     """
 
     def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
@@ -136,26 +146,29 @@ def settle(refine: Callable[[jax.Array], jax.Array], start: list[float], like: j
     def log_refine(t: jax.Array) -> jax.Array:
         return jnp.log(refine(jnp.exp(t)))
 
+    def search(_: object, t: jax.Array) -> jax.Array:
+        carry = log_refine(t), t, jnp.asarray(1)
+        return jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), sweep, carry)[0]
+
     first = jnp.stack([jnp.full_like(like, np.log(value)) for value in start])
-    carry = log_refine(first), first, jnp.asarray(1)
-    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), sweep, carry)[0]
-    return jnp.exp(t)
+    return jnp.exp(jax.lax.custom_root(lambda t: log_refine(t) - t, first, search, _solved_by_slopes))
 
 
 def _newton(function: Callable[[jax.Array], jax.Array], t: jax.Array) -> jax.Array:
     """t + (I - J)^-1 (f(t) - t) for one or two components."""
-    count = len(t)
-    value = function(t)
-    unit = [jnp.zeros_like(t).at[i].set(1.0) for i in range(count)]
-    slopes = [jax.jvp(function, (t,), (direction,))[1] for direction in unit]
-    rest = value - t
-    if count == 1:
-        step = rest / (1 - slopes[0])
-    else:
-        (a, b), (c, d) = (1 - slopes[0][0], -slopes[1][0]), (-slopes[0][1], 1 - slopes[1][1])
-        step = jnp.stack([d * rest[0] - b * rest[1], a * rest[1] - c * rest[0]]) / (a * d - b * c)
+    rest = function(t) - t
+    step = _solved_by_slopes(lambda v: v - jax.jvp(function, (t,), (v,))[1], rest)
     safe = jnp.all(jnp.abs(step) < LONGEST, axis=0)
     return t + jnp.where(safe, step, rest)
+
+
+def _solved_by_slopes(linear: Callable[[jax.Array], jax.Array], right: jax.Array) -> jax.Array:
+    """x with linear(x) = right for one or two components, each run's own; `linear` is read off at unit vectors."""
+    columns = [linear(jnp.zeros_like(right).at[i].set(1.0)) for i in range(len(right))]
+    if len(right) == 1:
+        return right / columns[0]
+    (a, c), (b, d) = columns
+    return jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
 
 
 def homogeneous(second: jax.Array, mean: jax.Array, one: float) -> jax.Array:
