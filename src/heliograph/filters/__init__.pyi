@@ -2,6 +2,7 @@
 
 from .base import (
     corrects as corrects,
+    in_float64 as in_float64,
     predicts as predicts,
 )
 from .correction import (

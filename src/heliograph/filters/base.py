@@ -12,8 +12,10 @@ import numpy as np
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+__all__ = ["AbstractFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts", "step_number"]
 
 Step = int | np.integer | Int[Array, ""]
 
@@ -29,7 +31,8 @@ class AbstractFilter(eqx.Module):
 
     It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
     what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
-    give the four static fields, `init`, `predict` under `@predicts`, `correct` under `@corrects`, and `estimate`.
+    give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, and `init` and `estimate` under
+    `@in_float64` where they compute anything.
     """
 
     claim: eqx.AbstractVar[Claim]
