@@ -251,7 +251,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
             claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), start)
         if own < len(order):
             shared = shared + _pairs(bounds[-1])[..., 0] * counted.sum()
-        uplinks = jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, batch["uplinks"])
+        sent = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(valid), *x.shape[1:])), batch["uplinks"])
+        uplinks = jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent)
         pairs = _pairs(errors[:, None] * errors[None])
         sums = _dealt(carry.count, counted, start), _dealt(carry.pairs, pairs, start), _dealt(carry.nees, nees, start)
         return Sums(*sums, claimed, shared, uplinks, order, own), ()

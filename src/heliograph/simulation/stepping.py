@@ -21,16 +21,17 @@ from heliograph.simulation.network import FUSED, Network
 class Alike(eqx.Module):
     """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
 
-    `group`: of nodes that they belong to; `count` of filters at each node.
+    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes.
     """
 
     filters: AbstractFilter
     group: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
 
     def init(self) -> PyTree:
         """States before the first step, (filter and node, ...)."""
-        return _each(_initial)(self.filters)
+        return _each(_initial, self.count * self.nodes)(self.filters)
 
     def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Estimate]:
         """One step of each from the nodes' measurements (node, received); estimates (filter, node, ...)."""
@@ -61,7 +62,8 @@ class Fused(eqx.Module):
         """States of the quantizers."""
         if self.quantizers is None:
             return ()
-        return _each(_each(lambda item: at(item, 0).init(n)))(self.quantizers)
+        fusions, nodes = self.order.shape
+        return _each(_each(lambda item: at(item, 0).init(n), nodes), fusions)(self.quantizers)
 
     def step(
         self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
@@ -104,7 +106,12 @@ class AllFilters(eqx.Module):
 
     def __init__(self, network: Network):
         self.alike = tuple(
-            Alike(stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]), g, len(names))
+            Alike(
+                stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
+                g,
+                len(names),
+                len(network.groups[g]),
+            )
             for g, names in network.kinds
         )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
@@ -154,7 +161,9 @@ def plan(filters: AllFilters, u: Any) -> AllFilters:
         return item.planned(u)
 
     alike = tuple(
-        Alike(_each(one)(item.filters), item.group, item.count) if filters.complete[item.group] else item
+        Alike(_each(one, item.count * item.nodes)(item.filters), item.group, item.count, item.nodes)
+        if filters.complete[item.group]
+        else item
         for item in filters.alike
     )
     central = {name: one(item) if all(filters.complete) else item for name, item in filters.central.items()}
@@ -202,9 +211,9 @@ def _initial(item: AbstractFilter) -> PyTree:
     return jax.tree.map(jnp.asarray, item.init())
 
 
-def _each(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-    """A function of one of what is stacked, for all of them."""
-    over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0))
+def _each(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
+    """A function of one of what is stacked, for all of them; some hold no array that would tell how many."""
+    over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
     return over
 
 
