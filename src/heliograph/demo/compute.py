@@ -92,7 +92,7 @@ def networks(extra_variance: float) -> Network:
     node, count = plaza.network.nodes["robot"], len(plaza.BEACONS)
     extra = cubature_filter(plaza.plant, plaza.sensor, hop(1.0, extra_variance, dimension=count))
     direct = cubature_filter(plaza.plant, plaza.sensor, perfect(count))
-    relayed = Node(node.sensor, node.channel, node.filters | {"extra_noise": extra})
+    relayed = Node(plaza.sensor, plaza.channel, node.filters | {"extra_noise": extra})
     return Network(
         plaza.plant, {"robot": relayed, "direct": Node(plaza.sensor, perfect(count), {"perfect_channel": direct})}
     )

@@ -156,7 +156,7 @@ def initial_states(runs: int, seed: int) -> np.ndarray:
     still = hg.LinearPlant(np.eye(3), 0.0, setting.INITIAL_MEAN, setting.INITIAL_COVARIANCE)
     sensor = hg.LinearSensor(setting.SENSING, 0.0)
     found = hg.monte_carlo(hg.Network(still, {"nobody": hg.Node(sensor, hg.perfect(), {})}), 1, runs, seed)
-    return np.asarray(found.truth[:, 0])
+    return np.asarray(found.truth)[:, 0]
 
 
 def simulate(network: hg.RelayNetwork, design: hg.RelayDesign, runs: int, seed: int) -> Simulated:
