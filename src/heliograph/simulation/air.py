@@ -143,13 +143,13 @@ class Slots(AbstractAir):
         kinds: dict[object, list[int]] = {}
         for number, slot in enumerate(self.relays.slots):
             kinds.setdefault(structure(slot), []).append(number)
-        kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)
+        kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)  # of each slot: its branch, and where in it
         for i, numbers in enumerate(kinds.values()):
             kind[numbers], position[numbers] = i, np.arange(len(numbers))
         branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
-        turn = k % len(kind)
+        now = k % len(kind)
         heard: dict[str, jax.Array] = jax.lax.switch(
-            jnp.asarray(kind)[turn], branches, jnp.asarray(position)[turn], k, sent, key
+            jnp.asarray(kind)[now], branches, jnp.asarray(position)[now], k, sent, key
         )
         return heard
 
