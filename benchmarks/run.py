@@ -1,6 +1,7 @@
 """Every benchmark: ours beside its peers, as ratios of one session on one machine, in a table and in results.json.
 
-Run: python benchmarks/run.py [--without-peers]; the latter for machines without a network.
+Run: python benchmarks/run.py [--without-peers] [--old SRC]; the former for machines without a network, the latter
+measures another release beside ours (benchmarks/nodes.py).
 
 Peers and ours are programs (benchmarks/peers) that read one file of data. Their estimates are compared first; then
 each is asked for one pass in turn, ROUNDS times, and the least time of each counts. Nobody's threads are restricted,
@@ -33,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results.json"
 ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
-ALONE = ("nodes", "startup", "h_infinity", "quadratic", "successive_relays", "cubature_fusion")
+ALONE = ("startup", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion")
 
 
 class Program(NamedTuple):
@@ -152,9 +153,9 @@ def judged(peer: Program, its: Running, ours: Running) -> dict[str, Any]:
     return {**result, "difference": gap, "ratio": ratio, "target": peer.target, "met": met}
 
 
-def alone(name: str) -> dict[str, Any]:
+def alone(name: str, old: str | None) -> dict[str, Any]:
     """A benchmark without peers, in a process of its own: two of them restrict threads before anything is loaded."""
-    code = f"import json, {name}; print(json.dumps({name}.measure()))"
+    code = f"import json, {name}; print(json.dumps({name}.measure({repr(old) if name == 'nodes' else ''})))"
     found = subprocess.run([sys.executable, "-c", code], cwd=HERE, stdout=subprocess.PIPE, text=True, check=True)
     measured = json.loads(found.stdout.splitlines()[-1])
     measured["values"] = {key: float(f"{value:.4g}") for key, value in measured["values"].items()}
@@ -193,7 +194,9 @@ def word(met: bool | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Run every benchmark and write benchmarks/results.json.")
     parser.add_argument("--without-peers", action="store_true", help="leave out what needs a peer's environment")
-    with_peers = not parser.parse_args().without_peers
+    parser.add_argument("--old", help="the src folder of another release, measured beside ours by number of nodes")
+    chosen = parser.parse_args()
+    with_peers = not chosen.without_peers
     load, rates = os.getloadavg()[0], machine.describe()
     print(f"{rates['cpu']}, {rates['cores']} cores, {rates['gflops']} Gflop/s, {rates['gbytes']} GB/s; load {load:.1f}")
     comparisons, others = {}, {}
@@ -201,7 +204,7 @@ def main() -> None:
         comparisons[name] = compare(item, rates, with_peers)
         show_comparison(comparisons[name])
     for name in ALONE:
-        others[name] = alone(name)
+        others[name] = alone(name, chosen.old)
         show_alone(name, others[name])
     found = {
         "date": datetime.now(UTC).date().isoformat(), "load": round(load, 2), "machine": rates,
