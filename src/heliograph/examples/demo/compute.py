@@ -88,17 +88,10 @@ def average_noise(path: AbstractRandomAffine, signals: np.ndarray) -> float:
 
 def networks(extra_variance: float) -> Network:
     """The example's node with one more competitor, and a node that hears the ranges without any relay."""
-<<<<<<< HEAD:src/heliograph/examples/demo/compute.py
     count = len(robot.BEACONS)
     extra = cubature_filter(robot.plant, robot.sensor, hop(1.0, extra_variance, dimension=count))
     direct = cubature_filter(robot.plant, robot.sensor, perfect(count))
     relayed = Node(robot.sensor, robot.channel, robot.filters | {"extra_noise": extra})
-=======
-    node, count = plaza.network.nodes["robot"], len(plaza.BEACONS)
-    extra = cubature_filter(plaza.plant, plaza.sensor, hop(1.0, extra_variance, dimension=count))
-    direct = cubature_filter(plaza.plant, plaza.sensor, perfect(count))
-    relayed = Node(plaza.sensor, plaza.channel, node.filters | {"extra_noise": extra})
->>>>>>> hC:src/heliograph/demo/compute.py
     return Network(
         robot.plant, {"robot": relayed, "direct": Node(robot.sensor, perfect(count), {"perfect_channel": direct})}
     )
