@@ -31,7 +31,7 @@ class AbstractFilter(eqx.Module):
 
     It knows the names of the `states` it estimates, the names of the `inputs` it takes, and the length `received` of
     what it hears; 0 if it never listens, and then z may have any length. Anything else is refused. To write one:
-    give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, and `init` and `estimate` under
+    give the four static fields, `predict` under `@predicts`, `correct` under `@corrects`, `init` and `estimate` under
     `@in_float64` where they compute anything.
     """
 

@@ -151,7 +151,8 @@ def settle(refine: Callable[[jax.Array], jax.Array], start: list[float], like: j
         return jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), sweep, carry)[0]
 
     first = jnp.stack([jnp.full_like(like, np.log(value)) for value in start])
-    return jnp.exp(jax.lax.custom_root(lambda t: log_refine(t) - t, first, search, _solved_by_slopes))
+    root: jax.Array = jax.lax.custom_root(lambda t: log_refine(t) - t, first, search, _solved_by_slopes)
+    return jnp.exp(root)
 
 
 def _newton(function: Callable[[jax.Array], jax.Array], t: jax.Array) -> jax.Array:
