@@ -167,9 +167,9 @@ def _solved_by_slopes(linear: Callable[[jax.Array], jax.Array], right: jax.Array
     """x with linear(x) = right for one or two components, each run's own; `linear` is read off at unit vectors."""
     columns = [linear(jnp.zeros_like(right).at[i].set(1.0)) for i in range(len(right))]
     if len(right) == 1:
-        return right / columns[0]
+        return jnp.asarray(right / columns[0])
     (a, c), (b, d) = columns
-    return jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c)
+    return jnp.asarray(jnp.stack([d * right[0] - b * right[1], a * right[1] - c * right[0]]) / (a * d - b * c))
 
 
 def homogeneous(second: jax.Array, mean: jax.Array, one: float) -> jax.Array:
