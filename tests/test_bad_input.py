@@ -42,13 +42,18 @@ def network() -> h.Network:
     return h.Network(plant(), {"a": node()})
 
 
+def pushed() -> h.Network:
+    filters = {"aware": h.cubature_filter(driven(), sensor(), h.perfect())}
+    return h.Network(driven(), {"a": h.Node(sensor(), h.perfect(), filters)})
+
+
 def lasting(steps: int) -> h.Network:
     channel = h.over_time([h.hop(0.5 + k, 0.1) for k in range(steps)])
     return h.Network(plant(), {"a": h.Node(sensor(), channel, {})})
 
 
-def one_per_step(*lengths: int) -> h.OverTime:
-    return h.OverTime({str(i): np.zeros(n) for i, n in enumerate(lengths)})
+def one_per_step(*lengths: int) -> h.model.OverTime:
+    return h.model.OverTime({str(i): np.zeros(n) for i, n in enumerate(lengths)})
 
 
 SHAPES = [
@@ -75,7 +80,7 @@ SHAPES = [
     (lambda: h.cubature_filter(plant(), sensor(), h.perfect(), initial_mean=[0]), "filter's initial mean", "(1,)"),
     (lambda: h.amplify_and_forward([h.perfect(1), h.perfect(2)]), "series", "takes 2"),
     (lambda: h.with_direct_link(h.perfect(1), h.perfect(2)), "stack", "[1, 2]"),
-    (lambda: h.Mixture([h.perfect(1), h.perfect(2)], [0.5, 0.5]), "mixture", "[(1, 1), (2, 2)]"),
+    (lambda: h.random_affine.Mixture([h.perfect(1), h.perfect(2)], [0.5, 0.5]), "mixture", "[(1, 1), (2, 2)]"),
     (lambda: h.hop(1.0, np.ones((2, 3))), "hop noise", "shape (2, 3)"),
     (lambda: h.Discrete([[1.0]], [1.0]), "gain values", "shape (1, 1)"),
     (lambda: h.Discrete([1.0, 2.0], [1.0]), "gain probabilities", "shape (1,)"),
@@ -90,10 +95,10 @@ PROBABILITIES = [
     (lambda: h.Discrete([1, 2], [0.5, 0.5], -0.1), "probability radius", "-0.1"),
     (lambda: h.Discrete([1, 2], [0.5, 0.5], 0.6), "probability radius", "0.6"),
     (lambda: h.Discrete([1, 2], [0.5, 0.5], [0.1, 0.1, 0.1]), "probability radius", "shape (3,)"),
-    (lambda: h.bernoulli(1.2), "probability that a link works", "1.2"),
+    (lambda: h.random_affine.bernoulli(1.2), "probability that a link works", "1.2"),
     (lambda: h.dropout(h.perfect(), -0.2), "arrival probability", "-0.2"),
-    (lambda: h.Mixture([h.perfect(), h.silent()], [0.7, 0.7]), "gain probabilities", "sum 1.4"),
-    (lambda: h.FiniteSupport([[1.0], [2.0]], [0.7, 0.7]), "noise probabilities", "sum 1.4"),
+    (lambda: h.random_affine.Mixture([h.perfect(), h.model.silent()], [0.7, 0.7]), "gain probabilities", "sum 1.4"),
+    (lambda: h.random_affine.FiniteSupport([[1.0], [2.0]], [0.7, 0.7]), "noise probabilities", "sum 1.4"),
 ]
 
 COVARIANCES = [
@@ -105,11 +110,11 @@ COVARIANCES = [
     (lambda: h.LinearSensor([[1.0, 0.0]], -1.0), "sensor noise", "eigenvalue -1"),
     (lambda: h.hop(1.0, INDEFINITE), "hop noise", "eigenvalue -1"),
     (lambda: h.hop(1.0, -0.5), "hop noise", "eigenvalue -0.5"),
-    (lambda: h.silent(2, noise=SKEWED), "noise of a silent channel", "differ by 0.1"),
+    (lambda: h.model.silent(2, noise=SKEWED), "noise of a silent channel", "differ by 0.1"),
     (lambda: h.Gaussian(INDEFINITE), "noise covariance", "eigenvalue -1"),
     (lambda: h.cubature_filter(plant(), sensor(), h.perfect(), initial_covariance=INDEFINITE),
      "filter's initial covariance", "eigenvalue -1"),
-    (lambda: h.GivenMoments([1.0, 0.5]), "gain moments", "which none has"),
+    (lambda: h.random_affine.GivenMoments([1.0, 0.5]), "gain moments", "which none has"),
 ]  # fmt: skip
 
 NUMBERS = [
@@ -132,9 +137,9 @@ NUMBERS = [
     (lambda: h.Rician(1.0, 0.0), "Rician scale", "got 0"),
     (lambda: h.Nakagami(0.4), "Nakagami shape", "0.4"),
     (lambda: h.LogNormal(0.0, -1.0), "log-normal deviation", "-1"),
-    (lambda: h.GivenMoments([NAN]), "gain moments", "1 that are not finite"),
-    (lambda: h.ZeroMean(-1.0), "scalar of the bound", "-1"),
-    (lambda: h.Scalars(0.0, 1.0), "scalars of the bound", "(0.0, 1.0)"),
+    (lambda: h.random_affine.GivenMoments([NAN]), "gain moments", "1 that are not finite"),
+    (lambda: h.filters.ZeroMean(-1.0), "scalar of the bound", "-1"),
+    (lambda: h.filters.Scalars(0.0, 1.0), "scalars of the bound", "(0.0, 1.0)"),
 ]
 
 KINDS = [
@@ -144,16 +149,16 @@ KINDS = [
     (lambda: h.hop(1.0, [0.1, 0.1]), "hop noise", "shape (2,)"),
     (lambda: h.hop(1.0, h.Discrete([1.0, 2.0], [0.5, 0.5])), "hop noise", "Discrete"),
     (lambda: h.hop(h.perfect(), 0.1), "constant gain", "GainAndNoise"),
-    (lambda: h.GainAndNoise(3, EYE, 0.1), "gain of a hop", "3"),
+    (lambda: h.random_affine.GainAndNoise(3, EYE, 0.1), "gain of a hop", "3"),
     (lambda: h.amplify_and_forward([3]), "series", "3"),
     (lambda: h.with_direct_link(3, h.perfect()), "stack", "3"),
     (lambda: h.parallel([3]), "parallel channels", "3"),
     (lambda: h.dropout(3, 0.5), "dropout", "3"),
     (lambda: h.erasure(3, 0.5), "erasure", "3"),
     (lambda: h.perfect(2.0), "dimension", "2.0"),
-    (lambda: h.silent(0), "outputs of a silent channel", "0"),
-    (lambda: h.Lift(h.perfect(), 2.0), "degree of the lift", "2.0"),
-    (lambda: h.Independent([3]), "independent noises", "3"),
+    (lambda: h.model.silent(0), "outputs of a silent channel", "0"),
+    (lambda: h.random_affine.Lift(h.perfect(), 2.0), "degree of the lift", "2.0"),
+    (lambda: h.random_affine.Independent([3]), "independent noises", "3"),
     (lambda: h.LinearPlant(EYE * 1j, EYE, [0, 0], EYE), "plant matrix", "complex"),
     (lambda: h.LinearPlant(EYE, EYE * 1j, [0, 0], EYE), "process noise", "complex"),
     (lambda: h.LinearPlant(EYE, "1", [0, 0], EYE), "process noise", "'1'"),
@@ -180,8 +185,8 @@ RUNS = [
     (lambda: h.run(network(), {"a": [1.0, INF]}), "measurements of node 'a'", "infinite"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0, 0.5]), "time", "0.5 after 1"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0]), "time", "shape (1,)"),
-    (lambda: h.run(h.Network(driven(), {"a": node()}), {"a": [1.0]}), "inputs", "none"),
-    (lambda: h.run(h.Network(driven(), {"a": node()}), {"a": [1.0]}, [[NAN]]), "inputs", "not finite"),
+    (lambda: h.run(pushed(), {"a": [1.0]}), "inputs", "none"),
+    (lambda: h.run(pushed(), {"a": [1.0]}, [[NAN]]), "inputs", "not finite"),
     (lambda: h.run(lasting(2), {"a": [1.0, 2.0, 3.0]}), "horizon", "got 3"),
     (lambda: h.monte_carlo(lasting(2), 3, 1, 0), "horizon", "got 3"),
     (lambda: h.monte_carlo(network(), 0, 1, 0), "horizon", "got 0"),
@@ -218,7 +223,7 @@ class Losing(h.AbstractFilter):
         return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
 
     def correct(self, state, z, k=0):
-        return state, h.Innovation(z, jnp.eye(1), 0.0)
+        return state, h.model.Innovation(z, jnp.eye(1), 0.0)
 
     def estimate(self, state):
         return h.Estimate(0 * state, jnp.diag(state), self.claim)

@@ -50,7 +50,7 @@ class Losing(h.AbstractFilter):
         return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
 
     def correct(self, state, z, k=0):
-        return state, h.Innovation(z, jnp.eye(1), 0.0)
+        return state, h.model.Innovation(z, jnp.eye(1), 0.0)
 
     def estimate(self, state):
         return h.Estimate(0 * state, jnp.diag(state), self.claim)

@@ -78,7 +78,7 @@ def test_a_setting_that_cannot_be_built(tmp_path, expected, trouble):
     trouble.write_text("raise")
     result = run_campaign(campaign, out, workers=0)
     assert [(f.setting, f.chunk, f.runs) for f in result.failures] == [(2, None, (0, 99)), (3, None, (0, 99))]
-    assert "RuntimeError in line 31: no such gain" in result.failures[0].error
+    assert "RuntimeError in line 40: no such gain" in result.failures[0].error
     assert result.computed == len(chunk_files(out)) == CHUNKS - 4
     assert [score.setting for score in read_summary(out / "summary.csv")] == [0, 1, 4, 5]
     assert run_campaign(campaign, out, workers=0, only=[(0, 0)]).already == 1

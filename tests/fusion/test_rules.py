@@ -248,7 +248,7 @@ def test_a_claim_through_a_quantizer():
             lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("linear", hg.fusion.FixedIntersection([1.0]))}),
             r"shape \(3\)",
         ),
-        (lambda: hg.filters.sequential_filter([]), "one state dimension"),
+        (lambda: hg.filters.sequential_filter([]), "filters of as many states and inputs each, got"),
         (lambda: hg.fusion.WeightedFusion([0.5, 0.6]), "sum to 1"),
         (lambda: hg.fusion.fuse(hg.fusion.WeightedFusion([0.5, 0.5]), estimates(covariances(0, 3, 2))), r"shape \(3\)"),
         (lambda: quantized({"a": QUANTIZER}), r"quantizers: expected one for each node of \['a', 'b', 'c'\]"),

@@ -158,7 +158,7 @@ class Staying(hop(1.0, 0.1).__class__):
 
 def staying(noise):
     plain = hop(1.0, noise)
-    return Staying(plain.gain, plain.matrix, plain.noise)
+    return Staying(plain.law, plain.matrix, plain.noise)
 
 
 def test_hops_that_remember_keep_their_state():

@@ -64,7 +64,9 @@ def check_moments(moments: np.ndarray) -> None:
     """
     sequence = np.concatenate([[1.0], moments])
     scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
-    m = sequence / scale ** np.arange(len(sequence))  # unit second moment, so that one tolerance serves all orders
+    size = scale ** np.arange(len(sequence))
+    in_range = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
+    m = sequence[in_range] / size[in_range]  # unit second moment, so that one tolerance serves all orders
     for j in range(1, len(m) // 2 + 1):
         hankel = np.array([[m[a + b] for b in range(j)] for a in range(j)])
         known = np.array([m[a + j] for a in range(j) if a + j < len(m)])

@@ -16,6 +16,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 import heliograph as hg
+from heliograph.filters.prediction import Ahead
 
 SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken
 FIRST = (1.0, 1.0, 0.1, 1e-3)  # sizes of x_0, e_0, v, rho where a climb starts; where it ends they are what they are
@@ -146,9 +147,17 @@ def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Dis
             missed = world.wanted @ (x - estimate.mean)
             return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
 
-        begin = jax.tree.map(jnp.asarray, filter.init())._replace(mean=w.state - w.error)
+        begin = _from(filter, w.state - w.error)
         items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
         return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
 
     result: jax.Array = jax.vmap(one)(jnp.asarray(draws.gain), jnp.asarray(draws.noise))
     return result
+
+
+def _from(filter: hg.AbstractFilter, mean: jax.Array) -> PyTree:
+    """The state of a filter that starts from another initial mean."""
+    state = jax.tree.map(jnp.asarray, filter.init())
+    if isinstance(state, Ahead):
+        return state._replace(belief=state.belief._replace(mean=mean))
+    return state._replace(mean=mean)
