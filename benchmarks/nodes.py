@@ -1,8 +1,8 @@
 """What a number of nodes costs: the first call, which compiles, and each node, step and run of many.
 
-Run: python benchmarks/nodes.py [--quick] [PYTHON]; with the PYTHON of another environment, its release is
-measured. Linear plant of 4 states, 2 outputs behind two Rayleigh hops, the linear filter, running statistics. Each first
-call is 64 runs of 50 steps in a process of its own: cold, and again with the programs that the cold one kept.
+Run: python benchmarks/nodes.py [--quick] [PYTHON]; with the PYTHON of another environment, its release is measured.
+Linear plant of 4 states, 2 outputs behind two Rayleigh hops, the linear filter, running statistics. Each first call is
+64 runs of 50 steps in a process of its own: cold, and again with the programs that the cold one kept.
 """
 
 import json
