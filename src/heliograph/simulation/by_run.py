@@ -47,7 +47,8 @@ def trajectories(
 
         return jax.lax.scan(scanned, carry, (rows, draw(keys, *rows)))
 
-    parts = -(-steps * len(keys) * sum(v.aval.size * v.aval.dtype.itemsize for v in drawn) // AHEAD)
+    avals: list[Any] = [v.aval for v in drawn]
+    parts = -(-steps * len(keys) * sum(a.size * a.dtype.itemsize for a in avals) // AHEAD)
     width = -(-steps // min(max(parts, 1), steps))
     dealt = [_dealt(leaf, width) for leaf in jax.tree.leaves(rows)]
     begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
