@@ -1,12 +1,18 @@
-"""Runs side by side, each number once: what does not depend on the run has no axis of runs."""
+"""Runs side by side, each number once: what all runs share has no axis of runs, what no past changes is drawn ahead.
+
+Both are found in the traced step: a result that does not depend on the key is common to all runs, and one that does
+not depend on what is carried is drawn for many steps at once, since a step's random numbers alone are mostly waiting.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
 from jaxtyping import PyTree
+
+AHEAD = 2**18  # bytes drawn ahead: more than fills the processor between two steps, less than its cache
 
 
 def trajectories(
@@ -17,36 +23,79 @@ def trajectories(
     The runs are the last axis of everything on the way: a processor works through them without a jump.
     """
     start, varies, tree = _start(init, keys)
-    example = jax.tree.map(lambda leaf: leaf[0], rows)
+    example, steps = jax.tree.map(lambda leaf: leaf[0], rows), len(jax.tree.leaves(rows)[0])
     one = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
     body, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
     )(one, keys[0], example)
-    told = jax.tree.structure(shape[1])
-    rest = [False] * len(jax.tree.leaves(example))
-    varies = _settled(lambda marks: dependent(body, [*marks, True, *rest])[: len(one)], varies)
-    tells = dependent(body, [*varies, True, *rest])[len(one) :]
+    row_axes: list[int | None] = [None] * len(jax.tree.leaves(example))
+    known = [False] * len(row_axes)
+    spread = _settled(lambda marks: _dependent(body, [*marks, True, *known])[: len(one)], varies)
+    tells = _dependent(body, [*spread, True, *known])[len(one) :]
+    ahead, rest, drawn = _split(body, len(one))
+    draw = jax.vmap(jaxpr_as_fun(ahead), in_axes=[0, *row_axes], out_axes=-1)
+    draw = jax.vmap(draw, in_axes=[None, *[0] * len(row_axes)])
+    out_axes = _axes([*spread, *tells])
     advance = jax.vmap(
-        jaxpr_as_fun(body), in_axes=[*_axes(varies), 0, *_axes(rest)], out_axes=_axes([*varies, *tells])
-    )  # fmt: skip
-
-    def scanned(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
-        results = advance(*carry, keys, *jax.tree.leaves(row))
-        return results[: len(one)], results[len(one) :]
-
-    begin = [_spread(leaf, len(keys)) if v and leaf.ndim == s.ndim else leaf
-             for leaf, s, v in zip(start, one, varies, strict=True)]  # fmt: skip
-    kept = jax.lax.scan(scanned, begin, rows)[1]
-    return jax.tree.unflatten(
-        told, [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(kept, tells, strict=True)]
+        jaxpr_as_fun(rest), in_axes=[*_axes(spread), 0, *row_axes, *[-1] * len(drawn)], out_axes=out_axes
     )
+
+    def several(carry: list[jax.Array], rows: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
+        def scanned(carry: list[jax.Array], item: Any) -> tuple[list[jax.Array], list[jax.Array]]:
+            results = advance(*carry, keys, *item[0], *item[1])
+            return results[: len(one)], results[len(one) :]
+
+        return jax.lax.scan(scanned, carry, (rows, draw(keys, *rows)))
+
+    avals: list[Any] = [v.aval for v in drawn]
+    parts = -(-steps * len(keys) * sum(a.size * a.dtype.itemsize for a in avals) // AHEAD)
+    width = -(-steps // min(max(parts, 1), steps))
+    dealt = [_dealt(leaf, width) for leaf in jax.tree.leaves(rows)]
+    begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
+             for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
+    kept = [
+        leaf.reshape(leaf.shape[0] * width, *leaf.shape[2:])[:steps] for leaf in jax.lax.scan(several, begin, dealt)[1]
+    ]
+    told = [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(kept, tells, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(shape[1]), told)
 
 
 def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], Any]:
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
-    varies = dependent(traced, [True])
+    varies = _dependent(traced, [True])
     start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)
     return start, varies, jax.tree.structure(shape)
+
+
+def _split(program: ClosedJaxpr, carried: int) -> tuple[ClosedJaxpr, ClosedJaxpr, list[Var]]:
+    """A step (carry, key, row) as what is drawn, without the carry, and the rest, which is given what was drawn too."""
+    whole = program.jaxpr
+    by_carry = _marked(program, [True] * carried + [False] * (len(whole.invars) - carried))
+    by_key = _marked(program, [i == carried for i in range(len(whole.invars))])
+    early = [e for e in whole.eqns if not any(v in by_carry for v in e.outvars)]
+    late = [e for e in whole.eqns if any(v in by_carry for v in e.outvars) or not any(v in by_key for v in e.outvars)]
+    made = {v for e in early for v in e.outvars} & by_key
+    used = [v for e in late for v in e.invars] + whole.outvars
+    drawn = list(dict.fromkeys(v for v in used if not isinstance(v, Literal) and v in made))
+    unnamed = whole.debug_info.with_unknown_names()
+    ahead = whole.replace(eqns=early, invars=whole.invars[carried:], outvars=drawn, debug_info=unnamed)
+    rest = whole.replace(eqns=late, invars=[*whole.invars, *drawn], debug_info=unnamed)
+    return ClosedJaxpr(ahead, program.consts), ClosedJaxpr(rest, program.consts), drawn
+
+
+def _marked(program: ClosedJaxpr, inputs: Sequence[bool]) -> set[Var]:
+    """What depends on the marked inputs; each operation is taken to use all that it is given."""
+    marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
+    for operation in program.jaxpr.eqns:
+        if any(v in marked for v in operation.invars if not isinstance(v, Literal)):
+            marked.update(operation.outvars)
+    return marked
+
+
+def _dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
+    """Which results depend on the marked inputs."""
+    marked = _marked(program, inputs)
+    return [not isinstance(v, Literal) and v in marked for v in program.jaxpr.outvars]
 
 
 def _settled(following: Callable[[list[bool]], list[bool]], marks: list[bool]) -> list[bool]:
@@ -55,22 +104,16 @@ def _settled(following: Callable[[list[bool]], list[bool]], marks: list[bool]) -
     return marks if more == marks else _settled(following, more)
 
 
-def dependent(program: ClosedJaxpr, inputs: Sequence[bool]) -> list[bool]:
-    """Which results depend on the inputs that are marked; each operation is taken to use all that it is given."""
-    marked = {v for v, mark in zip(program.jaxpr.invars, inputs, strict=True) if mark}
-
-    def depends(v: Any) -> bool:
-        return not isinstance(v, Literal) and v in marked
-
-    for operation in program.jaxpr.eqns:
-        if any(depends(v) for v in operation.invars):
-            marked.update(operation.outvars)
-    return [depends(v) for v in program.jaxpr.outvars]
-
-
 def _axes(varies: Sequence[bool]) -> list[int | None]:
     return [-1 if v else None for v in varies]
 
 
-def _spread(leaf: jax.Array, runs: int) -> jax.Array:
+def _dealt(leaf: jax.Array, width: int) -> jax.Array:
+    """Rows (time, ...) as (part, width, ...), filled up with the last one, whose results are cut off."""
+    missing = -len(leaf) % width
+    whole = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)])
+    return whole.reshape(len(whole) // width, width, *leaf.shape[1:])
+
+
+def _with_runs(leaf: jax.Array, runs: int) -> jax.Array:
     return jnp.broadcast_to(leaf[..., None], (*leaf.shape, runs))

@@ -1,0 +1,137 @@
+"""What all runs share is computed once, and what is drawn ahead are the same draws."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.files.recording import recording_of
+from heliograph.relays.design import relay_schedules
+from heliograph.relays.own_error import own_error_design
+from heliograph.simulation import by_run
+from heliograph.simulation.by_run import trajectories
+from tests.relays.relay_problems import example
+
+STEPS = 7
+ROWS = (np.arange(STEPS), np.zeros((STEPS, 0)))
+
+
+def init(key):
+    return jax.random.normal(key), jnp.zeros(()), jnp.ones(())
+
+
+def step(carry, key, row):
+    """A walk, a number of its own that no run changes, and one that a run changes from the second step on."""
+    x, shared, later = carry
+    noise = jax.random.normal(jax.random.fold_in(key, row[0]))
+    after = x + noise, shared + 1.0, later * shared + 0 * later + x
+    return after, {"walk": after[0], "shared": after[1], "later": after[2], "noise": noise}
+
+
+def one_run(key):
+    carry, kept = init(key), []
+    for k in range(STEPS):
+        carry, told = step(carry, key, (k, np.zeros(0)))
+        kept.append(told)
+    return {name: np.array([t[name] for t in kept]) for name in kept[0]}
+
+
+@pytest.mark.parametrize("ahead", [1, 1000, 2**18])
+def test_every_run_is_the_one_that_a_loop_makes(monkeypatch, ahead):
+    monkeypatch.setattr(by_run, "AHEAD", ahead)
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(3), 5)
+        found = trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
+        assert found["shared"].shape == (1, STEPS)
+        assert all(found[name].shape == (5, STEPS) for name in ("walk", "later", "noise"))
+        for run, key in enumerate(keys):
+            for name, expected in one_run(key).items():
+                got = found[name][0 if name == "shared" else run]
+                np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-14)
+
+
+class Planned(hg.AbstractFilter):
+    """An average with a fixed gain; its plan looks the claimed covariance up by the step."""
+
+    variances: np.ndarray
+    shift: np.ndarray
+    claim: str = "nominal"
+
+    def init(self):
+        return np.zeros(1), np.ones((1, 1))
+
+    def step(self, state, z, u=(), k=0):
+        present = ~jnp.isnan(z)
+        mean = state[0] + 0.5 * jnp.where(present, z - state[0], 0.0) + self.shift
+        spread = jnp.where(present[0], 0.25 * state[1], state[1]) + 0.1
+        return (mean, spread), hg.Estimate(mean, spread, "nominal")
+
+    def planned(self, inputs):
+        spread, found = jnp.ones((1, 1)), []
+        for _ in range(len(inputs)):
+            spread = 0.25 * spread + 0.1
+            found.append(spread)
+        return _Plan(jnp.stack(found), self.shift)
+
+
+class _Plan(hg.AbstractFilter):
+    variances: np.ndarray
+    shift: np.ndarray
+    claim: str = "nominal"
+
+    def init(self):
+        return np.zeros(1)
+
+    def step(self, state, z, u=(), k=0):
+        mean = state + 0.5 * (z - state) + self.shift
+        return mean, hg.Estimate(mean, self.variances[k], "nominal")
+
+
+def world(channel, shift):
+    plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
+    sensor = hg.LinearSensor([[1.0]], 0.1)
+    nodes = {
+        name: hg.Node(sensor, channel, {"f": Planned(np.zeros(1), np.array([s]))})
+        for name, s in zip("ab", shift, strict=True)
+    }
+    return hg.Network(plant, nodes)
+
+
+def test_planned_filters_tell_what_they_would_without_a_plan():
+    """Step by step without a plan; a channel that erases takes no plan."""
+    shift = 0.0, 0.3
+    plain = hg.hop(1.0, 0.1)
+    network = world(plain, shift)
+    record = hg.monte_carlo(network, 6, 40, 4)
+    with jax.enable_x64(True):
+        for node in "ab":
+            item, found = network.nodes[node].filters["f"], record.estimates[node]["f"]
+            for run in (0, 39):
+                state = item.init()
+                for k, z in enumerate(record.measurements[node][run]):
+                    state, estimate = item.step(state, z, (), k)
+                    np.testing.assert_allclose(found.mean[run, k], estimate.mean, rtol=1e-12, atol=1e-13)
+                    np.testing.assert_allclose(found.covariance[run, k], estimate.covariance, rtol=1e-12)
+    lost = hg.monte_carlo(world(hg.erasure(plain, 0.5), shift), 6, 40, 4)
+    assert np.isnan(lost.measurements["a"]).any() and lost.failures() == []
+    sums = hg.monte_carlo(network, 6, 40, 4, hg.Statistics())["b"]["f"]
+    kept = hg.error_statistics(record, "b", "f")
+    for name in ("outer", "covariance", "nees", "count"):
+        np.testing.assert_allclose(getattr(sums, name), getattr(kept, name), rtol=1e-10, atol=1e-12)
+
+
+def test_columns_of_what_relays_heard_may_be_left_out():
+    net = example()
+    schedules = relay_schedules(net, own_error_design(net, 4))
+    receivers = {"own": hg.ScheduledFilter(schedules.pop("receiver"))}
+    network = hg.Network.of_relays(net, schedules, receivers)
+    z = np.linspace(0.1, 0.4, 4)
+    columns = {"time": np.arange(4.0), "receiver.y0": z}
+    assert list(recording_of(columns, network).measurements) == ["receiver"]
+    both = recording_of(columns | {"relay_1.y0": z}, network)
+    assert sorted(both.measurements) == ["receiver", "relay_1"]
+    record = hg.run(network, *both)
+    assert sorted(record.estimates) == ["receiver", "relay_1"] and record.time[-1] == 3.0
+    with pytest.raises(ValueError, match=r"one column 'receiver.y0'"):
+        recording_of({"time": np.arange(4.0), "relay_1.y0": z}, network)
