@@ -109,10 +109,11 @@ class Network(eqx.Module):
         _check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
+        states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
             _check_type(f"node {name!r}", node, Node if relays is None else Listener)
             for filter_, one in node.filters.items():
-                self._check_sizes(f"filter {filter_!r} of node {name!r}", one)
+                _check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -134,12 +135,7 @@ class Network(eqx.Module):
             else:
                 _check_type(f"fused {name!r}", item, AbstractFilter)
                 _check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
-                self._check_sizes(f"fused {name!r}", item)
-
-    def _check_sizes(self, name: str, item: AbstractFilter) -> None:
-        for what, own, theirs in (("states", self.states, item.states), ("inputs", self.inputs, item.inputs)):
-            if len(own) != len(theirs):
-                raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
+                _check_sizes(f"fused {name!r}", item, states, inputs)
 
     @staticmethod
     def of_relays(
@@ -234,6 +230,12 @@ class Network(eqx.Module):
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
         check_horizon(horizon, steps_covered(self))
+
+
+def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+    for what, own, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
+        if len(own) != len(theirs):
+            raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
 
 
 def _check_received(name: str, item: AbstractFilter, received: int) -> None:

@@ -147,7 +147,7 @@ def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Dis
             missed = world.wanted @ (x - estimate.mean)
             return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
 
-        begin = _from(filter, w.state - w.error)
+        begin = _from(filter, jnp.asarray(w.state - w.error))
         items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
         return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
 
