@@ -51,58 +51,19 @@ def test_every_run_is_the_one_that_a_loop_makes(monkeypatch, ahead):
                 np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-14)
 
 
-class Planned(hg.AbstractFilter):
-    """An average with a fixed gain; its plan looks the claimed covariance up by the step."""
-
-    variances: np.ndarray
-    shift: np.ndarray
-    claim: str = "nominal"
-
-    def init(self):
-        return np.zeros(1), np.ones((1, 1))
-
-    def step(self, state, z, u=(), k=0):
-        present = ~jnp.isnan(z)
-        mean = state[0] + 0.5 * jnp.where(present, z - state[0], 0.0) + self.shift
-        spread = jnp.where(present[0], 0.25 * state[1], state[1]) + 0.1
-        return (mean, spread), hg.Estimate(mean, spread, "nominal")
-
-    def planned(self, inputs):
-        spread, found = jnp.ones((1, 1)), []
-        for _ in range(len(inputs)):
-            spread = 0.25 * spread + 0.1
-            found.append(spread)
-        return _Plan(jnp.stack(found), self.shift)
-
-
-class _Plan(hg.AbstractFilter):
-    variances: np.ndarray
-    shift: np.ndarray
-    claim: str = "nominal"
-
-    def init(self):
-        return np.zeros(1)
-
-    def step(self, state, z, u=(), k=0):
-        mean = state + 0.5 * (z - state) + self.shift
-        return mean, hg.Estimate(mean, self.variances[k], "nominal")
-
-
-def world(channel, shift):
+def world(channel, plain, gains):
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
-    sensor = hg.LinearSensor([[1.0]], 0.1)
-    nodes = {
-        name: hg.Node(sensor, channel, {"f": Planned(np.zeros(1), np.array([s]))})
-        for name, s in zip("ab", shift, strict=True)
-    }
+    nodes = {}
+    for name, gain in zip("ab", gains, strict=True):
+        sensor = hg.LinearSensor([[gain]], 0.1)
+        nodes[name] = hg.Node(sensor, channel, {"f": hg.linear_filter(plant, sensor, plain)})
     return hg.Network(plant, nodes)
 
 
 def test_planned_filters_tell_what_they_would_without_a_plan():
     """Step by step without a plan; a channel that erases takes no plan."""
-    shift = 0.0, 0.3
-    plain = hg.hop(1.0, 0.1)
-    network = world(plain, shift)
+    gains, plain = (1.0, 0.3), hg.hop(hg.Rayleigh(1.0), 0.1)
+    network = world(plain, plain, gains)
     record = hg.monte_carlo(network, 6, 40, 4)
     with jax.enable_x64(True):
         for node in "ab":
@@ -113,10 +74,10 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
                     state, estimate = item.step(state, z, (), k)
                     np.testing.assert_allclose(found.mean[run, k], estimate.mean, rtol=1e-12, atol=1e-13)
                     np.testing.assert_allclose(found.covariance[run, k], estimate.covariance, rtol=1e-12)
-    lost = hg.monte_carlo(world(hg.erasure(plain, 0.5), shift), 6, 40, 4)
+    lost = hg.monte_carlo(world(hg.erasure(plain, 0.5), plain, gains), 6, 40, 4)
     assert np.isnan(lost.measurements["a"]).any() and lost.failures() == []
     sums = hg.monte_carlo(network, 6, 40, 4, hg.Statistics())["b"]["f"]
-    kept = hg.error_statistics(record, "b", "f")
+    kept = hg.simulation.error_statistics(record, "b", "f")
     for name in ("outer", "covariance", "nees", "count"):
         np.testing.assert_allclose(getattr(sums, name), getattr(kept, name), rtol=1e-10, atol=1e-12)
 
@@ -124,7 +85,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
 def test_columns_of_what_relays_heard_may_be_left_out():
     net = example()
     schedules = relay_schedules(net, own_error_design(net, 4))
-    receivers = {"own": hg.ScheduledFilter(schedules.pop("receiver"))}
+    receivers = {"own": hg.filters.ScheduledFilter(schedules.pop("receiver"))}
     network = hg.Network.of_relays(net, schedules, receivers)
     z = np.linspace(0.1, 0.4, 4)
     columns = {"time": np.arange(4.0), "receiver.y0": z}

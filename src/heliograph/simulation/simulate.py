@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, check_times, fail
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import to_numpy
 from heliograph.simulation.air import AbstractAir, air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
@@ -141,12 +141,13 @@ def run(
     u = _check_inputs(network, inputs, steps)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
-    found = _run_filters(AllFilters(network), grouped, u)
+    with jax.enable_x64(True):
+        found = to_numpy(_run_filters(AllFilters(network), grouped, u))
     return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)
 
 
-@compiled
-def _run_filters(filters: AllFilters, z: tuple[Any, ...], u: Any) -> Any:
+@eqx.filter_jit
+def _run_filters(filters: AllFilters, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
     def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k = row
         return filters.step(states, z_k, u_k, k)

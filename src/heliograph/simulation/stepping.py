@@ -1,7 +1,7 @@
 """Filters of one kind run side by side: stacked along axes of filters and nodes, vmapped, under the scan over time."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import cast
 
 import equinox as eqx
 import jax
@@ -14,7 +14,8 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, stack, structure
-from heliograph.numerics.float64 import compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import FUSED, Network
 
 
@@ -153,10 +154,14 @@ class AllFilters(eqx.Module):
         return (own, central, tuple(after)), {"estimates": estimates, "fused": fused, "uplinks": uplinks}
 
 
-@compiled
-def plan(filters: AllFilters, u: Any) -> AllFilters:
+def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """The filters with what does not depend on data computed before, where all data arrive."""
+    with jax.enable_x64(True):
+        return cast(AllFilters, to_numpy(_plan(filters, jnp.asarray(u))))
 
+
+@eqx.filter_jit
+def _plan(filters: AllFilters, u: jax.Array) -> AllFilters:
     def one(item: AbstractFilter) -> AbstractFilter:
         return item.planned(u)
 
