@@ -90,6 +90,12 @@ def test_public_names_exist_and_are_documented(place, name):
             assert "Source:" in text, f"{name}: expected where it comes from"
 
 
+def test_every_public_name_stands_in_the_list_of_names():
+    page = (SOURCE.parents[1] / "docs" / "names.md").read_text()
+    missing = [f"{place}.{name}" for place, name in PUBLIC if f"| `{name}` |" not in page]
+    assert not missing, f"docs/names.md lacks {missing}"
+
+
 def test_a_name_has_one_home_and_the_hall_is_small():
     names = [name for _, name in PUBLIC]
     assert len(set(names)) == len(names)
