@@ -22,7 +22,7 @@ test: .venv/.test  ## Lint, check types and run the tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy --strict src
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadfile
 
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
 	@$(BIN)/python benchmarks/run.py

@@ -1,5 +1,6 @@
 """What the test processes of one session share and let go: compiled programs, compiled in a hurry and kept on disk."""
 
+import ctypes
 import gc
 import os
 import shutil
@@ -33,7 +34,10 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="module", autouse=True)
 def forget_compiled_programs():
-    """A module's programs are hardly ever another's; kept, they would add up to gigabytes."""
+    """A module's programs are hardly ever another's; kept, they and what the compiler left would be gigabytes."""
     yield
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
+        gc.collect()
+        if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps what is freed
+            ctypes.CDLL(None).malloc_trim(0)

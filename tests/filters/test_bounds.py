@@ -1,5 +1,8 @@
 """The bounds behind the updates: their order, their optimality, and validity by enumeration of extreme laws."""
 
+from functools import cache
+from typing import Any, NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -65,14 +68,20 @@ def correct(update, prior, signal, described):
     return update.correct(prior, signal, described, jnp.ones(2, bool))
 
 
-def one_step(update, s=STRONG):
-    """Prior, signal, description, gain and bound of one STRONG update at node 1."""
+@cache
+def strong_channel(kind):
+    """STRONG's channel as updates of one kind read it, whatever their scalars."""
+    return kind().describe(machine.channel(STRONG))
+
+
+def one_step(update):
+    """Prior, signal, gain and bound of one STRONG update at node 1."""
+    s = STRONG
     mean, p = oracle.predict_cubature(s["xbar0"], s["Xi0"], s)
     yhat, v = oracle.measure(mean, p, s["C"][0], s)
     with jax.enable_x64(True):
         signal = Signal(*(jnp.asarray(a) for a in (yhat, v.Pyy, v.Pxy, v.Y)))
-        described = update.describe(machine.channel(s))
-        gain, bound = correct(update, jnp.asarray(p), signal, described)
+        gain, bound = correct(update, jnp.asarray(p), signal, strong_channel(type(update)))
     return p, signal, np.asarray(gain), np.asarray(bound)
 
 
@@ -122,32 +131,55 @@ def test_theorem_1_holds_by_enumeration(build):
     check_by_enumeration(build)
 
 
-def check_by_enumeration(build, usable=lambda setting: True):
-    """E[e+ e+'] under every corner law, for random laws, signs and joint moments of (e, y), never exceeds the bound."""
-    rng, tried = np.random.default_rng(0), 0
-    while tried < 25:
+class Case(NamedTuple):
+    """A channel with the second moments of its corner laws, E of (e, e_y, yhat) (...)', and two scalars."""
+
+    channel: Any
+    corners: list[Any]
+    joint: np.ndarray
+    scalars: np.ndarray
+
+
+@cache
+def random_cases(usable):
+    """25 of them; e, e_y and yhat are correlated in any way, so E[e yhat'] is not zero."""
+    rng, found = np.random.default_rng(0), []
+    while len(found) < 25:
         s = random_setting(rng)
         if not usable(s):
             continue
-        tried += 1
         a = rng.normal(size=(9, 9))
-        joint = a @ a.T  # E of (e, e_y, yhat) (...)': correlated in any way, so E[e yhat'] is not zero
-        e, ey, y = joint[:5, :5], joint[5:7, 5:7], slice(7, 9)
+        channel = machine.channel(s)
+        found.append(Case(channel, corners(channel), a @ a.T, 10 ** rng.uniform(-2, 0, 2)))
+    return found
+
+
+def corners(channel):
+    return [hg.random_affine.second_order(corner) for corner in channel.extremes()]
+
+
+def anything(setting):
+    return True
+
+
+def check_by_enumeration(build, usable=anything):
+    """E[e+ e+'] under every corner law, for random laws, signs and joint moments of (e, y), never exceeds the bound."""
+    for case in random_cases(usable):
+        joint, y = case.joint, slice(7, 9)
+        e, ey = joint[:5, :5], joint[5:7, 5:7]
         yy = ey + joint[y, y] + joint[5:7, y] + joint[y, 5:7]
         signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
-        update = build(hg.filters.Scalars(*10 ** rng.uniform(-2, 0, 2)))
-        channel = machine.channel(s)
+        update = build(hg.filters.Scalars(*case.scalars))
         with jax.enable_x64(True):
-            described = update.describe(channel)
+            described = update.describe(case.channel)
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(e), signal, described))
-        for corner in channel.extremes():
+        for corner in case.corners:
             actual = actual_covariance(joint, gain, corner, described.mean_gain)
             assert np.linalg.eigvalsh(bound - actual)[0] >= -1e-9 * np.trace(bound)
 
 
-def actual_covariance(joint, gain, law, nominal):
-    """E of e - K(G y + n - M yhat) = e - K M e_y - K (G - M) y - K n, over the law of (G, n)."""
-    own = hg.random_affine.second_order(law)
+def actual_covariance(joint, gain, own, nominal):
+    """E of e - K(G y + n - M yhat) = e - K M e_y - K (G - M) y - K n, over the law of (G, n) with these moments."""
     shift = own.mean_gain - nominal
     lift = np.hstack([np.eye(5), -gain @ (nominal + shift), -gain @ shift])  # on (e, e_y, yhat)
     yy = joint[5:7, 5:7] + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
@@ -189,7 +221,8 @@ def check_extended(update, terms):
 
 def too_small(radius, shrink, seeds=range(20)):
     """Whether enumeration finds a violation when the channel's description is made smaller by `shrink`."""
-    worst = np.inf
+    channel, update = machine.channel(STRONG, radius), hg.filters.Polytope(hg.filters.Scalars(0.01, 0.01))
+    right, laws, worst = update.describe(channel), corners(channel), np.inf
     for seed in seeds:
         rng = np.random.default_rng(seed)
         a = np.outer(rng.normal(size=9), rng.normal(size=9)) + 0.05 * rng.normal(size=(9, 9))
@@ -197,11 +230,9 @@ def too_small(radius, shrink, seeds=range(20)):
         ey = joint[5:7, 5:7]
         yy = ey + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
         signal = Signal(np.zeros(2), ey, joint[:5, 5:7], yy)
-        channel, update = machine.channel(STRONG, radius), hg.filters.Polytope(hg.filters.Scalars(0.01, 0.01))
-        right = update.describe(channel)
         with jax.enable_x64(True):
             gain, bound = (np.asarray(v) for v in correct(update, jnp.asarray(joint[:5, :5]), signal, shrink(right)))
-        for corner in channel.extremes():
+        for corner in laws:
             gap = bound - actual_covariance(joint, gain, corner, right.mean_gain)
             worst = min(worst, np.linalg.eigvalsh(gap)[0] / np.trace(bound))
     return worst < -1e-6
