@@ -151,8 +151,11 @@ def _offset(result: Reproduction) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()
     gaps = []
     for rule in (hg.filters.Cubature(), hg.filters.PolynomialMoments(2)):
-        pairs = [(one_step.predicted(PRINTED, r, c)[0] for r in (rule, hg.filters.Linearization())) for c in claimed]
-        gaps.append([ours - linear for ours, linear in pairs])
+        moved, straight = (
+            np.array([one_step.predicted(PRINTED, each, c)[0] for c in claimed])
+            for each in (rule, hg.filters.Linearization())
+        )
+        gaps.append(moved - straight)
     size = np.linalg.norm(gaps[0], axis=1)
     same = float(np.max(np.abs(np.array(gaps[0]) - gaps[1])))
     ours = (

@@ -64,7 +64,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     advance("designing over the horizon")
     paper = hg.relays.own_error_design(network, setting.HORIZON)
     tuned = hg.relays.receiver_error_design(network, setting.HORIZON)
-    bounded = hg.relays.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power())
+    bounded = hg.relays.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power(), sweeps=400)
     behind = hg.relays.receiver_behind_relays(network, paper.gains)
     advance("designing the steady state")
     states = steady(network)
