@@ -91,7 +91,7 @@ from .simulation.stream import (
 from .simulation.record import (
     Record as Record,
 )
-from .simulation.statistics import (
+from .simulation.sums import (
     Statistics as Statistics,
 )
 from .report.progress import (

@@ -13,7 +13,8 @@ from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
 from heliograph.simulation.network import Network, Node
 from heliograph.simulation.simulate import monte_carlo, run
-from heliograph.simulation.statistics import BATCHES, Statistics, error_statistics
+from heliograph.simulation.statistics import BATCHES
+from heliograph.simulation.sums import Statistics, error_statistics
 from tests.relays.relay_problems import example, unusual
 
 FALSE_ALARM = 1e-4  # of each comparison over all its steps

@@ -13,6 +13,8 @@ from .record import (
 )
 from .statistics import (
     ErrorStatistics as ErrorStatistics,
-    error_statistics as error_statistics,
     pool as pool,
+)
+from .sums import (
+    error_statistics as error_statistics,
 )

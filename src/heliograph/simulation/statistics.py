@@ -2,24 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from operator import itemgetter
-from typing import Any
+from dataclasses import dataclass
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
 from scipy import stats
 
-from heliograph.model.estimate import Claim, Estimate, weakest
+from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail
-from heliograph.numerics.float64 import compiled
-from heliograph.numerics.small_matrix import squared_distance
-from heliograph.simulation.lanes import BLOCK
-from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.record import AbstractReducer, Record, Uplink, by_name, uplinks_of
+from heliograph.simulation.record import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
 
@@ -151,10 +141,13 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     parts = list(statistics)
     if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
-    joined: dict[str, Any] = {
-        name: np.concatenate([getattr(s, name) for s in parts], axis=1) for name in ("pairs", "claimed_pairs", "nees")
-    }
-    return ErrorStatistics(parts[0].count, **joined, claim=weakest([s.claim for s in parts]))
+    return ErrorStatistics(
+        parts[0].count,
+        np.concatenate([s.pairs for s in parts], axis=1),
+        np.concatenate([s.claimed_pairs for s in parts], axis=1),
+        np.concatenate([s.nees for s in parts], axis=1),
+        weakest([s.claim for s in parts]),
+    )
 
 
 @dataclass(frozen=True)
@@ -190,186 +183,3 @@ def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.nda
     root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))[..., None, :]
     inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ a @ root)
     return inner, root @ rotated
-
-
-StatisticsByName = dict[str, dict[str, ErrorStatistics]]
-
-
-class Sums(eqx.Module):
-    """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
-
-    Run r goes to batch r mod BATCHES; the last axis is longer, so that a block of consecutive runs lies in one piece,
-    and what is beyond folds back in the end. A covariance that all runs share is summed once, without batches.
-    `order`: whose estimates the parts are, kinds first and then fused ones; the first `own` have their own covariances.
-    """
-
-    count: jax.Array
-    pairs: jax.Array
-    nees: jax.Array
-    claimed: jax.Array
-    shared: jax.Array
-    uplinks: PyTree
-    order: tuple[int, ...] = eqx.field(static=True)
-    own: int = eqx.field(static=True)
-
-
-class Statistics(AbstractReducer[StatisticsByName]):
-    """Keep running error statistics of every filter of every node; memory does not grow with the number of runs."""
-
-    def initial(self, shapes: PyTree) -> Sums:
-        """Zero sums."""
-        runs, steps, n = shapes["truth"].shape
-        wide = BATCHES + runs - 1
-        parts, order, own = _parts(shapes)
-        sizes = [int(np.prod(parts[i].mean.shape[2:-1])) for i in order]
-        total, mine, pairs = sum(sizes), sum(sizes[:own]), n * (n + 1) // 2
-        return Sums(
-            count=jnp.zeros(wide),
-            pairs=jnp.zeros((steps, total, pairs, wide)),
-            nees=jnp.zeros((steps, total, wide)),
-            claimed=jnp.zeros((steps, mine, pairs, wide)),
-            shared=jnp.zeros((steps, total - mine, pairs)),
-            uplinks=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["uplinks"]),
-            order=order,
-            own=own,
-        )
-
-    def reduce(self, carry: Sums, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[Sums, PyTree]:
-        """Add the valid runs, dealt to batches."""
-        parts, order, own = _parts(batch)
-        errors = jnp.concatenate([_error(batch["truth"], parts[i]) for i in order], axis=2)  # (n, time, part, run)
-        errors = jnp.where(valid, errors, 0.0)  # the others may hold anything
-        n, start = len(errors), runs[0] % BATCHES
-        unit = jnp.eye(n).reshape(n, n, 1, 1, 1)
-        mine = [jnp.where(valid, _claimed(parts[i]), unit) for i in order[:own]]
-        bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(parts[i]) for i in order[own:]]) if b]
-        split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
-        nees = jnp.concatenate([_squared_distance(b, e) for b, e in zip(bounds, split, strict=True)], axis=1)
-        counted = valid.astype(float)
-        claimed, shared = carry.claimed, carry.shared
-        if own:
-            claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), start)
-        if own < len(order):
-            shared = shared + _pairs(bounds[-1])[..., 0] * counted.sum()
-        sent = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(valid), *x.shape[1:])), batch["uplinks"])
-        uplinks = jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent)
-        pairs = _pairs(errors[:, None] * errors[None])
-        sums = _dealt(carry.count, counted, start), _dealt(carry.pairs, pairs, start), _dealt(carry.nees, nees, start)
-        return Sums(*sums, claimed, shared, uplinks, order, own), ()
-
-    def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
-        """Statistics by node and filter."""
-        parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
-        kinds = len(network.kinds)
-        named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
-        pairs, nees, claimed = (by_name(network, named, itemgetter(i), axis) for i, axis in enumerate((-3, -2, -3)))
-        count = _folded(carry.count)
-        result = {
-            node: {
-                name: ErrorStatistics(count, pairs[node][name], claimed[node][name], nees[node][name], claim)
-                for name, claim in claims.items()
-            }
-            for node, claims in network.claims().items()
-        }
-        for name, uplink in uplinks_of(network, carry.uplinks).items():
-            fused = result[FUSED][name]
-            means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
-            result[FUSED][name] = replace(fused, uplink=means)
-        return result
-
-
-def _parts(batch: PyTree) -> tuple[list[Estimate], tuple[int, ...], int]:
-    """The estimates of a block; their order, those with a covariance for each run first; and the number of these."""
-    parts = [*batch["estimates"], *(batch["fused"][name] for name in sorted(batch["fused"]))]
-    shared = [part.covariance.shape[0] < batch["truth"].shape[0] for part in parts]
-    return parts, tuple(sorted(range(len(parts)), key=shared.__getitem__)), shared.count(False)
-
-
-def _error(truth: jax.Array, part: Estimate) -> jax.Array:
-    """x - xhat as (n, time, part, run)."""
-    mean = jnp.asarray(part.mean)
-    mean = jnp.broadcast_to(mean, (len(truth), *mean.shape[1:])).reshape(*truth.shape[:2], -1, truth.shape[2])
-    return (truth[:, :, None] - mean).transpose(3, 1, 2, 0)
-
-
-def _claimed(part: Estimate) -> jax.Array:
-    """The covariance as (n, n, time, part, run)."""
-    value = jnp.asarray(part.covariance)
-    return value.reshape(*value.shape[:2], -1, *value.shape[-2:]).transpose(3, 4, 1, 2, 0)
-
-
-_squared_distance = jax.jit(squared_distance)
-
-
-def _pairs(values: jax.Array) -> jax.Array:
-    """Entries i <= j of symmetric (n, n, time, part, run) as (time, part, pair, run)."""
-    return jnp.stack([values[i, j] for i, j in zip(*np.triu_indices(len(values)), strict=True)], axis=2)
-
-
-def _dealt(sums: jax.Array, values: jax.Array, start: jax.Array) -> jax.Array:
-    """Add values of consecutive runs (..., run), the first of which is in batch `start`."""
-    runs, last = values.shape[-1], sums.ndim - 1
-    there = jax.lax.dynamic_slice_in_dim(sums, start, runs, last)
-    return jax.lax.dynamic_update_slice_in_dim(sums, there + values, start, last)
-
-
-def _folded(sums: jax.Array | np.ndarray) -> np.ndarray:
-    """Sums (..., batch) of exactly BATCHES batches, (batch, ...)."""
-    ahead = np.moveaxis(np.asarray(sums), -1, 0)
-    result = np.array(ahead[:BATCHES], order="C")
-    result[: len(ahead) - BATCHES] += ahead[BATCHES:]
-    return result
-
-
-def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, ...]]:
-    """Of each kind and fused estimate: sums of pairs and of NEES by batch, and the batches' mean claimed covariances.
-
-    Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
-    """
-    count, pairs, nees = _folded(carry.count), _folded(carry.pairs), _folded(carry.nees)
-    own = _folded(carry.claimed)
-    own /= np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
-    shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
-    result, place = {}, 0
-    for position, i in enumerate(carry.order):
-        axes = kinds[i] if i < len(kinds) else ()
-        rows = slice(place, place + int(np.prod(axes)))
-        offset = own.shape[2] if position >= carry.own else 0
-        claimed = (shared if offset or position >= carry.own else own)[:, :, rows.start - offset : rows.stop - offset]
-        result[i] = tuple(
-            a.reshape(*a.shape[:2], *axes, *a.shape[3:]) for a in (pairs[:, :, rows], nees[:, :, rows], claimed)
-        )
-        place = rows.stop
-    return [result[i] for i in range(len(result))]
-
-
-def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
-    """Statistics of one filter of one node from kept trajectories.
-
-    Raises:
-        ValueError: a record without truth, or without a run axis.
-    """
-    if record.truth is None or record.truth.ndim != 3:
-        raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
-    estimate = record.estimates[node][name]
-    sums = _of_record(record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
-    ((pairs, nees, claimed),) = _split(sums, [])
-    sent = record.uplinks.get(name) if node == FUSED else None
-    uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
-    return ErrorStatistics(_folded(sums.count), pairs, claimed, nees, estimate.claim, uplink)
-
-
-@compiled
-def _of_record(truth: Any, mean: Any, covariance: Any) -> Sums:
-    """Sums over the runs of a record, block by block."""
-    runs = len(truth)
-    blocks = jnp.arange(-(-runs // BLOCK) * BLOCK).reshape(-1, BLOCK)
-
-    def batch(numbers: jax.Array) -> PyTree:
-        rows = [jnp.asarray(a)[jnp.minimum(numbers, runs - 1)] for a in (truth, mean, covariance)]
-        return {"truth": rows[0], "estimates": (), "fused": {"": Estimate(rows[1], rows[2], "none")}, "uplinks": {}}
-
-    def body(sums: Sums, numbers: jax.Array) -> tuple[Sums, PyTree]:
-        return Statistics().reduce(sums, batch(numbers), numbers, numbers < runs)
-
-    return jax.lax.scan(body, Statistics().initial(batch(blocks[0])), blocks)[0]

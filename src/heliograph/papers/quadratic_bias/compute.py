@@ -27,7 +27,8 @@ from heliograph.papers.quadratic_bias.printed import Printed, printed_quadratic
 from heliograph.simulation.network import Network, Node
 from heliograph.simulation.record import AbstractReducer, Record, trajectories_record
 from heliograph.simulation.simulate import monte_carlo
-from heliograph.simulation.statistics import ErrorStatistics, Statistics
+from heliograph.simulation.statistics import ErrorStatistics
+from heliograph.simulation.sums import Statistics
 
 RUNS = 20_000
 RESOLUTION = 0.01  # of z for the mixture filter, where a link that is off leaves z with a few exact values
