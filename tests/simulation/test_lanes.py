@@ -60,7 +60,8 @@ np.savez(sys.argv[1], truth=record.truth, mean=record.estimates["a"]["f"].mean, 
 
 def test_several_devices_share_the_lanes(tmp_path):
     """Three devices that JAX makes of one processor; sums run in another order, so rounding may differ."""
-    environment = os.environ | {"XLA_FLAGS": "--xla_force_host_platform_device_count=3"}
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=3"
+    environment = os.environ | {"XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", DEVICES, str(tmp_path / "found.npz")], env=environment, check=True)
     found = np.load(tmp_path / "found.npz")
     record = hg.monte_carlo(network(), HORIZON, 700, 0)
