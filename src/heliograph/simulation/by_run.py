@@ -10,7 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
+from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import PyTree
+
+from heliograph.simulation.hashing import evaluated, written_out
 
 AHEAD = 2**18  # bytes drawn ahead: more than fills the processor between two steps, less than its cache
 
@@ -25,20 +28,20 @@ def trajectories(
     start, varies, tree = _start(init, keys)
     example, steps = jax.tree.map(lambda leaf: leaf[0], rows), len(jax.tree.leaves(rows)[0])
     one = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
-    body, shape = jax.make_jaxpr(
+    traced, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
     )(one, keys[0], example)
+    body = _needed(traced)
     row_axes: list[int | None] = [None] * len(jax.tree.leaves(example))
     known = [False] * len(row_axes)
     spread = _settled(lambda marks: _dependent(body, [*marks, True, *known])[: len(one)], varies)
     tells = _dependent(body, [*spread, True, *known])[len(one) :]
     ahead, rest, drawn = _split(body, len(one))
-    draw = jax.vmap(jaxpr_as_fun(ahead), in_axes=[0, *row_axes], out_axes=-1)
+    keys = written_out(keys, (ahead, rest))
+    draw = jax.vmap(evaluated(ahead), in_axes=[0, *row_axes], out_axes=-1)
     draw = jax.vmap(draw, in_axes=[None, *[0] * len(row_axes)])
     out_axes = _axes([*spread, *tells])
-    advance = jax.vmap(
-        jaxpr_as_fun(rest), in_axes=[*_axes(spread), 0, *row_axes, *[-1] * len(drawn)], out_axes=out_axes
-    )
+    advance = jax.vmap(evaluated(rest), in_axes=[*_axes(spread), 0, *row_axes, *[-1] * len(drawn)], out_axes=out_axes)
 
     def several(carry: list[jax.Array], rows: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
         def scanned(carry: list[jax.Array], item: Any) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -65,6 +68,12 @@ def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[j
     varies = _dependent(traced, [True])
     start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)
     return start, varies, jax.tree.structure(shape)
+
+
+def _needed(program: ClosedJaxpr) -> ClosedJaxpr:
+    """A program without what none of its results needs, such as likelihoods that nobody asks for."""
+    jaxpr, _ = dce_jaxpr(program.jaxpr, [True] * len(program.jaxpr.outvars), instantiate=True)
+    return ClosedJaxpr(jaxpr, program.consts)
 
 
 def _split(program: ClosedJaxpr, carried: int) -> tuple[ClosedJaxpr, ClosedJaxpr, list[Var]]:
