@@ -114,21 +114,25 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
 
     def body(state: Any, row: tuple[jax.Array, jax.Array]) -> tuple[Any, tuple[Plan, jax.Array]]:
         k, u = row
-        prior = item.predict(state, u, k)
-        after, heard = item.correct(prior, quiet, k)
         none = jnp.zeros_like(state.mean)
 
-        def moved(mean: jax.Array) -> jax.Array:
-            return jnp.asarray(item.predict(state._replace(mean=mean), u, k).mean)
+        def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+            """What follows from each, and all that the means have no part in."""
+            prior = item.predict(state._replace(mean=before), u, k)
+            after, heard = item.correct(prior._replace(mean=moved), z, k)
+            values = jnp.asarray(prior.mean), jnp.asarray(after.mean), jnp.asarray(heard.value)
+            return values, (values, prior, after, heard)
 
-        def listened(mean: jax.Array, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-            later, one = item.correct(prior._replace(mean=mean), z, k)
-            return later.mean, jnp.asarray(one.value)
-
-        _, output = jax.jacfwd(listened, 0)(none, quiet)
-        gain, _ = jax.jacfwd(listened, 1)(none, quiet)
-        offset = -listened(none, quiet)[1]
-        one = Plan(jax.jacfwd(moved)(none), moved(none), gain, -output, offset, jnp.asarray(heard.covariance))
+        derivatives, found = jax.jacfwd(means, (0, 1, 2), has_aux=True)(none, none, quiet)
+        (drift, _, unexpected), prior, after, heard = found
+        one = Plan(
+            transition=derivatives[0][0],
+            drift=drift,
+            gain=derivatives[1][2],
+            output=-derivatives[2][1],
+            offset=-unexpected,
+            innovation=jnp.asarray(heard.covariance),
+        )
         return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
 
     start = item.init()
