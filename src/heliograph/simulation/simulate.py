@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, check_times, fail
+from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.simulation.air import AbstractAir, air_of
 from heliograph.simulation.by_run import trajectories
@@ -146,7 +147,7 @@ def run(
     return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)
 
 
-@eqx.filter_jit
+@large_program
 def _run_filters(filters: AllFilters, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
     def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k = row
@@ -188,13 +189,13 @@ class _Job(eqx.Module):
     single: bool = eqx.field(static=True)
 
 
-@eqx.filter_jit
+@large_program
 def _initial(job: _Job) -> PyTree:
     """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
     return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
 
 
-@eqx.filter_jit(donate="all-except-first")
+@partial(large_program, donate="all-except-first")
 def _lane(todo: tuple[_Job, Any], carry: PyTree) -> tuple[PyTree, PyTree]:
     return _blocks(*todo, carry)
 
@@ -208,7 +209,7 @@ def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
 
 
-@eqx.filter_jit
+@large_program
 def _all_lanes(job: _Job, blocks: Any, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)

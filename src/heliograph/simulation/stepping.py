@@ -14,6 +14,7 @@ from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, stack, structure
+from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import FUSED, Network
@@ -160,7 +161,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
         return cast(AllFilters, to_numpy(_plan(filters, jnp.asarray(u))))
 
 
-@eqx.filter_jit
+@large_program
 def _plan(filters: AllFilters, u: jax.Array) -> AllFilters:
     def one(item: AbstractFilter) -> AbstractFilter:
         return item.planned(u)

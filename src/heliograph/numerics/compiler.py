@@ -1,0 +1,40 @@
+"""What the compiler is asked: half of the compile time, for programs that are large and run for seconds at most."""
+
+from collections.abc import Callable
+from functools import cache, wraps
+from typing import Literal, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# The newer way of generating code for a processor takes twice as long and makes code that is 7 % faster.
+OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+
+
+def large_program(function: Callable[P, R], donate: Literal["none", "all-except-first"] = "none") -> Callable[P, R]:
+    """Compile a function as `equinox.filter_jit` does, with options that make large programs compile faster."""
+
+    @cache
+    def jitted() -> Callable[P, R]:
+        result: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=_understood())  # type: ignore[call-overload]
+        return result
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        return jitted()(*args, **kwargs)
+
+    return call
+
+
+@cache
+def _understood() -> dict[str, bool]:
+    """The options, if this release of the compiler has them: they are not part of its promises."""
+    try:
+        jax.jit(lambda: jnp.zeros(()), compiler_options=OPTIONS)()
+    except jax.errors.JaxRuntimeError:
+        return {}
+    return OPTIONS
