@@ -86,7 +86,8 @@ def times(a: Array, b: jax.Array) -> jax.Array:
     inner = b.shape[0]
     if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
         return jnp.einsum("ij...,jk...->ik...", a, b)
-    return add([a[:, j, None] * b[None, j] for j in range(inner)])
+    columns, rows = jnp.split(a, inner, axis=1), jnp.split(b, inner)
+    return add([column * row for column, row in zip(columns, rows, strict=True)])
 
 
 def times_vector(a: Array, x: jax.Array) -> jax.Array:
@@ -101,7 +102,8 @@ def congruence(a: Array, p: jax.Array) -> jax.Array:
 
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
     """tr(A' B)."""
-    return add([a[i, j] * b[i, j] for i in range(a.shape[0]) for j in range(a.shape[1])])
+    products = a * b
+    return add(jnp.split(products.reshape(-1, *products.shape[2:]), products.shape[0] * products.shape[1]))[0]
 
 
 def trace(a: jax.Array) -> jax.Array:
@@ -189,4 +191,6 @@ def contract(tensor: Array, matrix: jax.Array) -> jax.Array:
     n = matrix.shape[0]
     if n > UNROLL_LIMIT // 2:
         return jnp.einsum("ijab...,ab...->ij...", tensor, matrix)
-    return add([tensor[:, :, a, b] * matrix[a, b] for a in range(n) for b in range(n)])
+    flat = jnp.asarray(tensor).reshape(*tensor.shape[:2], n * n, *tensor.shape[4:])
+    parts = zip(jnp.split(flat, n * n, axis=2), jnp.split(matrix.reshape(n * n, *matrix.shape[2:]), n * n), strict=True)
+    return add([part[:, :, 0] * weight for part, weight in parts])
