@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail
@@ -82,7 +82,7 @@ class ErrorStatistics:
         """
         n = self.outer.shape[-1]
         mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
-        width = float(stats.t.ppf((1 + confidence) / 2, max(int(np.count_nonzero(self.count)) - 1, 1))) * error
+        width = float(stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
         return mean, mean - width, mean + width
 
     def worst_direction(self) -> "WorstDirection":

@@ -141,11 +141,11 @@ def _dealt(sums: jax.Array, values: jax.Array, start: jax.Array) -> jax.Array:
 
 
 def _folded(sums: jax.Array | np.ndarray) -> np.ndarray:
-    """Sums (..., batch) of exactly BATCHES batches, (batch, ...)."""
-    ahead = np.moveaxis(np.asarray(sums), -1, 0)
-    result = np.array(ahead[:BATCHES], order="C")
-    result[: len(ahead) - BATCHES] += ahead[BATCHES:]
-    return result
+    """Sums (..., batch) of exactly BATCHES batches, (batch, ...): a view, in memory the batches are last."""
+    ahead = np.asarray(sums)
+    result = ahead[..., :BATCHES].copy()
+    result[..., : ahead.shape[-1] - BATCHES] += ahead[..., BATCHES:]
+    return np.moveaxis(result, -1, 0)
 
 
 def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, ...]]:
