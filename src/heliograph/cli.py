@@ -179,7 +179,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (CycloptsError, ValueError) as error:
         return _refuse(str(error))
     except OSError as error:
-        return _refuse(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return _refuse(f"{error.filename}: {error.strerror or error}" if error.filename else str(error))
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:

@@ -12,12 +12,13 @@ from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, v
 from heliograph.numerics.check import check_count, fail
 from heliograph.simulation.lanes import BLOCK
 
-KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "grid", "settings")
+KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
 KEEP = ("errors", "trajectories")
 # Names that the store's variables and the table's columns have already.
 VARIABLES = ("error", "variance", "nees_per_dimension", "truth", "measurement", "claim")
 COLUMNS = ("rmse", "rmse_error", "nees_error", "runs", "finite_runs")
 CHUNK = 256
+TIMEOUT = 3600.0  # seconds, compiling included
 
 
 def load_campaign(path: str | Path) -> Campaign:
@@ -26,7 +27,8 @@ def load_campaign(path: str | Path) -> Campaign:
     Keys: network = "my_network.py:build" (a function of the settings; the path counts from the campaign's folder),
     horizon, runs, and [grid] name = [values], whose product is taken, or [[settings]], one table for each. Optional:
     seed (0), chunk (runs computed and stored at once, 256; a multiple of 32), keep ("errors", or "trajectories" for
-    truth and measurements too), [inputs] name = a number or one for each step.
+    truth and measurements too), [inputs] name = a number or one for each step, timeout (seconds that a worker may take
+    to build a setting or compute a chunk, 3600).
 
     Raises:
         ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
@@ -74,6 +76,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_inputs(table.get("inputs", {}), horizon, name),
         settings=_settings(table, name),
+        timeout=_timeout(table.get("timeout", TIMEOUT), name),
         versions=versions(),
     )
 
@@ -112,6 +115,12 @@ def _chunk(value: object, name: str) -> int:
     if count % BLOCK:
         raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", count)
     return count
+
+
+def _timeout(value: object, name: str) -> float:
+    if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
+        raise fail(f"{name}, timeout", "a positive number of seconds", _shown(value))
+    return float(value)
 
 
 def _one_of(value: object, choices: Sequence[str], name: str) -> str:

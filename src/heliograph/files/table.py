@@ -6,10 +6,13 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from glob import escape as glob_escape
 from pathlib import Path
 
 import numpy as np
 
+from heliograph.files.durable import naming, replace
+from heliograph.files.quoting import from_cell, in_cell
 from heliograph.numerics.check import fail
 
 FORMATS = (".csv", ".parquet")
@@ -77,12 +80,27 @@ def check_output_folder(folder: str | Path) -> None:
 def _whole(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
+        if not _lives(left.name.split(".")[-2]):
+            left.unlink(missing_ok=True)
     try:
-        yield partial
-        os.replace(partial, path)
+        with naming(path):
+            yield partial
+            replace(partial, path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def _lives(process: str) -> bool:
+    """Whether a process of this number runs; what others left is theirs where that cannot be told."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OSError):
+        return True
+    return True
 
 
 def _format(path: Path) -> str:
@@ -102,7 +120,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = (line for line in csv.reader(file, strict=True) if line)
-            header = [name.strip() for name in next(lines, [])]
+            header = [from_cell(name.strip()) for name in next(lines, [])]
             _check_distinct(path, header)
             rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
@@ -145,7 +163,7 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
+        writer.writerow(map(in_cell, columns))
         writer.writerows(zip(*(_plain(c).tolist() for c in columns.values()), strict=True))
 
 
