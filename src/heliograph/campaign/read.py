@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.simulation.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
@@ -71,7 +71,7 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         path=str(path.absolute()),
         horizon=horizon,
         runs=runs,
-        seed=_seed(table.get("seed", 0), name),
+        seed=check_seed(f"{name}, seed", table.get("seed", 0)),
         chunk=min(_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_inputs(table.get("inputs", {}), horizon, name),
@@ -102,12 +102,6 @@ def _shown(value: object) -> str:
 
 def _count(table: Mapping[str, object], key: str, name: str) -> int:
     return check_count(f"{name}, {key}", table.get(key, "none"))
-
-
-def _seed(value: object, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        raise fail(f"{name}, seed", "a whole number from 0 to 4294967295", _shown(value))
-    return value
 
 
 def _chunk(value: object, name: str) -> int:

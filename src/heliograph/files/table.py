@@ -2,6 +2,7 @@
 
 import csv
 import os
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,7 +14,7 @@ import numpy as np
 
 from heliograph.files.durable import naming, replace
 from heliograph.files.quoting import from_cell, in_cell
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, shown
 
 FORMATS = (".csv", ".parquet")
 
@@ -121,7 +122,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = (line for line in csv.reader(file, strict=True) if line)
             header = [from_cell(name.strip()) for name in next(lines, [])]
-            _check_distinct(path, header)
+            _check_header(path, header)
             rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
@@ -130,16 +131,33 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(path: Path, header: list[str], number: int, line: list[str]) -> list[float]:
+    if line[0].lstrip().startswith("#"):
+        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: a table has none")
     if len(line) != len(header):
-        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
+        hint = ": numbers have a decimal point" if len(line) > len(header) else ""
+        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
     return [_number(path, name, number, cell.strip()) for name, cell in zip(header, line, strict=True)]
 
 
 def _number(path: Path, name: str, number: int, cell: str) -> float:
     try:
+        if "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
         return float(cell) if cell else np.nan
     except ValueError:
-        raise fail(f"{path}, row {number}, column {name!r}", "a number or an empty cell", repr(cell)) from None
+        hint = ": numbers have a decimal point" if re.fullmatch(r"[+-]?\d+,\d+", cell) else ""
+        wanted = "a number or an empty cell"
+        raise fail(f"{path}, row {number}, column {name!r}", wanted, f"{shown(cell)}{hint}") from None
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
+    line = ",".join(header)
+    if line.startswith("#"):
+        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: a table has none")
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        if len(header) == 1 and mark in line:
+            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}")
+    _check_distinct(path, header)
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
