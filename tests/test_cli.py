@@ -2,6 +2,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from types import ModuleType
 
 import numpy as np
@@ -12,6 +13,7 @@ from heliograph import cli
 from heliograph.files.network_file import load_network
 from heliograph.files.recording import read_recording
 from heliograph.files.table import read_table
+from heliograph.numerics.check import InputError
 
 NETWORK = """
 import jax.numpy as jnp
@@ -215,6 +217,82 @@ def test_nothing_is_left_after_an_interrupt(folder, monkeypatch, signal_number, 
     assert signal.getsignal(signal.SIGTERM) is handler
 
 
+def in_a_callback():
+    class Removed:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)  # an exception in here is swallowed, with a word on stderr
+
+    item = Removed()
+    del item
+    time.sleep(5)
+    raise AssertionError("it went on")
+
+
+def told_as_something_else():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("INTERNAL: KeyboardInterrupt") from None
+
+
+def kept_quiet():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        return
+
+
+@pytest.mark.parametrize("interrupt", [in_a_callback, told_as_something_else, kept_quiet])
+def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
+    demo_module(monkeypatch, lambda out, seed: interrupt())
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert cli.main(["demo", "--out", "results"]) == cli.INTERRUPTED
+    finally:
+        signal.signal(signal.SIGINT, inherited)
+    assert capsys.readouterr().err == ""
+
+
+START = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'heliograph'; "
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.2])
+def test_ctrl_c_in_a_process_of_its_own(folder, delay):
+    """From when the network's file is read: then all is loaded, traced and compiled."""
+    (folder / "net.py").write_text("print('ready', flush=True)\n" + NETWORK)
+    before = contents(folder)
+    program = START + "from heliograph.__main__ import command; command()"
+    process = subprocess.Popen([sys.executable, "-c", program, *run_arguments()], cwd=folder, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode in (0, cli.INTERRUPTED) and said.count("\n") <= 1
+    if process.returncode == 0:  # it was done
+        assert len(read_table(folder / "out.csv")["time"]) == len(read_table(folder / "data.csv")["time"])
+    else:
+        assert contents(folder) == before
+
+
+@pytest.mark.parametrize("module", ["cyclopts", "heliograph.cli"])
+def test_ctrl_c_while_the_command_is_imported(folder, module):
+    program = (
+        START
+        + f"""
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{module}":
+            signal.raise_signal(signal.SIGINT)
+
+from heliograph.__main__ import command
+sys.meta_path.insert(0, Interrupted())
+command()"""
+    )
+    done = subprocess.run([sys.executable, "-c", program, "--help"], capture_output=True, text=True, cwd=folder)
+    assert (done.returncode, done.stderr, done.stdout) == (130, "", "")
+
+
 @pytest.mark.parametrize(
     ("arguments", "fragments"),
     [
@@ -257,13 +335,20 @@ def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
 
 def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     def wrong(*_):
-        raise ValueError("thing: expected\n  one, got\n  two")
+        raise InputError("thing: expected\n  one, got\n  two")
 
     demo_module(monkeypatch, wrong)
     refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")
 
 
-@pytest.mark.parametrize("bug", [RuntimeError("bug"), ModuleNotFoundError("bug", name="heliograph.nowhere")])
+@pytest.mark.parametrize(
+    "bug",
+    [
+        RuntimeError("bug"),
+        ValueError("bug: not said by a check"),
+        ModuleNotFoundError("bug", name="heliograph.nowhere"),
+    ],
+)
 def test_a_bug_keeps_its_traceback(folder, monkeypatch, bug):
     def broken(*_):
         raise bug
@@ -322,6 +407,16 @@ def test_a_refusal_in_a_process_of_its_own(folder):
         (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
         (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
         (["example", "dmeo", "--out", "o"], ["example: expected one of demo, motor-drive, got 'dmeo'"]),
+        (["demo", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0 to 4294967295, got 111"]),
+        (["demo", "--out", "o", "--seed", "-1"], ["--seed: expected a whole number from 0 to 4294967295, got -1"]),
+        (["reproduce", "all", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0"]),
+        (["reproduce", "all", "--out", "o", "--runs", "1" * 23], ["--runs: expected at most 4294967295, got 111"]),
+        (["reproduce", "all", "--out", "o", "--runs", "150.7"], ["--runs: expected a whole number, got '150.7'"]),
+        (["reproduce", "all", "--out", "o", "--runs", "1_000"], ["--runs: expected a whole number, got '1_000'"]),
+        (["reproduce", "all", "--out", "o", "--runs", "0x100"], ["--runs: expected a whole number, got '0x100'"]),
+        (["demo", "--out", ""], ["--out: expected a path, got ''"]),
+        (["demo", "--out", "o\0"], ["--out: expected a path, got 'o\\x00'"]),
+        (["run", "\x1b[31m.py", "--measurements", "data.csv", "--out", "o.csv"], ["network \\x1b[31m.py: expected"]),
         (["example", "demo"], ["example: expected a folder for the results (--out DIR), got none"]),
         (["example", "demo", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
     ],

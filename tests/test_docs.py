@@ -1,6 +1,7 @@
 """Every Python example in the README and the docs runs, in the order of its page."""
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -25,3 +26,16 @@ def test_the_readmes_network_is_as_short_as_it_says():
     scope = {}
     exec(block, scope)
     assert isinstance(scope["network"], hg.Network)
+
+
+def test_a_source_distribution_holds_all_but_what_a_clone_needs():
+    """Tests read the docs and the benchmarks, and pages link to them."""
+    table = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    included = table["tool"]["hatch"]["build"]["targets"]["sdist"]["include"]
+    there = {f"/{path.name}" for path in ROOT.iterdir() if not path.name.startswith(".")}
+    always = {"/README.md", "/LICENSE", "/pyproject.toml"}  # by the builder itself
+    assert {"/docs", "/benchmarks", "/src", "/tests"} <= set(included)
+    assert all((ROOT / name[1:]).exists() for name in included)
+    assert {name for name in there if name.endswith((".md", ".cff", ".txt")) or name == "/Makefile"} <= set(
+        included
+    ) | always

@@ -1,7 +1,24 @@
-"""`python -m heliograph` is the command `heliograph`."""
+"""The command `heliograph`, and `python -m heliograph`, as a process: Ctrl-C ends it without a word from the start."""
 
+import os
+import signal
 import sys
+from typing import NoReturn
 
-from heliograph.cli import main
 
-sys.exit(main())
+def command() -> NoReturn:
+    """Run the command and end the process with its exit code."""
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, lambda *_: os._exit(130))  # while it is imported there is nothing to undo
+    from heliograph.cli import INTERRUPTED, main
+
+    code = main()
+    if code == INTERRUPTED:  # what other threads still compute is not waited for
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    sys.exit(code)
+
+
+if __name__ == "__main__":
+    command()

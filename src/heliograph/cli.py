@@ -1,13 +1,16 @@
 """The command `heliograph`: it reads files, calls the library and writes files. Help must not wait for JAX."""
 
+import re
 import signal
 import sys
-from collections.abc import Sequence
-from contextlib import suppress
+from _thread import interrupt_main
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
+from threading import Timer
 from types import FrameType
-from typing import Annotated
+from typing import Annotated, Any, NoReturn
 
 from cyclopts import App, CycloptsError, Parameter
 
@@ -15,6 +18,8 @@ import heliograph
 from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143  # the last two are 128 + the signal's number
+
+SOON = 0.01  # seconds
 
 EXTRAS = {  # the extra that brings a package which the core does without
     "pyarrow": "tables",
@@ -33,6 +38,30 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "gym_electric_motor": "motor",
 }
 
+
+def _whole(_: type, tokens: Sequence[Any]) -> int:
+    """Digits: no fraction is rounded away."""
+    if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
+        raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
+    return int(tokens[0].value)
+
+
+def _path(_: type, tokens: Sequence[Any]) -> Path:
+    if not tokens[0].value or "\0" in tokens[0].value:
+        raise ValueError(f"expected a path, got {tokens[0].value!r}")
+    return Path(tokens[0].value)
+
+
+def number(text: str) -> Parameter:
+    """An option that is a whole number."""
+    return Parameter(help=text, converter=_whole)
+
+
+def place(text: str = "") -> Parameter:
+    """An option that is a file or folder."""
+    return Parameter(help=text, converter=_path)
+
+
 app = App(
     name="heliograph",
     help="State estimation over relay networks.",
@@ -46,8 +75,8 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, Parameter(help="CSV or Parquet: time, inputs and received measurements.")],
-    out: Annotated[Path, Parameter(help="CSV or Parquet to write: estimates with their claimed covariances.")],
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    out: Annotated[Path, place("CSV or Parquet to write: estimates with their claimed covariances.")],
 ) -> None:
     """Run the filters of your own network over measured data.
 
@@ -90,8 +119,8 @@ def run(
 @app.command
 def demo(
     *,
-    out: Annotated[Path, Parameter(help="Folder for the estimates, figures, report and summary; made if missing.")],
-    seed: Annotated[int, Parameter(help="Seed of the simulated relays.")] = 0,
+    out: Annotated[Path, place("Folder for the estimates, figures, report and summary; made if missing.")],
+    seed: Annotated[int, number("Seed of the simulated relays.")] = 0,
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
     example("demo", out=out, seed=seed)
@@ -102,8 +131,8 @@ def example(
     name: Annotated[str | None, Parameter(help="Which example; without it, the list of them.")] = None,
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder for the example's own, with report and summary.")] = None,
-    seed: Annotated[int, Parameter(help="Seed of what is simulated.")] = 0,
+    out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
+    seed: Annotated[int, number("Seed of what is simulated.")] = 0,
 ) -> None:
     """Run an example and report, or list them."""
     from heliograph.examples import examples, load_example
@@ -113,8 +142,10 @@ def example(
         width = max(map(len, known))
         print("\n".join(f"{each:{width}}  {what}" for each, what in known.items()))
         return
+    from heliograph.numerics.check import check_seed
+
     run_example = load_example(name)
-    run_example(_folder("example", out), seed)
+    run_example(_folder("example", out), check_seed("--seed", seed))
 
 
 @app.command
@@ -122,9 +153,9 @@ def reproduce(
     method: Annotated[str | None, Parameter(help="Which publication, or all; without it, the list of them.")] = None,
     /,
     *,
-    out: Annotated[Path | None, Parameter(help="Folder for figures, report, record and summary.")] = None,
-    runs: Annotated[int | None, Parameter(help="Monte Carlo runs; each publication has its own default.")] = None,
-    seed: Annotated[int, Parameter(help="Seed of the simulations.")] = 0,
+    out: Annotated[Path | None, place("Folder for figures, report, record and summary.")] = None,
+    runs: Annotated[int | None, number("Monte Carlo runs; each publication has its own default.")] = None,
+    seed: Annotated[int, number("Seed of the simulations.")] = 0,
 ) -> None:
     """Run a published method as printed and as improved, and judge each of its statements by this very run."""
     from heliograph.papers import METHODS
@@ -132,7 +163,7 @@ def reproduce(
     if method is None:
         print("\n".join(METHODS))
         return
-    from heliograph.numerics.check import check_count, fail
+    from heliograph.numerics.check import check_count, check_seed, fail
 
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":
@@ -140,20 +171,21 @@ def reproduce(
     target = _folder("reproduce", out)
     if runs is not None:
         check_count("--runs", runs)
+    check_seed("--seed", seed)
     for name in chosen:
         import_module(METHODS[name]).reproduce(target, runs, seed)
 
 
 @app.command
 def sweep(
-    campaign: Path,
+    campaign: Annotated[Path, place()],
     /,
     *,
-    out: Annotated[Path, Parameter(help="Folder for the results; what is already there is not computed again.")],
-    workers: Annotated[int | None, Parameter(help="Processes on this machine; one for each CPU by default.")] = None,
+    out: Annotated[Path, place("Folder for the results; what is already there is not computed again.")],
+    workers: Annotated[int | None, number("Processes here; 0: this one; by default one a CPU.")] = None,
     scheduler: Annotated[str | None, Parameter(help="Address of a Dask scheduler to work on instead.")] = None,
-    setting: Annotated[int | None, Parameter(help="Run only this setting, here in one process.")] = None,
-    chunk: Annotated[int | None, Parameter(help="And of it only this chunk.")] = None,
+    setting: Annotated[int | None, number("Run only this setting, here in one process.")] = None,
+    chunk: Annotated[int | None, number("And of it only this chunk.")] = None,
 ) -> int:
     """Simulate a network in many settings, into one labelled store that survives any interruption.
 
@@ -168,18 +200,40 @@ def sweep(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback."""
-    before = signal.signal(signal.SIGTERM, _terminate)
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
+
+    Ctrl-C ends it with INTERRUPTED and without a word, at any moment.
+    """
+    stopped: list[int] = []
+    try:
+        with _stoppable(stopped):
+            code = _command(arguments)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except Exception:
+        if stopped:  # what was interrupted told it in its own way
+            return INTERRUPTED
+        raise
+    return INTERRUPTED if stopped else code
+
+
+def _command(arguments: Sequence[str] | None) -> int:
     with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
         keep_compilations()
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
         code: int | None = command(*bound.args, **bound.kwargs)
         return code or 0
-    except (CycloptsError, ValueError) as error:
+    except CycloptsError as error:
+        return _refuse(str(error))
+    except ValueError as error:
+        from heliograph.numerics.check import InputError
+
+        if not isinstance(error, InputError):
+            raise
         return _refuse(str(error))
     except OSError as error:
-        return _refuse(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        return _refuse(f"{error.filename}: {error.strerror or error}" if error.filename else str(error))
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
@@ -187,10 +241,41 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _refuse(
             f'{error.name}: expected to be installed, got no such package: pip install "heliograph[{extra}]"'
         )
-    except KeyboardInterrupt:
-        return INTERRUPTED
+
+
+@contextmanager
+def _stoppable(stopped: list[int]) -> Iterator[None]:
+    """Have the signals to stop unwind what runs, so that no temporary file stays; notes each one to interrupt.
+
+    An interrupt that comes while a compiler calls back, or while an object is removed, is swallowed there: it is
+    raised again where that is told.
+    """
+
+    def interrupt(number: int, _: FrameType | None) -> NoReturn:
+        stopped.append(number)
+        raise KeyboardInterrupt
+
+    def swallowed(what: "sys.UnraisableHookArgs") -> None:
+        if issubclass(what.exc_type, KeyboardInterrupt):
+            again.append(Timer(SOON, interrupt_main))  # not here: it would be swallowed once more
+            again[-1].start()
+        else:
+            told(what)
+
+    again: list[Timer] = []
+    told, terminate = sys.unraisablehook, signal.signal(signal.SIGTERM, _terminate)
+    heard = signal.getsignal(signal.SIGINT)
+    if heard is not signal.SIG_IGN:  # as in the background, where nobody's Ctrl-C is meant
+        signal.signal(signal.SIGINT, interrupt)
+    sys.unraisablehook = swallowed
+    try:
+        yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for timer in again:
+            timer.cancel()
+        sys.unraisablehook = told
+        signal.signal(signal.SIGTERM, terminate)
+        signal.signal(signal.SIGINT, heard)
 
 
 def _folder(command: str, out: Path | None) -> Path:
@@ -204,7 +289,9 @@ def _folder(command: str, out: Path | None) -> Path:
 
 
 def _refuse(message: str) -> int:
-    print("heliograph:", " ".join(message.split()), file=sys.stderr)
+    from heliograph.files.quoting import visible
+
+    print("heliograph:", visible(" ".join(message.split())), file=sys.stderr)
     return BAD_INPUT
 
 

@@ -53,7 +53,7 @@ def test_a_chunk_half_written_is_written_again(tmp_path, expected):
     assert len(chunk_files(out)) == 3
     (out / "results.zarr" / "variance" / "c.0.1.0.0.0.0").unlink()
     (out / "results.zarr" / "variance" / "c.0.1.0.0.0.0123abcd.partial").write_bytes(b"half")
-    (out / ".results.zarr-killed").mkdir()
+    (out / ".results.zarr-killed_1").mkdir()
     result = run_campaign(campaign, out, workers=0)
     assert (result.already, result.computed) == (2, CHUNKS - 2)
     assert contents(out) == expected
@@ -61,7 +61,7 @@ def test_a_chunk_half_written_is_written_again(tmp_path, expected):
 
 def test_killed_before_the_store_is_whole(tmp_path, expected):
     campaign, out = write(tmp_path), tmp_path / "out"
-    (out / ".results.zarr-killed" / "new").mkdir(parents=True)
+    (out / ".results.zarr-killed_1" / "new").mkdir(parents=True)
     run_campaign(campaign, out, workers=0)
     assert contents(out) == expected and not list(out.glob(".*"))
 

@@ -7,6 +7,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from heliograph.files.durable import naming
 from heliograph.files.table import check_output, check_output_folder, read_table, write_table
 
 COLUMNS = {
@@ -67,6 +68,13 @@ def test_truth_values_are_one_and_zero_in_csv(tmp_path):
     [
         ("", ["data.csv", "an empty file"]),
         ("time,a\n", ["data.csv", "at least one row", "none"]),
+        ("time,a\n0,1_000\n", ["data.csv, row 1, column 'a': expected a number or an empty cell, got '1_000'"]),
+        ("time;a\n0;1\n", ["data.csv, header: expected names separated by commas, got semicolons in 'time;a'"]),
+        ("time\ta\n0\t1\n", ["data.csv, header: expected names separated by commas, got tabs in"]),
+        ("time,a\n0,1,5\n", ["row 1: expected 2 cells, one for each column, got 3: numbers have a decimal point"]),
+        ('time,a\n0,"1,5"\n', ["column 'a': expected a number or an empty cell, got '1,5': numbers have a decimal"]),
+        ("# made by hand\ntime,a\n0,1\n", ["data.csv, header: expected names of columns, got a comment, '# made"]),
+        ("time,a\n# a pause\n0,1\n", ["data.csv, row 1: expected numbers, got a comment, '# a pause'"]),
         ("\n\n", ["data.csv", "at least one row"]),
         ("time,a,a\n0,1,2\n", ["header", "distinct columns", "'a'"]),
         ("time,a\n0,1\n1,abc\n", ["row 2, column 'a'", "a number", "'abc'"]),
@@ -158,3 +166,29 @@ def test_estimates_are_readable_by_others(tmp_path):
     with (tmp_path / "out.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert float(rows[0]["a"]) == 1 / 3
+
+
+def test_a_full_disk_names_the_file(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("heliograph.files.table._write_csv", full)
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write_table(COLUMNS, tmp_path / "out.csv")
+    assert caught.value.filename == str(tmp_path / "out.csv") and not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device that is always full")
+def test_a_disk_that_is_really_full(tmp_path):
+    columns = {"a": np.arange(1e5)}
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        (tmp_path / ".out.csv.partial").symlink_to("/dev/full")
+        with naming(tmp_path / "out.csv"), (tmp_path / ".out.csv.partial").open("w") as file:
+            file.writelines(f"{v}\n" for v in columns["a"])
+    assert caught.value.filename == str(tmp_path / "out.csv")
+
+
+def test_a_header_is_no_formula_in_a_spreadsheet_and_is_read_as_it_was(tmp_path):
+    write_table({"=cmd|'!A0": np.ones(1), "-x": np.ones(1)}, tmp_path / "t.csv")
+    assert (tmp_path / "t.csv").read_text().startswith("'=cmd|'!A0,'-x")
+    assert list(read_table(tmp_path / "t.csv")) == ["=cmd|'!A0", "-x"]

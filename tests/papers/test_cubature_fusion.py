@@ -25,10 +25,12 @@ from heliograph.papers.cubature_fusion.setting import (
     plant,
     sensor,
 )  # fmt: skip
-from heliograph.papers.cubature_fusion.statements import statements, vacuous
+from heliograph.papers.cubature_fusion.statements import statements
 from heliograph.papers.cubature_fusion.variants import MixedCross, variants
+from heliograph.papers.statement import Sampled
 from tests import machine
 from tests.oracles import cubature_fusion as oracle
+from tests.papers.verdicts import both, check_verdicts
 
 FILTERS = {"open_loop", "mean_gain", "extended_polytope", "cubature_printed", "cubature_tight", "cubature_polytope",
            "cubature_zero_mean"}  # fmt: skip
@@ -113,7 +115,7 @@ def test_mixed_points_do_no_harm_where_propagation_moves_nothing():
     np.testing.assert_allclose(state.covariance, expected.covariance, atol=1e-13)
 
 
-def test_a_small_run_agrees_with_the_note():
+def test_a_small_run_agrees_with_another_implementation():
     nodes = {
         name: hg.Node(sensor(STRONG, i), channel(STRONG), {
             "mean_gain": filters(STRONG, i)["mean_gain"],
@@ -170,7 +172,7 @@ def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch):
             assert set(numbers) == NUMBERS
             assert set(numbers["worst_direction"]) == {"ratio", "standard_error", "z", "step", "node"}
     for claim in found["claims"]:
-        assert set(claim) == {"claim", "source", "paper", "ours", "verdict"} and claim["ours"]
+        assert set(claim) == {"claim", "source", "paper", "ours", "verdict", "evidence"} and claim["ours"]
         assert claim["verdict"] in {"holds", "holds_vacuously", "fails"}
     assert len({claim["claim"] for claim in found["claims"]}) == len(found["claims"])
     for number in range(1, 13):
@@ -202,7 +204,60 @@ def test_claims_follow_the_numbers(result):
                 for node, by_name in result.strong.statistics.items() if node != "fused"}  # fmt: skip
     strong = replace(result.strong, statistics=result.strong.statistics | polytope)
     assert {c.text: c.verdict for c in statements(replace(result, strong=strong))}[text] == "fails"
-    assert (vacuous(True, True), vacuous(True, False), vacuous(False, True)) == ("holds_vacuously", "holds", "fails")
+
+
+BOUND = both("actual_over_claimed", Sampled(1.02, 0.01), Sampled(1.05, 0.01))
+BELOW = both("own", Sampled(0.0, 0.1), Sampled(9.0, 0.1))
+VERDICTS = [
+    ("(10) is an upper bound", both("violations", 0, 1)),
+    ("The filter's Ξ", {"holds": {"printed": Sampled(0.9, 0.1), "strong": Sampled(1.2, 0.1)},
+                        "fails": {"printed": Sampled(0.9, 0.1), "strong": Sampled(1.4, 0.1)}}),
+    ("(29) minimises", both("relative_gradient", 1e-13, 1e-3)),
+    ("Ξ stays below", {"holds": {"factor": 0.99}, "holds_vacuously": {"factor": 1.01}}),
+    ("The scheme reliably", {
+        "holds": {"fused": Sampled(1, 0), "without_measurements": Sampled(2, 0), "state": 3.0},
+        "holds_vacuously": {"fused": Sampled(1, 0), "without_measurements": Sampled(1, 0), "state": 3.0},
+        "fails": {"fused": Sampled(4, 0), "without_measurements": Sampled(5, 0), "state": 3.0}}),
+    ("The fused trace", both("least_gain_percent", 0.0, -0.1)),
+    ("The RMSE stays", {"holds": {"least_root_over_rmse": 1.1, "without_measurements": 0.9},
+                        "holds_vacuously": {"least_root_over_rmse": 1.1, "without_measurements": 1.1},
+                        "fails": {"least_root_over_rmse": 0.9}}),
+    ("The cubature filter's RMSE", both("steps_above", 0, 1)),
+    ("The fused RMSE", {"holds": {"steps_above": 0, "without_measurements": 1},
+                        "holds_vacuously": {"steps_above": 0, "without_measurements": 0},
+                        "fails": {"steps_above": 1}}),
+    ("Measurements enhance", both("least_gain_of_a_node", 0.1, -0.1)),
+    *[(start, BOUND) for start in ("A filter that takes", "The polytope", "The zero-mean", "Trace-optimal intersection",
+                                   "Equal-weight", "The sequential central filter with the zero",
+                                   "The sequential central filter with the poly")],
+    ("Trace-optimal weights", {"holds": {"optimal": Sampled(1, 0.1), "equal": Sampled(2, 0.1)},
+                               "fails": {"optimal": Sampled(2, 0.1), "equal": Sampled(1, 0.1)}}),
+    ("The RMSE of cubature polytope", BELOW), ("The RMSE of cubature zero", BELOW), ("The RMSE of ci equal", BELOW),
+    ("The variance bounds", {"holds": {"excess_printed": 0.0, "excess_strong": 0.0}, "fails": {"excess_strong": 0.1}}),
+    ("A minus sign", {"holds": {"bound": 1.0, "possible": 0.9}, "fails": {"bound": 1.0, "possible": 1.1}}),
+    ("P^xy from", both("relative_error", 0.0, 0.1)),
+    ("One symbol", both("relative_gap", 0.0, 0.1)),
+    ("The other reading", BOUND),
+    ("The gain of Step 4", {"holds": {"factor_printed": 1.0, "factor_strong": 1.0}, "fails": {"factor_strong": 0.9}}),
+    ("The fused estimate", both("largest_error", 0.0, 0.1)),
+    ("The relay noise", both("printed_over_right_power", 1.0, 0.5)),
+    ("The cross terms", both("trace_added", 0.0, 0.1)),
+    ("x⁻ = f(x̂)", both("longest_offset", 0.0, 0.1)),
+    ("The cubature covariance", both("least_eigenvalue_of_difference", 0.0, -0.1)),
+    ("The Δ are", both("sum_of_probabilities_off_by", Sampled(0.01, 0.01), Sampled(0.04, 0.01))),
+    ("𝔖₄", both("with_constant_gain", 0.0, 0.1)),
+    ("RMSE and trace", both("mean_trace", 4.0, 16.0)),
+    ("The example's state", both("rotor_growth_after_100_steps", 0.9, 1.1)),
+]  # fmt: skip
+
+
+def test_verdicts_follow_from_evidence(result):
+    judged = [
+        s._replace(evidence={**s.evidence, "mean_root": 4.0}) if s.text.startswith("RMSE and trace") else
+        s._replace(evidence={**s.evidence, "papers": Sampled(1.0, 0.1)}) if "papers" in s.evidence else s
+        for s in statements(result)
+    ]  # fmt: skip
+    check_verdicts(judged, VERDICTS)
 
 
 def overstated(statistics):

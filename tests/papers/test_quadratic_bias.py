@@ -5,19 +5,35 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.papers.quadratic_bias import compute, setting
-from heliograph.papers.quadratic_bias.run import reproduce
+from heliograph.papers.quadratic_bias import compute, run, setting
+from heliograph.papers.quadratic_bias.run import reproduce, results
+from heliograph.papers.quadratic_bias.statements import statements
+from heliograph.papers.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
+from tests.papers.verdicts import both, check_verdicts
 
 # Means over t = 31 ... 100 by a separate implementation (enumerated monomials in NumPy), for what the oracle lacks.
 EXPECTED = {"memory": (0.0419766, 0.0393043), "cubic": (0.0328326, 0.0333223), "quartic": (0.0312705, 0.0326232)}
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def found(tmp_path_factory):
+    kept = []
+
+    def told(result):
+        kept.append(result)
+        return results(result)
+
     out = tmp_path_factory.mktemp("out")
-    reproduce(out, runs=128, seed=1)
-    return out / "quadratic-bias"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(run, "results", told)
+        run.reproduce(out, runs=128, seed=1)
+    return kept[0], out / "quadratic-bias"
+
+
+@pytest.fixture(scope="module")
+def folder(found):
+    return found[1]
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +78,7 @@ def test_covariances_of_the_variants(numbers):
         np.testing.assert_allclose(means, expected, rtol=0, atol=5.1e-8)  # seven decimals
 
 
-def test_gains_reach_what_was_promised(numbers):
+def test_gains_over_the_linear_filter(numbers):
     gain = numbers["gain_percent"]
     assert gain["quadratic"]["x1"] >= 50.4 and gain["cubic"]["x1"] >= 63.0 and gain["mixture"]["x1"] >= 90.0
     ratio = np.mean(numbers["covariance"]["cubic"]["x2"][31:]) / np.mean(numbers["covariance"]["linear"]["x2"][31:])
@@ -115,11 +131,28 @@ def test_every_file_is_there_and_the_record_can_be_read(folder):
 
 
 def test_claims_say_what_holds(numbers):
-    assert all(set(c) == {"claim", "source", "paper", "ours", "verdict"} for c in numbers["claims"])
+    assert all(set(c) == {"claim", "source", "paper", "ours", "verdict", "evidence"} for c in numbers["claims"])
     verdict = {c["claim"]: c["verdict"] for c in numbers["claims"]}
     assert verdict["The quadratic filter beats the linear one in the example"] == "holds"
     assert verdict["(35) minimises it"] == verdict["(31), (36) are the error covariance"] == "fails"
     assert verdict["P_t >= beta I"] == "holds_vacuously"
+
+
+BOUND = {"holds": {"applies": 1, "slack": 0.1}, "holds_vacuously": {"applies": 0}, "fails": {"applies": 1, "slack": -1}}
+VERDICTS = [
+    ("The quadratic filter beats", both("least_gain_percent", 0.1, -0.1)),
+    ("(31), (36)", {"holds": {"claimed": 1.0, "true": 1.0}, "fails": {"claimed": 1.0, "true": 1.1}}),
+    ("(35) minimises", {
+        "holds": {"true": 1.0, "best": 1.0, "excess_over_linear_with_outages": Sampled(-1.0, 0.1)},
+        "fails": {"true": 1.0, "best": 1.0, "excess_over_linear_with_outages": Sampled(1.0, 0.1)}}),
+    ("The noises", both("largest_gap", 5e-5, 6e-5)),
+    ("Table 1", both("belong_to_no_distribution", 0, 1)),
+    ("P_t >= beta I", BOUND), ("P_t is bounded", BOUND), ("P_t is bounded", BOUND),
+]  # fmt: skip
+
+
+def test_verdicts_follow_from_evidence(found):
+    check_verdicts(statements(found[0]), VERDICTS)
 
 
 def test_a_folder_with_other_files_and_too_few_runs_are_refused(tmp_path):

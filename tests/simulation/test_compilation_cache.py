@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
+import jax
 import pytest
 
 import heliograph as hg
@@ -52,6 +54,38 @@ def test_a_folder_that_cannot_be_made_is_refused(monkeypatch, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"folder .*file/inside: expected one that can be made"):
         hg.simulation.keep_compilations(tmp_path / "file" / "inside")
+
+
+def test_the_folder_is_its_users_alone(monkeypatch, tmp_path):
+    """What is compiled is run: nobody else may write it, whatever the umask."""
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    before = os.umask(0)
+    try:
+        for folder in (None, tmp_path / "mine"):
+            with monkeypatch.context() as patch:
+                patch.setattr(jax.config, "update", lambda *_: None)
+                made = hg.simulation.keep_compilations(folder)
+                assert made.stat().st_mode & 0o777 == 0o700
+                made.chmod(0o777)  # as it once was made
+                patch.delenv("JAX_COMPILATION_CACHE_DIR")
+                hg.simulation.keep_compilations(folder)
+                assert made.stat().st_mode & 0o777 == 0o700
+            os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    finally:
+        os.umask(before)
+
+
+def test_no_home_folder_is_one_line(monkeypatch):
+    for name in ("JAX_COMPILATION_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+
+    def homeless():
+        raise RuntimeError("Could not determine home directory.")
+
+    monkeypatch.setattr(Path, "home", homeless)
+    with pytest.raises(ValueError, match="folder for compiled programs: expected one, or a home folder to make it in"):
+        hg.simulation.keep_compilations()
 
 
 def test_import_is_lazy_and_changes_no_configuration():

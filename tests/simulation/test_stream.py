@@ -1,12 +1,43 @@
-"""A stream refuses what is not its filter's, with one line, and stays as it was."""
+"""A stream has the numbers of `run`, at little cost; it refuses what is not its filter's, and stays as it was."""
 
+import os
+import sys
+
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.model.estimate import Claim
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], 0.1, [1.0, -1.0], 1.0, [[1.0], [0.0]], inputs=["push"])
 SENSOR = hg.LinearSensor(np.eye(2), 0.5)
+ROW = hg.LinearSensor([[1.0, 0.0]], 0.5)
+PACKAGES = ("heliograph", "jax", "equinox")
+
+
+class Keeping(hg.AbstractFilter):
+    """Its state is the measurement before, and its mean the sum of that one and the present one."""
+
+    claim: Claim = eqx.field(static=True, default="none")
+    states: tuple[str, ...] = eqx.field(static=True, default=tuple(f"x{i}" for i in range(64)))
+    inputs: tuple[str, ...] = eqx.field(static=True, default=())
+    received: int = eqx.field(static=True, default=64)
+
+    def init(self):
+        return np.zeros((2, 64))
+
+    def predict(self, state, u=(), k=0):
+        return state
+
+    def correct(self, state, z, k=0):
+        return jnp.stack([state[1], z]), hg.model.Innovation(z, jnp.eye(64), 0.0)
+
+    def estimate(self, state):
+        return hg.Estimate(state[0] + state[1], jnp.full((64, 64), jnp.nan), self.claim)
+
+
 REFUSED = [
     ([1.0], [0.0], r"measurement: expected 2 numbers, got shape \(1,\)"),
     (1.0, [0.0], r"measurement: expected 2 numbers, got shape \(\)"),
@@ -80,3 +111,59 @@ def test_a_network_refuses_filters_that_do_not_fit_it():
     with pytest.raises(ValueError, match="fused 'all': expected one that hears the 4 numbers that arrive"):
         hg.Network(PLANT, {"a": node, "b": node}, {"all": item})
     hg.Network(PLANT, {"a": node, "b": node}, {"all": hg.filters.sequential_filter([item, item])})
+
+
+def test_every_bit_is_that_of_run():
+    relay = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.7), 0.1), hg.hop(hg.Discrete([0.8, 1.2], [0.4, 0.6], 0.1), 1)])
+    items = {"row": hg.cubature_filter(PLANT, ROW, relay), "extended": hg.extended_filter(PLANT, ROW, relay)}
+    rng = np.random.default_rng(0)
+    z, u = rng.normal(size=(20, 1)), rng.normal(size=(20, 1))
+    z[4] = np.nan
+    told = hg.run(hg.Network(PLANT, {"n": hg.Node(ROW, relay, items)}), {"n": z}, u).estimates["n"]
+    for name, item in items.items():
+        stream = hg.Stream(item)
+        for k in range(len(z)):
+            estimate = stream.push(z[k], u[k])
+            np.testing.assert_array_equal(estimate.mean, told[name].mean[k])
+            np.testing.assert_array_equal(estimate.covariance, told[name].covariance[k])
+            assert estimate.claim == told[name].claim
+
+
+def test_a_sample_runs_little_python():
+    """Calls of Python functions in a push, which is what it costs, as the step is compiled; not of shapes' checks."""
+    calls = 0
+
+    def count(frame, event, argument):
+        nonlocal calls
+        calls += event == "call" and any(f"{os.sep}{of}{os.sep}" in frame.f_code.co_filename for of in PACKAGES)
+
+    stream = hg.Stream(hg.linear_filter(PLANT, SENSOR, hg.perfect(2)))
+    stream.push([1.0, 0.0], [0.0])
+    sys.setprofile(count)
+    stream.push([1.0, 0.0], [0.0])
+    sys.setprofile(None)
+    assert calls <= 30, calls
+
+
+def test_what_is_pushed_is_copied():
+    """The caller may fill one array again and again."""
+    stream, other = hg.Stream(Keeping()), hg.Stream(Keeping())
+    z = np.zeros(64)
+    for k in range(4):
+        z[:] = k
+        told = stream.push(z).mean, other.push(np.full(64, float(k))).mean
+        z[:] = np.nan
+        np.testing.assert_array_equal(*told)
+
+
+def test_streams_of_one_filter_share_what_they_do_not_change():
+    item = hg.kalman_filter(PLANT, SENSOR)
+    one, other = hg.Stream(item), hg.Stream(item)
+    one.push([1.0, 2.0], [0.0])
+    assert one._placed is other._placed
+    np.testing.assert_array_equal(other.push([1.0, 2.0], [0.0]).mean, hg.Stream(item).push([1.0, 2.0], [0.0]).mean)
+
+
+def test_what_is_no_filter_makes_no_stream():
+    with pytest.raises(ValueError, match="stream: expected a filter, got LinearPlant"):
+        hg.Stream(PLANT)

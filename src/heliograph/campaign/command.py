@@ -12,6 +12,7 @@ from heliograph.campaign.read import load_campaign
 from heliograph.campaign.run import CampaignRun, run_campaign
 from heliograph.campaign.show import print_scores, showing
 from heliograph.campaign.summary import SUMMARY, read_summary
+from heliograph.files.quoting import visible
 from heliograph.numerics.check import fail
 
 FAILED = 1  # exit code: some work failed, the rest is there
@@ -45,10 +46,12 @@ def sweep(
     console = rich.console.Console()
     console.print(_done(result), soft_wrap=True, highlight=False, markup=False)
     console.print(f"Report: {report}", soft_wrap=True, highlight=False, markup=False)
+    for file in result.damaged:
+        print(f"heliograph: damaged, so it does not count as done: {file}", file=sys.stderr)
     for failure in result.failures:
         if only is not None:
             print(failure.traceback, end="", file=sys.stderr)
-        print(f"heliograph: failed: {failure}", file=sys.stderr)
+        print(f"heliograph: failed: {visible(str(failure))}", file=sys.stderr)
     if result.failures:
         print(f"heliograph: {out / FAILURES} says how to run each of them again alone", file=sys.stderr)
     return FAILED if result.failures else 0

@@ -5,30 +5,42 @@ too, or is done by another worker.
 """
 
 import json
+import logging
+import math
 import queue
 import signal
 import subprocess
 import sys
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread, Timer
 from typing import Any
 
 from heliograph.campaign.work import Job, Reply, perform
+from heliograph.numerics.check import fail
 
 Engine = Callable[[Iterable[Job]], Iterator[tuple[Job, Reply]]]
+TIMEOUT_MAX = threading.TIMEOUT_MAX  # the longest that a system waits
+CONNECT = 10  # seconds in which a scheduler answers
+LOOK = 0.01  # seconds between looks whether a cluster has done something
+LOST = "scheduler", "one that goes on to the end", "a lost connection: the same command goes on with what is missing"
 LOOK_AHEAD = 2  # jobs a cluster is given for each of its threads, so that none waits for this process
 
 
 def start_engine(
-    campaign: str, store: Path, workers: int, scheduler: str | None = None
+    campaign: str, store: Path, workers: int, scheduler: str | None = None, timeout: float = math.inf
 ) -> AbstractContextManager[Engine]:
-    """The engine on the cluster of a scheduler; else with so many worker processes; else, for none, in this process."""
+    """The engine on the cluster of a scheduler; else with so many worker processes; else, for none, in this process.
+
+    A job that takes longer than `timeout` seconds is given up, but for one in this process.
+    """
     if scheduler is not None:
-        return on_cluster(campaign, store, scheduler)
-    return in_processes(campaign, store, workers) if workers else in_this_process(campaign, store)
+        return on_cluster(campaign, store, scheduler, timeout)
+    return in_processes(campaign, store, workers, timeout) if workers else in_this_process(campaign, store)
 
 
 @contextmanager
@@ -38,9 +50,9 @@ def in_this_process(campaign: str, store: Path) -> Iterator[Engine]:
 
 
 @contextmanager
-def in_processes(campaign: str, store: Path, workers: int) -> Iterator[Engine]:
-    """As many jobs at a time as there are worker processes; one that dies is replaced."""
-    crew = [_Worker(campaign, store) for _ in range(workers)]
+def in_processes(campaign: str, store: Path, workers: int, timeout: float = math.inf) -> Iterator[Engine]:
+    """As many jobs at a time as there are worker processes; one that dies, or that takes too long, is replaced."""
+    crew = [_Worker(campaign, store, timeout) for _ in range(workers)]
     try:
         yield lambda jobs: _share(crew, deque(jobs))
     finally:
@@ -69,21 +81,33 @@ def _share(crew: list["_Worker"], waiting: deque[Job]) -> Iterator[tuple[Job, Re
 class _Worker:
     """A worker process and the pipes to it."""
 
-    def __init__(self, campaign: str, store: Path):
-        self.greeting = json.dumps([campaign, str(store)])
+    def __init__(self, campaign: str, store: Path, timeout: float):
+        self.greeting, self.timeout = json.dumps([campaign, str(store)]), timeout
         self.process: subprocess.Popen[str] | None = None
         self.stopped = False
 
     def ask(self, job: Job) -> Reply:
-        """Have a job done; a process that dies over it is replaced when the next job comes."""
+        """Have a job done; a process that dies over it, or is too late, is replaced when the next job comes."""
         process = self._alive()
+        late = Event()
+
+        def give_up() -> None:
+            late.set()
+            process.kill()
+
+        guard = Timer(min(self.timeout, TIMEOUT_MAX), give_up)
+        guard.daemon = True
+        guard.start()
         _say(process, json.dumps([job.setting, job.chunk]))
         assert process.stdout is not None
         line = process.stdout.readline()
-        if line.endswith("\n"):
+        guard.cancel()
+        if line.endswith("\n") and not late.is_set():
             return Reply(**json.loads(line))
         code = process.wait()
         self._end()
+        if late.is_set():
+            return _too_late(self.timeout)
         return Reply(error=f"WorkerDied: the worker process ended with {_ending(code)}")
 
     def _alive(self) -> subprocess.Popen[str]:
@@ -123,40 +147,81 @@ def _say(process: subprocess.Popen[str], line: str) -> None:
         process.stdin.flush()
 
 
+def _too_late(timeout: float) -> Reply:
+    return Reply(error=f"TimedOut: no answer within {timeout:g} s, the campaign's timeout", late=True)
+
+
 def _ending(code: int) -> str:
     return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
 
 
 @contextmanager
-def on_cluster(campaign: str, store: Path, address: str) -> Iterator[Engine]:
+def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.inf) -> Iterator[Engine]:
     """On a Dask cluster whose workers have this package and see the store's folder; it does again what a dead one had.
 
+    Jobs are given up when none came back for `timeout` seconds.
+
     Raises:
-        OSError: no scheduler at the address.
+        ValueError: no scheduler at the address, or one that dies.
         ModuleNotFoundError: the extra `cluster` is not installed.
     """
     from distributed import Client
 
     start: Any = Client  # it has no types
-    with start(address, set_as_default=False) as client:
-        yield lambda jobs: _submit(client, campaign, str(store), deque(jobs))
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what there is to say is said in one line
+    try:
+        client = start(address, set_as_default=False, timeout=CONNECT)
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        raise fail(f"scheduler {address}", "the address of a Dask scheduler that answers", _line(error)) from None
+    try:
+        yield lambda jobs: _submit(client, campaign, str(store), deque(jobs), timeout)
+    finally:
+        client.close(timeout=CONNECT)
 
 
-def _submit(client: Any, campaign: str, store: str, waiting: deque[Job]) -> Iterator[tuple[Job, Reply]]:
+def _submit(client: Any, campaign: str, store: str, waiting: deque[Job], timeout: float) -> Iterator[tuple[Job, Reply]]:
     from distributed import as_completed
 
     jobs: dict[object, Job] = {}
     collect: Any = as_completed
     flying = collect(loop=client.loop)
     while waiting or jobs:
-        room = max(LOOK_AHEAD * sum(client.nthreads().values()), 1) - len(jobs)
+        room = max(LOOK_AHEAD * sum(_reached(client, client.nthreads).values()), 1) - len(jobs)
         for _ in range(min(room, len(waiting))):
             job = waiting.popleft()
             future = client.submit(perform, campaign, store, job.setting, job.chunk, pure=False)
             jobs[future] = job
             flying.add(future)
-        future = next(flying)
+        future = _next(client, flying, timeout)
+        if future is None:
+            client.cancel(list(jobs))
+            yield from ((job, _too_late(timeout)) for job in jobs.values())
+            return
         yield jobs.pop(future), _result(future)
+
+
+def _next(client: Any, flying: Any, timeout: float) -> Any:
+    """The next job that is done; None if none is for `timeout` seconds."""
+    waited = 0.0
+    while not flying.has_ready():
+        if client.status != "running":
+            raise fail(*LOST)
+        if waited >= timeout:
+            return None
+        time.sleep(LOOK)
+        waited += LOOK
+    return _reached(client, lambda: next(flying))
+
+
+def _reached(client: Any, ask: Callable[[], Any]) -> Any:
+    try:
+        return ask()
+    except (OSError, RuntimeError, TimeoutError):
+        raise fail(*LOST) from None
+
+
+def _line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _result(future: Any) -> Reply:
@@ -164,4 +229,4 @@ def _result(future: Any) -> Reply:
         reply: Reply = future.result()
         return reply
     error = future.exception() if future.status == "error" else RuntimeError(f"the task was {future.status}")
-    return Reply(error=f"{type(error).__name__}: {' '.join(str(error).split())}")
+    return Reply(error=_line(error))

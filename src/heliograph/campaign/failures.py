@@ -1,7 +1,6 @@
 """What failed in a campaign, with all that is needed to run it again alone."""
 
 import json
-import os
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -9,6 +8,7 @@ from typing import TypedDict
 
 from heliograph.campaign.plan import Campaign, Setting
 from heliograph.campaign.work import Job, Reply
+from heliograph.files.durable import naming, replace
 
 FAILURES = "failures.json"
 
@@ -72,15 +72,17 @@ def failure(campaign: Campaign, job: Job, reply: Reply) -> Failure:
 def write_failures(out: Path, campaign: Campaign, failures: list[Failure], tried: list[Job]) -> None:
     """Write failures.json beside the store: these, and the earlier ones of what was not tried now; none, no file."""
     path = out / FAILURES
+    partial = path.with_name(f".{path.name}.partial")
     jobs = {*tried, *(Job(job.setting) for job in tried)}
     left = [entry for entry in read_failures(out) if Job(entry["setting"], entry["chunk"]) not in jobs]
     entries = [*left, *(asdict(item) | {"command": command(campaign, out, item)} for item in failures)]
     if not entries:
         path.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)  # of a process that was killed
         return
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
-    os.replace(partial, path)
+    with naming(path):
+        partial.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    replace(partial, path)
 
 
 def command(campaign: Campaign, out: Path, item: Failure) -> str:

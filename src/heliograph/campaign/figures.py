@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from heliograph.campaign.plan import Campaign, Setting, canonical
 from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import Score
+from heliograph.files.quoting import in_figure
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, STYLE, VERMILION, WIDTH
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED)
@@ -77,11 +78,12 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
             own.sort(key=lambda score: float(values[score.setting]))
             x = [values[score.setting] for score in own]
             y, error = _columns(own, quantity)
-            axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=name)
-        axes.set_title(title)
+            label = in_figure(name)
+            axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
+        axes.set_title(in_figure(title))
     drawn = [score for part in shown.values() for score in part]
     _scale(grid[0], [values[score.setting] for score in drawn], "x")
-    figure.supxlabel(parameter, fontsize=10, color=INK)
+    figure.supxlabel(in_figure(parameter), fontsize=10, color=INK)
     _finish(figure, grid, drawn, quantity, colours)
     return figure
 
@@ -98,10 +100,10 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
             own = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
             y, error = _columns(own, quantity)
             rows = [settings.index(score.setting) + shift for score in own]
-            axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=name)
+            axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
         axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)
-        axes.set_title(node)
+        axes.set_title(in_figure(node))
         if quantity is NEES:
             axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
     drawn = [score for score in scores if score.node in nodes and score.setting in settings]
@@ -113,7 +115,7 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
 
 def _named(campaign: Campaign, setting: int) -> str:
     text = ", ".join(f"{name} = {value}" for name, value in campaign.settings[setting].items())
-    return text if len(text) <= 36 else text[:35] + "…"
+    return in_figure(text if len(text) <= 36 else text[:35] + "…")
 
 
 def _panels(count: int, height: float, columns: int = 2) -> tuple[Figure, list[Axes]]:
@@ -156,7 +158,7 @@ def _scale(axes: Axes, values: Sequence[float], axis: str) -> None:
 
 def _legend(figure: Figure, grid: list[Axes], colours: Mapping[str, str]) -> None:
     entries = {name: handle for axes in grid for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
-    names = [name for name in colours if name in entries]
+    names = [name for name in map(in_figure, colours) if name in entries]
     figure.legend(
         [entries[name] for name in names],
         names,

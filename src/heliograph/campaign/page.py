@@ -5,7 +5,7 @@ from pathlib import Path
 
 from heliograph.campaign.failures import FAILURES, Entry, read_failures
 from heliograph.campaign.figures import PANELS, campaign_figures
-from heliograph.campaign.plan import Campaign
+from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.show import score_headers, score_row
 from heliograph.campaign.summary import SUMMARY, Score
 from heliograph.report.figures import svg
@@ -39,7 +39,7 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
             _reading(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
         ],
-        footer=", ".join(f"{package} {number}" for package, number in campaign.versions.items()),
+        footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
@@ -16,7 +17,13 @@ from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
 BITWISE = ("heliograph", "jax", "jaxlib", "equinox", "numpy", "zarr")  # packages that decide about the store's bytes
-
+SETTINGS = (  # of JAX that do
+    "jax_default_matmul_precision",
+    "jax_default_prng_impl",
+    "jax_disable_most_optimizations",
+    "jax_numpy_dtype_promotion",
+    "jax_threefry_partitionable",
+)
 
 Setting = dict[str, object]  # keyword arguments of the network's function, as JSON can hold them
 
@@ -36,7 +43,8 @@ class Campaign:
     """A campaign as read from its file, with the source of the network's module: all that its results depend on.
 
     settings: the keyword arguments of the network's function, one dictionary for each setting. inputs: by name a
-    number, or one for each step. keep: "errors" or "trajectories". path: of the file.
+    number, or one for each step. keep: "errors" or "trajectories". path: of the file. timeout: seconds that building
+    a setting, or computing a chunk, may take; no result depends on it.
     """
 
     text: str
@@ -50,6 +58,7 @@ class Campaign:
     keep: str
     inputs: dict[str, float | list[float]]
     settings: list[Setting]
+    timeout: float
     versions: dict[str, str]
 
     @property
@@ -105,8 +114,10 @@ def from_json(text: str) -> Campaign:
 
 
 def versions() -> dict[str, str]:
-    """Installed versions of the packages that decide about the store's bytes."""
-    return {name: version(name) for name in BITWISE}
+    """What decides about the store's bytes beside the campaign: packages, and how JAX is told to compute."""
+    packages = {name: version(name) for name in BITWISE}
+    settings = {name: str(jax.config.values[name]) for name in SETTINGS}
+    return packages | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
 
 
 @lru_cache(maxsize=8)

@@ -9,15 +9,16 @@ from itertools import product
 from pathlib import Path
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.simulation.lanes import BLOCK
 
-KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "grid", "settings")
+KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
 KEEP = ("errors", "trajectories")
 # Names that the store's variables and the table's columns have already.
 VARIABLES = ("error", "variance", "nees_per_dimension", "truth", "measurement", "claim")
 COLUMNS = ("rmse", "rmse_error", "nees_error", "runs", "finite_runs")
 CHUNK = 256
+TIMEOUT = 3600.0  # seconds, compiling included
 
 
 def load_campaign(path: str | Path) -> Campaign:
@@ -26,7 +27,8 @@ def load_campaign(path: str | Path) -> Campaign:
     Keys: network = "my_network.py:build" (a function of the settings; the path counts from the campaign's folder),
     horizon, runs, and [grid] name = [values], whose product is taken, or [[settings]], one table for each. Optional:
     seed (0), chunk (runs computed and stored at once, 256; a multiple of 32), keep ("errors", or "trajectories" for
-    truth and measurements too), [inputs] name = a number or one for each step.
+    truth and measurements too), [inputs] name = a number or one for each step, timeout (seconds that a worker may take
+    to build a setting or compute a chunk, 3600).
 
     Raises:
         ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
@@ -69,11 +71,12 @@ def read_campaign(text: str, source: str, path: Path) -> Campaign:
         path=str(path.absolute()),
         horizon=horizon,
         runs=runs,
-        seed=_seed(table.get("seed", 0), name),
+        seed=check_seed(f"{name}, seed", table.get("seed", 0)),
         chunk=min(_chunk(table.get("chunk", CHUNK), name), BLOCK * -(-runs // BLOCK)),
         keep=_one_of(table.get("keep", KEEP[0]), KEEP, f"{name}, keep"),
         inputs=_inputs(table.get("inputs", {}), horizon, name),
         settings=_settings(table, name),
+        timeout=_timeout(table.get("timeout", TIMEOUT), name),
         versions=versions(),
     )
 
@@ -101,17 +104,17 @@ def _count(table: Mapping[str, object], key: str, name: str) -> int:
     return check_count(f"{name}, {key}", table.get(key, "none"))
 
 
-def _seed(value: object, name: str) -> int:
-    if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 2**32:
-        raise fail(f"{name}, seed", "a whole number from 0 to 4294967295", _shown(value))
-    return value
-
-
 def _chunk(value: object, name: str) -> int:
     count = check_count(f"{name}, chunk", value)
     if count % BLOCK:
         raise fail(f"{name}, chunk", f"a multiple of {BLOCK}, the runs simulated side by side", count)
     return count
+
+
+def _timeout(value: object, name: str) -> float:
+    if not isinstance(value, int | float) or not _is_number(value) or value <= 0:
+        raise fail(f"{name}, timeout", "a positive number of seconds", _shown(value))
+    return float(value)
 
 
 def _one_of(value: object, choices: Sequence[str], name: str) -> str:

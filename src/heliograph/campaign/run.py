@@ -15,14 +15,16 @@ from heliograph.campaign.store import (
     create,
     described,
     done_chunks,
+    remove_damaged,
     remove_partial,
-    remove_unmade,
     stored_labels,
     write_claims,
 )
 from heliograph.campaign.summary import SUMMARY, write_summary
 from heliograph.campaign.work import Job, Reply
-from heliograph.files.output_folder import check_replaceable
+from heliograph.files.holding import only_here
+from heliograph.files.output_folder import check_replaceable, clear_left
+from heliograph.files.table import check_output_folder
 from heliograph.numerics.check import check_count, fail
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
@@ -32,12 +34,13 @@ Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, 
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """What a call did: how many chunks were there, how many it computed, and what failed."""
+    """What a call did: how many chunks were there, how many it computed, what failed, and which files were damaged."""
 
     folder: Path
     already: int
     computed: int
     failures: list[Failure]
+    damaged: list[Path]
 
 
 def run_campaign(
@@ -53,30 +56,51 @@ def run_campaign(
     workers: processes of this machine, one for each CPU unless given; 0 computes in this process. scheduler: the
     address of a Dask scheduler instead. only: (setting, chunk) pairs instead of all. tell(what, done, total) is called
     as the work goes on. The store's bytes depend on the campaign alone: neither on the workers, nor on how often and
-    where it was interrupted. A chunk that fails is tried three times, then reported; the rest goes on.
+    where it was interrupted. A chunk that fails is tried three times, then reported, one that takes longer than the
+    campaign's `timeout` at once; the rest goes on. A chunk whose files do not agree with their checksums is computed
+    again. Nothing is timed in this process, where a debugger may follow.
 
     Raises:
-        ValueError: a folder of something else or of another campaign, a setting or chunk that is none, no setting
-            that can be built, settings whose plants differ in their states.
-        OSError: no scheduler at the address.
+        ValueError: a folder of something else or of another campaign, or in which one is at work; a setting or chunk
+            that is none, no setting that can be built, settings whose plants differ in their states; no scheduler at
+            the address, or one that dies: what it has done is there.
         ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
     """
     out, tell = Path(out), tell or (lambda what, done, total: None)
+    check_output_folder(out)
+    with only_here(out) as alone:
+        if not alone:
+            raise fail(f"results folder {out}", "no other campaign at work in it", "one that is")
+        return _run(campaign, out, workers, scheduler, only, tell)
+
+
+def _run(
+    campaign: Campaign,
+    out: Path,
+    workers: int | None,
+    scheduler: str | None,
+    only: Sequence[tuple[int, int]] | None,
+    tell: Tell,
+) -> CampaignRun:
     store = (out / STORE).absolute()
-    remove_unmade(store)
+    clear_left(store)
     check_replaceable(out, f"{STORE}/zarr.json")
     wanted = _wanted(campaign, only)
     done: set[tuple[int, ...]] = set()
+    damaged: list[Path] = []
     if store.is_dir():
         check_same(store, campaign)
+        damaged = remove_damaged(store, campaign)
+        remove_partial(store)
         done = done_chunks(store, campaign)
     missing = [job for job in wanted if (job.setting, job.chunk) not in done]
     already = len(wanted) - len(missing)
-    if not missing and (out / SUMMARY).is_file():
-        return CampaignRun(out, already, 0, [])
+    if not missing and not damaged and (out / SUMMARY).is_file():
+        return CampaignRun(out, already, 0, [], [])
     failed: dict[Job, Reply] = {}
-    if missing:
-        with start_engine(campaign.as_json(), store, _count(workers, len(missing)), scheduler) as engine:
+    if missing or damaged:
+        count = _count(workers, len(missing) or 1)
+        with start_engine(campaign.as_json(), store, count, scheduler, campaign.timeout) as engine:
             (out / SUMMARY).unlink(missing_ok=True)  # it would not hold for what follows
             failed = _compute(engine, campaign, store, missing, already, tell)
     remove_partial(store)
@@ -84,7 +108,7 @@ def run_campaign(
     write_failures(out, campaign, failures, tried=wanted)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
-    return CampaignRun(out, already, len(missing) - lacking, failures)
+    return CampaignRun(out, already, len(missing) - lacking, failures, damaged)
 
 
 def _compute(
@@ -121,7 +145,9 @@ def _count(workers: int | None, jobs: int) -> int:
 def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int], tell: Tell) -> dict[Job, Reply]:
     """Make the store if it is not there, and write the claims it lacks; returns the settings that cannot be built."""
     new = not store.is_dir()
-    lacking = range(len(campaign.settings)) if new else sorted(settings - described(store))
+    begun = {setting for setting, _ in done_chunks(store, campaign)} if not new else set()  # its claims may be damaged
+    known = set() if new else {setting for (setting,) in described(store)}
+    lacking = range(len(campaign.settings)) if new else sorted((settings | begun) - known)
     jobs = [Job(setting) for setting in lacking]
     found: dict[int, Description] = {}
 
@@ -148,14 +174,16 @@ def _try(
 ) -> dict[Job, Reply]:
     """Have jobs done, accept(job, value, how many are done) the good replies; return the last of those that failed."""
     done, left = 0, {job: Reply() for job in jobs}
+    hung: list[Job] = []  # what took too long once is not waited for again
     for _ in range(TRIES):
-        for job, reply in engine(list(left)):
+        for job, reply in engine([job for job in left if job not in hung]):
             if reply.error:
                 left[job] = reply
+                hung += [job] if reply.late else []
             else:
                 del left[job]
                 done += 1
                 accept(job, reply.value, done)
-        if not left:
+        if len(left) == len(hung):
             break
     return left

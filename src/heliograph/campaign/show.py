@@ -9,10 +9,12 @@ from textwrap import fill
 import rich.box
 import rich.console
 import rich.table
+from rich.text import Text
 
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.run import Tell
 from heliograph.campaign.summary import Score
+from heliograph.files.quoting import visible
 from heliograph.report.progress import Countdown, counting
 
 ROWS = 30  # of the printed table; the file has all
@@ -62,10 +64,12 @@ def print_scores(campaign: Campaign, scores: Sequence[Score]) -> None:
     table = rich.table.Table(box=rich.box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     for i, header in enumerate(score_headers(campaign)):
         table.add_column(
-            fill(header, 7), overflow="fold", justify="right" if i >= len(campaign.parameters) + 3 else "left"
+            Text(fill(visible(header), 7)),
+            overflow="fold",
+            justify="right" if i >= len(campaign.parameters) + 3 else "left",
         )
     for score in scores[:ROWS]:
-        table.add_row(*score_row(campaign, score))
+        table.add_row(*(Text(visible(cell)) for cell in score_row(campaign, score)))
     console = rich.console.Console()
     console.print(table)
     if len(scores) > ROWS:

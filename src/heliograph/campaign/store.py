@@ -1,25 +1,27 @@
 """The labelled Zarr store of a campaign: made whole before the first run, then filled file by file.
 
-Every chunk of runs has files of its own, each written under another name and then renamed. So a chunk is done when its
-files are there, whoever wrote them and whatever was killed meanwhile, and the bytes depend on the campaign alone.
+Every chunk of runs has files of its own, each with a checksum, written under another name and then renamed. So a chunk
+is done when its files are there and agree with their checksums, whoever wrote them and whatever was killed meanwhile,
+and the bytes depend on the campaign alone.
 """
 
 import json
 import os
-import shutil
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import google_crc32c
 import numpy as np
 import zarr
-from zarr.codecs import ZstdCodec
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
 from heliograph.campaign.labels import Claims, Labels, labels_from
 from heliograph.campaign.plan import Campaign, Chunk
 from heliograph.campaign.read import read_campaign
+from heliograph.files.durable import sync
 from heliograph.files.output_folder import whole_folder
 from heliograph.numerics.check import fail
 
@@ -119,7 +121,7 @@ def _create(
         chunks=chunks,
         dtype=str if text else kind,
         fill_value=fill,
-        compressors=None if text else ZstdCodec(level=1),
+        compressors=(Crc32cCodec(),) if text else (ZstdCodec(level=1), Crc32cCodec()),
         dimension_names=axes,
         attributes=dict(attributes),
         chunk_key_encoding={"name": "default", "separator": "."},  # one flat folder for each variable
@@ -138,6 +140,7 @@ def write_chunk(path: Path, chunk: Chunk, values: Mapping[str, np.ndarray]) -> N
     group = zarr.open_group(path, mode="r+")
     for name, block in values.items():
         _open(group, name)[chunk.setting : chunk.setting + 1, chunk.start : chunk.stop] = block[None]
+        _sync(path / name, f"c.{chunk.setting}.{chunk.number}.")
 
 
 def write_claims(path: Path, setting: int, claims: Claims) -> None:
@@ -145,27 +148,44 @@ def write_claims(path: Path, setting: int, claims: Claims) -> None:
     labels = stored_labels(path)
     table = [[claims.get(node, {}).get(name, "") for name in labels.filters] for node in labels.nodes]
     _open(zarr.open_group(path, mode="r+"), CLAIM)[setting : setting + 1] = np.array([table], dtype=object)
+    _sync(path / CLAIM, f"c.{setting}.")
+
+
+def _sync(folder: Path, start: str) -> None:
+    for file in folder.glob(f"{start}*"):
+        sync(file)
+    sync(folder)
 
 
 def done_chunks(path: Path, campaign: Campaign) -> set[tuple[int, ...]]:
     """(setting, chunk) of the chunks whose files are all there."""
-    return set.intersection(*(_written(path / name, 2) for name in variables(campaign)))
+    return set.intersection(*(set(_written(path / name, 2)) for name in variables(campaign)))
 
 
-def described(path: Path) -> set[int]:
-    """Settings whose claims are written."""
-    return {setting for (setting,) in _written(path / CLAIM, 1)}
+def described(path: Path) -> set[tuple[int, ...]]:
+    """(setting,) of the settings whose claims are written."""
+    return set(_written(path / CLAIM, 1))
 
 
-def _written(folder: Path, indices: int) -> set[tuple[int, ...]]:
-    files = (name.split(".") for name in os.listdir(folder) if name.startswith("c."))
-    return {tuple(int(part) for part in parts[1 : 1 + indices]) for parts in files if all(map(str.isdigit, parts[1:]))}
+def remove_damaged(path: Path, campaign: Campaign) -> list[Path]:
+    """Remove the files of chunks that do not agree with their checksums; returns which those were."""
+    files = [file for name in variables(campaign) for file in _written(path / name, 2).values()]
+    damaged = [file for file in (*files, *_written(path / CLAIM, 1).values()) if not _whole(file)]
+    for file in damaged:
+        file.unlink()
+    return damaged
 
 
-def remove_unmade(path: Path) -> None:
-    """Remove what a process left that was killed while it made the store."""
-    for left in path.parent.glob(f".{path.name}-*"):
-        shutil.rmtree(left)
+def _whole(file: Path) -> bool:
+    """Whether the last four bytes are the checksum of all others."""
+    data = file.read_bytes()
+    return len(data) > 4 and google_crc32c.value(data[:-4]) == int.from_bytes(data[-4:], "little")
+
+
+def _written(folder: Path, indices: int) -> dict[tuple[int, ...], Path]:
+    """Files of chunks by the first indices of the chunk."""
+    files = ((name, name.split(".")[1:]) for name in os.listdir(folder) if name.startswith("c."))
+    return {tuple(map(int, parts[:indices])): folder / name for name, parts in files if all(map(str.isdigit, parts))}
 
 
 def remove_partial(path: Path) -> None:
@@ -184,10 +204,10 @@ def stored_labels(path: Path) -> Labels:
 
 def check_same(path: Path, campaign: Campaign) -> None:
     """Raise ValueError unless the store was begun with this campaign, saying what differs."""
-    attributes: Any = zarr.open_group(path, mode="r").attrs
+    attributes: Any = _attributes(path)
     begun = dict(attributes["versions"])
     differs = [
-        f"{name} {campaign.versions.get(name)} (was {begun.get(name)})"
+        f"{name} {campaign.versions.get(name) or 'none'} (was {begun.get(name) or 'none'})"
         for name in campaign.versions
         if campaign.versions[name] != begun.get(name)
     ]
@@ -198,6 +218,17 @@ def check_same(path: Path, campaign: Campaign) -> None:
         raise fail(
             f"results folder {path.parent}", "the campaign it was begun with, or another folder", "; ".join(differs)
         )
+
+
+def _attributes(path: Path) -> Mapping[str, Any]:
+    try:
+        found = zarr.open_group(path, mode="r").attrs.asdict()
+        if not {"versions", "campaign", "network_source", "labels"} <= found.keys():
+            raise ValueError("not all that it had")
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        wanted = "a store that can be read, or another folder"
+        raise fail(f"{path / 'zarr.json'}", wanted, f"a damaged one ({type(error).__name__})") from None
+    return found
 
 
 def _differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:

@@ -1,7 +1,6 @@
 """The results of a campaign: the labelled store, and a table of RMSE and NEES by setting, node and filter."""
 
 import csv
-import os
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, get_type_hints
@@ -11,6 +10,8 @@ import zarr
 
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
+from heliograph.files.durable import naming, replace
+from heliograph.files.quoting import from_cell, in_cell
 from heliograph.numerics.check import fail
 
 if TYPE_CHECKING:
@@ -64,7 +65,8 @@ def read_summary(path: Path) -> list[Score]:
     """The scores that `write_summary` wrote."""
     kinds = get_type_hints(Score)
     with path.open(newline="", encoding="utf-8") as file:
-        return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in csv.DictReader(file)]
+        rows = [{name: from_cell(cell) for name, cell in row.items()} for row in csv.DictReader(file)]
+    return [Score(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in rows]
 
 
 def summarize(store: Path, campaign: Campaign) -> list[Score]:
@@ -124,11 +126,15 @@ def _mean(values: np.ndarray) -> tuple[float, float]:
 def write_summary(store: Path, campaign: Campaign, path: Path) -> None:
     """Write the scores with the parameters of their settings as CSV."""
     partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w", newline="", encoding="utf-8") as file:
+    with naming(path), partial.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["setting", *campaign.parameters, *(field.name for field in fields(Score)[1:])])
         for score in summarize(store, campaign):
             setting = campaign.settings[score.setting]
             values = [setting.get(name, "") for name in campaign.parameters]
-            writer.writerow([score.setting, *values, *astuple(score)[1:]])
-    os.replace(partial, path)
+            writer.writerow(map(_cell, [score.setting, *values, *astuple(score)[1:]]))
+    replace(partial, path)
+
+
+def _cell(value: object) -> object:
+    return value if isinstance(value, int | float) else in_cell(str(value))

@@ -31,15 +31,19 @@ class Job:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a job: a description if it was asked for, or an error in one line with its traceback."""
+    """What came of a job: a description if it was asked for, or an error in one line with its traceback.
+
+    late: it was given up, since it took longer than the campaign allows.
+    """
 
     value: Description | None = None
     error: str = ""
     traceback: str = ""
+    late: bool = False
 
 
 def perform(campaign: str, store: str, setting: int, chunk: int | None) -> Reply:
-    """Do one job of a campaign given as JSON; an error becomes a reply, since nobody else's work shall suffer."""
+    """Do one job of a campaign given as JSON; an error becomes a reply, and the rest goes on."""
     try:
         plan = from_json(campaign)
         _check_versions(plan)

@@ -1,11 +1,15 @@
 """A folder of results that appears whole or not at all."""
 
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from glob import escape as glob_escape
 from pathlib import Path
 
+from heliograph.files.durable import naming, sync, sync_tree
+from heliograph.files.holding import LOCK, held
 from heliograph.files.table import check_output_folder
 from heliograph.numerics.check import fail
 
@@ -13,23 +17,31 @@ from heliograph.numerics.check import fail
 def check_replaceable(target: Path, mark: str) -> None:
     """Raise ValueError unless `target` can be written and is new, empty, or holds a file `mark`: earlier results."""
     check_output_folder(target)
-    if target.is_dir() and any(target.iterdir()) and not (target / mark).is_file():
+    clear_left(target)
+    if target.is_dir() and {p.name for p in target.iterdir()} - {LOCK} and not (target / mark).is_file():
         raise fail(f"output folder {target}", f"a new or empty folder, or one with {mark} to replace", "other files")
 
 
 @contextmanager
 def whole_folder(target: Path) -> Iterator[Path]:
-    """An empty folder that takes the place of `target` at the end; after an error or interrupt all is as it was."""
+    """An empty folder that takes the place of `target` at the end; after an error or interrupt all is as it was.
+
+    What a process left that was killed over the same folder is cleared first, and what it had put aside is put back.
+    """
+    clear_left(target)
     made = [folder for folder in target.parents if not folder.exists()]
     target.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
     new, old = partial / "new", partial / "old"
     try:
         new.mkdir()
-        yield new
+        with held(partial), naming(target):
+            yield new
+            sync_tree(new)
         if target.exists():
             target.rename(old)
         new.rename(target)
+        sync(target.parent)
     except BaseException:
         if old.exists() and not target.exists():
             old.rename(target)
@@ -39,3 +51,16 @@ def whole_folder(target: Path) -> Iterator[Path]:
                 folder.rmdir()
         raise
     shutil.rmtree(partial)
+
+
+def clear_left(target: Path) -> None:
+    """Remove the hidden folders that killed processes left beside `target`; none that a living one works in."""
+    for left in target.parent.glob(f".{glob_escape(target.name)}-*") if target.parent.is_dir() else ():
+        if not re.fullmatch(r"-[a-z0-9_]{8}", left.name.removeprefix(f".{target.name}")) or not left.is_dir():
+            continue
+        with held(left) as ours:
+            if not ours or {p.name for p in left.iterdir()} - {"new", "old"}:
+                continue
+            if (left / "old").exists() and not target.exists():
+                (left / "old").rename(target)
+            shutil.rmtree(left)

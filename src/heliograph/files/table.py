@@ -2,15 +2,19 @@
 
 import csv
 import os
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from glob import escape as glob_escape
 from pathlib import Path
 
 import numpy as np
 
-from heliograph.numerics.check import fail
+from heliograph.files.durable import naming, replace
+from heliograph.files.quoting import from_cell, in_cell
+from heliograph.numerics.check import fail, shown
 
 FORMATS = (".csv", ".parquet")
 
@@ -77,12 +81,27 @@ def check_output_folder(folder: str | Path) -> None:
 def _whole(path: Path) -> Iterator[Path]:
     """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
+        if not _lives(left.name.split(".")[-2]):
+            left.unlink(missing_ok=True)
     try:
-        yield partial
-        os.replace(partial, path)
+        with naming(path):
+            yield partial
+            replace(partial, path)
     except BaseException:
         partial.unlink(missing_ok=True)
         raise
+
+
+def _lives(process: str) -> bool:
+    """Whether a process of this number runs; what others left is theirs where that cannot be told."""
+    try:
+        os.kill(int(process), 0)
+    except ProcessLookupError:
+        return False
+    except (ValueError, OSError):
+        return True
+    return True
 
 
 def _format(path: Path) -> str:
@@ -102,8 +121,8 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             lines = (line for line in csv.reader(file, strict=True) if line)
-            header = [name.strip() for name in next(lines, [])]
-            _check_distinct(path, header)
+            header = [from_cell(name.strip()) for name in next(lines, [])]
+            _check_header(path, header)
             rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
@@ -112,16 +131,33 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
 
 
 def _numbers(path: Path, header: list[str], number: int, line: list[str]) -> list[float]:
+    if line[0].lstrip().startswith("#"):
+        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: a table has none")
     if len(line) != len(header):
-        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(line))
+        hint = ": numbers have a decimal point" if len(line) > len(header) else ""
+        raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
     return [_number(path, name, number, cell.strip()) for name, cell in zip(header, line, strict=True)]
 
 
 def _number(path: Path, name: str, number: int, cell: str) -> float:
     try:
+        if "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
         return float(cell) if cell else np.nan
     except ValueError:
-        raise fail(f"{path}, row {number}, column {name!r}", "a number or an empty cell", repr(cell)) from None
+        hint = ": numbers have a decimal point" if re.fullmatch(r"[+-]?\d+,\d+", cell) else ""
+        wanted = "a number or an empty cell"
+        raise fail(f"{path}, row {number}, column {name!r}", wanted, f"{shown(cell)}{hint}") from None
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
+    line = ",".join(header)
+    if line.startswith("#"):
+        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: a table has none")
+    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
+        if len(header) == 1 and mark in line:
+            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}")
+    _check_distinct(path, header)
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
@@ -145,7 +181,7 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
 def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
     with path.open("x", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(columns)
+        writer.writerow(map(in_cell, columns))
         writer.writerows(zip(*(_plain(c).tolist() for c in columns.values()), strict=True))
 
 

@@ -114,7 +114,7 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
         ValueError: another shape, infinite values, or no real numbers.
     """
     found = _numbers("measurement", z, item.received or None)
-    if not isinstance(found, jax.core.Tracer) and np.any(np.isinf(found)):
+    if isinstance(found, np.ndarray) and np.isinf(found).any():
         raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(found).tolist())
     return found if item.received else found[:0]
 
@@ -126,7 +126,7 @@ def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
         ValueError: another shape, values that are not finite, or no real numbers.
     """
     found = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
-    if not isinstance(found, jax.core.Tracer) and not np.all(np.isfinite(found)):
+    if isinstance(found, np.ndarray) and not np.isfinite(found).all():
         raise fail("inputs", "finite numbers", np.asarray(found).tolist())
     return found
 
@@ -150,13 +150,13 @@ def step_number(item: AbstractFilter, k: Step) -> Step:
 def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
     """Real numbers of one axis as an array of floats; a single number will do for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(value)):
-        found: Array = jnp.asarray(value, dtype=float)
-    else:
-        try:
-            found = np.asarray(value)
-        except ValueError:  # rows of different lengths
-            raise fail(name, expected, repr(value)[:60]) from None
+    try:
+        found: Array = np.asarray(value)
+    except jax.errors.TracerArrayConversionError:
+        found = jnp.asarray(value, dtype=float)
+    except ValueError:  # rows of different lengths
+        raise fail(name, expected, repr(value)[:60]) from None
+    if isinstance(found, np.ndarray):
         if found.dtype.kind not in "fiub":
             raise fail(name, expected, repr(value)[:60])
         found = found.astype(np.float64)

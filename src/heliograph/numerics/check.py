@@ -11,12 +11,17 @@ from heliograph.numerics.traced import is_traced
 
 SYMMETRY_TOLERANCE = 1e-10  # relative to the largest entry: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # relative to the largest eigenvalue, for the same reason
+MOST = 2**32 - 1  # of runs and steps, since each has a key of its own in which 32 bits count
 PROBABILITY_TOLERANCE = 1e-9  # sums of decimal fractions such as .1 + .2 + .7
 
 
-def fail(name: str, expected: str, got: object) -> ValueError:
-    """Build the one error that every check raises: name, expectation, what came."""
-    return ValueError(f"{name}: expected {expected}, got {got}")
+class InputError(ValueError):
+    """What was given cannot be used; any other ValueError is a defect."""
+
+
+def fail(name: str, expected: str, got: object) -> InputError:
+    """Build the one error that every check raises, in one line: name, expectation, what came."""
+    return InputError(" ".join(f"{name}: expected {expected}, got {got}".split()))
 
 
 def shown(value: object) -> str:
@@ -72,7 +77,17 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
 def check_count(name: str, value: object, least: int = 1) -> int:
     """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise fail(name, "a positive whole number" if least == 1 else f"a whole number of at least {least}", value)
+        wanted = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
+        raise fail(name, wanted, value if isinstance(value, int | float) else shown(value))
+    if value > MOST:
+        raise fail(name, f"at most {MOST}", value)
+    return int(value)
+
+
+def check_seed(name: str, value: object) -> int:
+    """Return a whole number that 32 bits hold, as the keys of draws do."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST:
+        raise fail(name, f"a whole number from 0 to {MOST}", shown(value))
     return int(value)
 
 

@@ -1,34 +1,77 @@
-"""One statement of a publication, judged."""
+"""One statement of a publication, the evidence on it, and the verdict that follows."""
 
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 Verdict = Literal["holds", "holds_vacuously", "fails"]
 
+SIGNIFICANT = 3.0  # standard errors: what differs by less may be sampling
+
+
+class Sampled(NamedTuple):
+    """A number found by simulation, and its standard error."""
+
+    value: float
+    error: float
+
+    def at_most(self, limit: float) -> bool:
+        """Whether it is, but for sampling; not if it is NaN."""
+        return self.value - limit <= SIGNIFICANT * self.error
+
+    def below(self, limit: float) -> bool:
+        """Whether it is, sampling set aside."""
+        return self.value - limit < -SIGNIFICANT * self.error
+
+
+Evidence: TypeAlias = Mapping[str, "float | Sampled"]
+
 
 class Statement(NamedTuple):
-    """What a publication states, where, what it says there in numbers, what is found here, and the verdict.
+    """What a publication states, where, what it says there in numbers, what is found here, and how that is judged.
 
-    "holds_vacuously": true, but so it would be without any measurement, or its premise is never met.
+    `evidence` are the numbers that decide, by name: those that were simulated with their standard errors. `judge` takes
+    them by these names and depends on nothing else.
     """
 
     text: str
     source: str
     paper: str
     ours: str
-    verdict: Verdict
+    evidence: Evidence
+    judge: Callable[..., Verdict]
 
-    def entry(self) -> dict[str, str]:
+    @property
+    def verdict(self) -> Verdict:
+        """What follows from the evidence.
+
+        "holds_vacuously": true, but so it would be without any measurement, or its premise is never met.
+        """
+        return self.judged()
+
+    def judged(self, **other: "float | Sampled") -> Verdict:
+        """The verdict that would follow if some of the evidence were other."""
+        return self.judge(**{**self.evidence, **other})
+
+    def entry(self) -> dict[str, Any]:
         """As it stands in a summary, which calls a statement a claim."""
-        return {"claim": self.text, **{name: value for name, value in self._asdict().items() if name != "text"}}
+        evidence = {name: found._asdict() if isinstance(found, Sampled) else found
+                    for name, found in self.evidence.items()}  # fmt: skip
+        return {"claim": self.text, "source": self.source, "paper": self.paper, "ours": self.ours,
+                "verdict": self.verdict, "evidence": evidence}  # fmt: skip
 
 
-def holds(condition: bool | np.bool | None) -> Verdict:
-    """ "holds" or "fails" (also where nothing could be judged, None)."""
+def holds(condition: bool | np.bool) -> Verdict:
+    """ "holds" or "fails"."""
     return "holds" if condition else "fails"
 
 
-def if_met(premise: bool) -> Verdict:
+def if_met(premise: bool | np.bool) -> Verdict:
     """ "holds" for a theorem whose premise is met here, else "holds_vacuously"."""
     return "holds" if premise else "holds_vacuously"
+
+
+def vacuous(condition: bool | np.bool, anyway: bool | np.bool) -> Verdict:
+    """ "fails", or "holds_vacuously" for a statement that says nothing since it would hold `anyway`, or "holds"."""
+    return ("holds_vacuously" if anyway else "holds") if condition else "fails"

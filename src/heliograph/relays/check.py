@@ -18,13 +18,14 @@ from heliograph.relays.design import GainsByFilter
 
 
 class Recomputed(NamedTuple):
-    """Error covariance[filter] and state covariance at k = 0 .. steps, and how far gains are from greedy.
+    """Error covariance[filter], mean error[filter], state covariance at k = 0 .. steps; how far gains are from greedy.
 
     correlation[filter]: largest correlation of a component of the error after the step with a component of
     the innovation; zero if and only if the gain minimises the filter's own next error.
     """
 
     covariance: dict[str, Float[np.ndarray, "steps+1 n n"]]
+    mean: dict[str, Float[np.ndarray, "steps+1 n"]]
     state: Float[np.ndarray, "steps+1 n n"]
     correlation: dict[str, Float[np.ndarray, "steps"]]
 
@@ -61,6 +62,7 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     means = moments[:, 0, 1 : 1 + n]
     return Recomputed(
         {name: errors[f] @ moments @ errors[f].T for f, name in enumerate(filters)},
+        {name: moments[:, 0] @ errors[f].T for f, name in enumerate(filters)},
         moments[:, 1 : 1 + n, 1 : 1 + n] - means[:, :, None] * means[:, None, :],
         {name: np.array(correlation)[:, f] for f, name in enumerate(filters)},
     )

@@ -23,7 +23,7 @@ class Advance(Protocol):
 def _bar(*more: rich.progress.ProgressColumn) -> Iterator[rich.progress.Progress]:
     """A bar on stderr with what is being done, gone at the end; nothing where stderr is no terminal."""
     console = rich.console.Console(stderr=True)
-    columns = rich.progress.TextColumn("{task.description}"), rich.progress.BarColumn(), *more
+    columns = rich.progress.TextColumn("{task.description}", markup=False), rich.progress.BarColumn(), *more
     with rich.progress.Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
         yield bar
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 SHORTEST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+PRIVATE, OTHERS_WRITE = 0o700, 0o022
 SECONDS = 0.1  # what compiles faster than this is not worth a file
 
 
@@ -16,18 +17,15 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
     library changes no settings unless asked. Where JAX_COMPILATION_CACHE_DIR is set, that folder is used and nothing is
     changed.
 
+    What it holds is run: the folder is made for its user alone, and closed to others where it was open.
+
     Raises:
-        ValueError: a folder that cannot be made.
+        ValueError: a folder that cannot be made, or that is not the user's own; no folder, and no home.
     """
     if os.environ.get(FOLDER):
         return Path(os.environ[FOLDER])
     place = _default() if folder is None else Path(folder)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        from heliograph.numerics.check import fail  # it loads NumPy and JAX, for which --help need not wait
-
-        raise fail(f"folder {place}", "one that can be made", error.strerror) from None
+    _make_private(place)
     os.environ[FOLDER] = str(place)
     shortest = float(os.environ.setdefault(SHORTEST, str(SECONDS)))
     if "jax" in sys.modules:  # it has read the environment already
@@ -39,5 +37,29 @@ def keep_compilations(folder: str | Path | None = None) -> Path:
 
 
 def _default() -> Path:
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(base) / "heliograph" / "compilations"
+    if os.environ.get("XDG_CACHE_HOME"):
+        return Path(os.environ["XDG_CACHE_HOME"]) / "heliograph" / "compilations"
+    try:
+        return Path.home() / ".cache" / "heliograph" / "compilations"
+    except RuntimeError:
+        raise _fail("folder for compiled programs", "one, or a home folder to make it in", "neither") from None
+
+
+def _make_private(place: Path) -> None:
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        place.mkdir(mode=PRIVATE, exist_ok=True)
+        there = place.stat()
+        if hasattr(os, "getuid") and there.st_uid == os.getuid() and there.st_mode & OTHERS_WRITE:
+            place.chmod(PRIVATE)  # as an earlier release made it
+            there = place.stat()
+    except OSError as error:
+        raise _fail(f"folder {place}", "one that can be made", error.strerror) from None
+    if hasattr(os, "getuid") and there.st_uid not in (os.getuid(), 0):
+        raise _fail(f"folder {place}", "the user's own", f"that of user {there.st_uid}")
+
+
+def _fail(name: str, expected: str, got: object) -> ValueError:
+    from heliograph.numerics.check import fail  # it loads NumPy and JAX, for which --help need not wait
+
+    return fail(name, expected, got)

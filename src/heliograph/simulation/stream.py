@@ -1,20 +1,39 @@
 """One filter on live data: push a measurement, read the estimate."""
 
-from heliograph.filters.base import AbstractFilter
+from collections.abc import Callable, Hashable
+from functools import lru_cache
+from typing import Any
+from weakref import WeakValueDictionary
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import ArrayLike, PyTree
+
+Program = Callable[..., tuple[PyTree, list[jax.Array]]]
 
 
 class Stream:
     """Feed a filter one sample at a time; it holds the filter's state and the step counter.
 
-    The numbers are those of `run` over the same data.
+    The numbers are those of `run` over the same data, bit for bit.
+
+    Raises:
+        ValueError: no filter.
     """
 
     def __init__(self, filter_: AbstractFilter):
+        if not isinstance(filter_, AbstractFilter):
+            raise fail("stream", "a filter", type(filter_).__name__)
         self.filter = filter_
         self.steps = 0
-        self._state = filter_.init()
+        self._placed = _place(filter_)
+        self._state = self._placed.start
 
     def push(self, measurement: ArrayLike, inputs: ArrayLike = ()) -> Estimate:
         """Advance one step: `inputs` led to this `measurement` (NaN where a component did not arrive).
@@ -23,6 +42,57 @@ class Stream:
             ValueError: a measurement or inputs that are not the filter's, infinite values, an input that is NaN, a
                 step past the end of what varies over time; the state stays as it was.
         """
-        self._state, estimate = self.filter.step(self._state, measurement, inputs, self.steps)
+        placed, k = self._placed, self.steps
+        z, u = measured(self.filter, measurement), given(self.filter, inputs)
+        if placed.horizon is not None and k >= placed.horizon:
+            raise fail("step", f"one of the {placed.horizon} that the filter covers, counted from 0", k)
+        with jax.enable_x64(True):
+            self._state, told = placed.run(placed.numbers, self._state, z, u, np.asarray(k))
         self.steps += 1
-        return estimate
+        result: Estimate = placed.estimate.unflatten([np.asarray(leaf) for leaf in told])
+        return result
+
+
+class _Placed:
+    """A filter compiled, its numbers where the program finds them: what all streams of the filter share."""
+
+    def __init__(self, filter_: AbstractFilter):
+        self.filter, self.horizon = filter_, filter_.horizon
+        leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, filter_))
+        self.run = _program(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
+        with jax.enable_x64(True):
+            self.numbers = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+            self.start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
+        self.estimate: Any = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
+
+
+_SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id of a filter, which its entry keeps
+
+
+def _place(filter_: AbstractFilter) -> _Placed:
+    found = _SHARED.get(id(filter_))
+    if found is None:
+        found = _SHARED[id(filter_)] = _Placed(filter_)
+    return found
+
+
+@lru_cache
+def _program(tree: Any, parts: tuple[Hashable, ...]) -> Program:
+    """One step of every filter that differs in numbers alone; None among its `parts` stands for an array.
+
+    Called with arrays only: telling apart what is none costs more than all the rest of a step.
+    """
+
+    def step(
+        numbers: list[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, list[jax.Array]]:
+        rest = iter(numbers)
+        item: AbstractFilter = tree.unflatten([next(rest) if part is None else part for part in parts])
+        after, estimate = item.step(state, z, u, k)
+        return after, jax.tree.leaves(estimate)
+
+    return jax.jit(step)
+
+
+def _as_array(leaf: object) -> object:
+    return np.asarray(leaf) if isinstance(leaf, int | float) else leaf

@@ -14,6 +14,7 @@ from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcom
 from heliograph.examples.demo.recording import find_recording, read_recording
 from heliograph.files.recording import write_estimates
 from heliograph.files.table import write_table
+from heliograph.numerics.check import check_seed
 from heliograph.report.progress import Advance
 from heliograph.report.results import Json, Results, write_results
 from heliograph.simulation.record import Record
@@ -29,6 +30,7 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: an extra of `recordings`, `report`, `tables` is not installed.
     """
+    check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     find_recording()  # a missing extra is told before the work starts
 
     def work(advance: Advance) -> Outcome:

@@ -14,6 +14,7 @@ from heliograph.examples.motor_drive.compute import (
     Score,
     compute,
 )
+from heliograph.numerics.check import check_seed
 from heliograph.report.results import Json, Results, write_results
 
 NAME = "motor-drive"
@@ -26,6 +27,7 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: the extra `motor` or `report` is not installed.
     """
+    check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     target = Path(out) / NAME
     write_results(target, STAGES, partial(compute, SEEDS, seed), results, ("gym_electric_motor",))
     print(f"Report: {target / 'report.html'}")

@@ -22,8 +22,6 @@ from heliograph.papers.cubature_fusion.setting import (
 from heliograph.papers.cubature_fusion.variants import variants
 from heliograph.report.progress import Advance
 
-SIGNIFICANT = 3.0  # standard errors: an excess smaller than this may be sampling
-
 RUNS = 5_000  # what the judgement of the worst direction needs
 STAGES = 5  # as `reproduction` tells them
 EARLY, EARLY_FACTOR = 3, 20  # first steps, where fused bounds overstate themselves by little, with 20 times the runs

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, check_seed
 from heliograph.papers.cubature_fusion.compute import RUNS, STAGES, Outcome, Reproduction, reproduction
 from heliograph.papers.cubature_fusion.setting import NODES, STATES
 from heliograph.papers.cubature_fusion.statements import statements
@@ -27,6 +27,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
         ValueError: fewer than 10 runs, a folder that cannot be written or that holds something else.
         ModuleNotFoundError: an extra of `report`, `sweep` is not installed.
     """
+    seed = check_seed("seed", seed)
     count = check_count("runs", RUNS if runs is None else runs, 10)  # with fewer a standard error means nothing
     work = partial(reproduction, count, seed)
     write_results(Path(out) / "cubature-fusion", STAGES, work, results, ("xarray", "h5netcdf"))

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, check_seed
 from heliograph.papers.h_infinity_fusion import setting
 from heliograph.papers.h_infinity_fusion.compute import RUNS, STAGES, Reproduction, reproduction
 from heliograph.papers.h_infinity_fusion.discriminating import NODE, Discriminating
@@ -28,6 +28,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
             something else.
         ModuleNotFoundError: an extra of `lmi`, `report`, `sweep` is not installed.
     """
+    seed = check_seed("seed", seed)
     count = check_count("runs", RUNS if runs is None else runs, 100)
     work = partial(reproduction, count, seed)
     needs = ("clarabel", "cvxpy", "xarray", "h5netcdf")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, check_seed
 from heliograph.papers.quadratic_bias.compute import (
     NODE,
     RUNS,
@@ -33,6 +33,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
             or that holds something else.
         ModuleNotFoundError: an extra of `report`, `sweep` is not installed.
     """
+    seed = check_seed("seed", seed)
     count = check_count("runs", RUNS if runs is None else runs, 100)
     work = partial(compute, count, seed)
     write_results(Path(out) / "quadratic-bias", STAGES, work, results, ("xarray", "h5netcdf"))

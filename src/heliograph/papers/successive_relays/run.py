@@ -7,7 +7,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.files.recording import write_estimates
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, check_seed
 from heliograph.papers.successive_relays.compute import FILTERS, RUNS, Reproduction, compute
 from heliograph.papers.successive_relays.statements import statements, tuned_mean_ratio
 from heliograph.report.results import Json, Results, write_results
@@ -28,6 +28,7 @@ def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
             or that holds something else.
         ModuleNotFoundError: an extra of `report` is not installed.
     """
+    seed = check_seed("seed", seed)
     count = check_count("runs", RUNS if runs is None else runs, 100)
     write_results(Path(out) / "successive-relays", STAGES, partial(compute, count, seed), results)
 

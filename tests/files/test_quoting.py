@@ -1,0 +1,32 @@
+"""Names from outside, where they land."""
+
+import matplotlib
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+
+from heliograph.files.quoting import FORMULA, from_cell, in_cell, in_figure, visible
+
+matplotlib.use("agg")
+
+
+@given(st.text())
+def test_a_cell_is_no_formula_and_can_be_read_again(text):
+    cell = in_cell(text)
+    assert not cell.startswith(FORMULA) and from_cell(cell) == visible(text)
+
+
+@given(st.text())
+def test_what_is_visible_moves_no_cursor(text):
+    assert all(c.isprintable() for c in visible(text))
+
+
+@pytest.mark.parametrize("name", ["$\\bad{$", "$", "a$b$c", "_hidden", "\\$x$", "\x1b[31m", "plain"])
+def test_a_figure_draws_any_name_and_shows_it_in_the_legend(name):
+    figure = Figure()
+    axes = figure.subplots()
+    axes.plot([0, 1], label=in_figure(name))
+    axes.set_title(in_figure(name))
+    assert len(axes.legend().get_texts()) == 1
+    figure.canvas.draw()
