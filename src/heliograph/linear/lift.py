@@ -12,6 +12,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
+from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -53,7 +54,7 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     routes = model_routes(plant, sensor, channel, 2 * degree, horizon)
     moments, parts, rounding = initial_moments(start, 2 * degree), [], []
     before = second_moments(moments, n + 1, degree)
-    mean, spread = before[:-1, -1], before[:-1, :-1] - np.outer(before[:-1, -1], before[:-1, -1])
+    mean, spread = mean_and_spread(before)
     last: Route | None = None
     for route in routes:
         if last is None or not eqx.tree_equal(route.plant, last.plant):
@@ -69,6 +70,14 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
         before = after
     return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), mean, spread, linear_rows(n, degree), rounding)
+
+
+def mean_and_spread(
+    second: Float[np.ndarray, "N N"],
+) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
+    """Mean and covariance from the second moments of (y, 1), with the rounding of the difference."""
+    mean = second[:-1, -1]
+    return mean, with_rounding(second[:-1, :-1], len(mean)) - np.outer(mean, mean)
 
 
 def affine(

@@ -9,6 +9,7 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
+from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
@@ -31,7 +32,7 @@ def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
     predicted = s.transition @ spread @ s.transition.T + s.process
     cross = s.output @ predicted
     gain = solve_innovation(cross @ s.output.T + s.noise, cross).T
-    after = predicted - gain @ cross
+    after = with_rounding(predicted, len(cross)) - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
 
 

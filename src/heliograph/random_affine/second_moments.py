@@ -25,8 +25,9 @@ Matrix = Float[jax.Array | np.ndarray, "m p"]
 class QuadraticMap(eqx.Module):
     """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
 
-    Value: C:W + diag_i(sum_j R_ij:|W|). The second term is zero where one law dominates all others; otherwise
-    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin).
+    Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
+    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin,
+    in units d of each component's own, d_i^2 = |C_ii:W| + R_ii:|W|).
 
     Shapes: center, radius (m, m, p + 1, p + 1).
     """
@@ -37,9 +38,15 @@ class QuadraticMap(eqx.Module):
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
         mask = present[:, None] & present[None, :]
-        center = jnp.where(mask, contract(self.center, second_moment), 0.0)
+        center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        return center + diagonal(add([entries[:, j] for j in range(entries.shape[1])]))
+        m = range(entries.shape[0])
+        own = jnp.stack([jnp.sqrt(_or_one(jnp.abs(center[i, i]) + entries[i, i])) for i in m])
+        return center + diagonal(own * add([entries[:, j] / own[j] for j in m]))
+
+    def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """C:W alone, which is all where the law is known."""
+        return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
 class SecondOrder(eqx.Module):
@@ -60,6 +67,10 @@ class SecondOrder(eqx.Module):
     power: QuadraticMap
     nominal: QuadraticMap
     uncertain: bool = eqx.field(static=True)
+
+
+def _or_one(value: jax.Array) -> jax.Array:
+    return jnp.where(value > 0, value, 1.0)
 
 
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:

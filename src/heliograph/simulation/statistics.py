@@ -178,8 +178,14 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 
 
 def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive definite B."""
-    values, vectors = np.linalg.eigh(b)
-    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))[..., None, :]
-    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ a @ root)
-    return inner, root @ rotated
+    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
+
+    In units of each component's own B_ii, and where that is zero of its A_ii.
+    """
+    own = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
+    unit = np.where(own[0] > 0, own[0], np.where(own[1] > 0, own[1], 1.0))
+    both = unit[..., :, None] * unit[..., None, :]
+    values, vectors = np.linalg.eigh(b / both)
+    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]
+    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ (a / both) @ root)
+    return inner, (root @ rotated) / unit[..., None]

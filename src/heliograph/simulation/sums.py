@@ -71,7 +71,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
         mine = [jnp.where(valid, _claimed(parts[i]), unit) for i in order[:own]]
         bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(parts[i]) for i in order[own:]]) if b]
         split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
-        nees = jnp.concatenate([_squared_distance(b, e) for b, e in zip(bounds, split, strict=True)], axis=1)
+        size = batch["truth"].transpose(2, 1, 0)[:, :, None]
+        nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
         counted = valid.astype(float)
         claimed, shared = carry.claimed, carry.shared
         if own:
