@@ -17,6 +17,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.monomials import monomials
 from heliograph.simulation.likelihood import log_likelihood
+from heliograph.simulation.scaling import check_scaling as check_scaling
 
 ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
 SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for to the root of rounding, 1e-8

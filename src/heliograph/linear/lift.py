@@ -13,7 +13,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.small_matrix import with_rounding
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
@@ -73,9 +73,10 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
 
 
 def mean_and_spread(
-    second: Float[np.ndarray, "N N"],
+    second: Float[Array, "N N"],
 ) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
     """Mean and covariance from the second moments of (y, 1), with the rounding of the difference."""
+    second = np.asarray(second)
     mean = second[:-1, -1]
     return mean, with_rounding(second[:-1, :-1], len(mean)) - np.outer(mean, mean)
 

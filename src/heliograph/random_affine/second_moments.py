@@ -15,7 +15,7 @@ from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.monomials import product_table
 
-PROPORTIONAL_TOLERANCE = 1e-12  # relative: two tensors computed by different sums are one multiple of the other
+PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
 
 
 Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
@@ -184,18 +184,24 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    tolerance = PROPORTIONAL_TOLERANCE * xp.max(xp.abs(tensors), initial=0.0)
+    each: Matrix = xp.abs(mean[:, :-1])
+    own = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(each, each)
+    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    reach = xp.sqrt(xp.einsum("iiaa->ia", own))[:, None, :] * loud[:, None]
     size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
-    residual = xp.max(xp.abs(gains - multiples[:, None, None, None, None] * shape), initial=0.0)
+    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
-    gaps = xp.linalg.eigvalsh(_still(largest - noises))
-    holds = (residual <= tolerance) & (xp.max(xp.abs(cross), initial=0.0) <= tolerance)
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = _still(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * own)
+    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
     exact = widened + largest[:, :, None, None] * corner
-    return exact, holds & (xp.min(gaps, initial=0.0) >= -tolerance)
+    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
 
 
 def _still(value: Matrix) -> Matrix:
