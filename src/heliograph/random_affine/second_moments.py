@@ -76,17 +76,18 @@ def _or_one(value: jax.Array) -> jax.Array:
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
     """Whether z depends on y through anything but a known gain; a law with traced parameters counts as random."""
     if described.uncertain or is_traced(described.spread):
-        return described.uncertain or not _has_constant_gain(channel)
+        return described.uncertain or not has_known_gain(channel)
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
-    return bool(np.any(block > 0)) and not _has_constant_gain(channel)
+    return bool(np.any(block > 0)) and not has_known_gain(channel)
 
 
-def _has_constant_gain(channel: AbstractRandomAffine) -> bool:
+def has_known_gain(channel: AbstractRandomAffine) -> bool:
+    """Whether z = G y + n with one G that never varies."""
     match channel:
         case GainAndNoise():
             return isinstance(channel.law, Constant)
         case Series() | Stack():
-            return all(_has_constant_gain(part) for part in channel.maps)
+            return all(has_known_gain(part) for part in channel.maps)
     return False
 
 

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.centre import Centre
 from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.linear import LinearFilter, OpenLoop
 from heliograph.filters.mixture import Components, MixtureFilter
@@ -19,7 +20,7 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.monomials import exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
@@ -65,7 +66,8 @@ def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
             return replace(item, plant=_plant(item.plant, units), components=_components(item.components, units))
         case PolynomialFilter(inner=LinearSystemFilter()):
             assert isinstance(item.inner, LinearSystemFilter)
-            return PolynomialFilter(_system(item.inner, item.degree, units), item.degree, item.endless)
+            inner = _system(item.inner, item.degree, units)
+            return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
         case PredictionFilter():
             return PredictionFilter(_gaussian(rescaled(item.base, units)))
         case SequentialFilter():
@@ -149,6 +151,18 @@ def _components(item: Components | OverTime, units: Units) -> Components | OverT
         values.weight, q[:, None] * values.gain / units.states, q * values.offset, np.outer(q, q) * values.noise
     )
     return OverTime(scaled) if isinstance(item, OverTime) else scaled
+
+
+def _centre(item: Centre | None, units: Units) -> Centre | None:
+    if item is None:
+        return None
+    s = units.states
+
+    def scaled(part: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+        return OverTime(factors * part.values) if isinstance(part, OverTime) else factors * part
+
+    heard = scaled(item.heard, units.received[:, None] / s)
+    return Centre(s * item.start, scaled(item.transition, s[:, None] / s), scaled(item.drift, s), heard)
 
 
 def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
