@@ -12,10 +12,12 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.fusion.quantizer import AbstractQuantizer
 from heliograph.fusion.rules import AbstractFusion, fuse
 from heliograph.model.estimate import STRENGTH, Claim, Estimate, Innovation
+from heliograph.numerics.check import own_units
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.monomials import monomials
 from heliograph.simulation.likelihood import log_likelihood
+from heliograph.simulation.scaling import check_scaling as check_scaling
 
 ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
 SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for to the root of rounding, 1e-8
@@ -159,11 +161,12 @@ def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
         assert np.all(np.isnan(bound)), f"step {k}: expected a covariance of NaN, since none is claimed"
         return
     assert np.all(np.isfinite(bound)), f"step {k}: expected a finite covariance"
-    size = np.abs(bound).max()
-    assert np.abs(bound - bound.T).max() <= 1e-9 * size, f"step {k}: expected a symmetric covariance"
-    smallest = np.linalg.eigvalsh((bound + bound.T) / 2)[0]
-    assert smallest >= -1e-9 * size, (
-        f"step {k}: expected a positive semidefinite covariance, smallest eigenvalue {smallest:g}"
+    unit = own_units(bound)
+    correlations = bound / np.outer(unit, unit)
+    assert np.abs(correlations - correlations.T).max() <= ROUNDING, f"step {k}: expected a symmetric covariance"
+    smallest = np.linalg.eigvalsh((correlations + correlations.T) / 2)[0]
+    assert smallest >= -ROUNDING, (
+        f"step {k}: expected a positive semidefinite covariance, smallest eigenvalue of correlations {smallest:g}"
     )
 
 

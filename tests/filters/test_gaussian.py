@@ -282,3 +282,19 @@ def test_every_transform_is_the_same_for_linear_plants():
     first, *others = (follow(hg.filters.gaussian_filter(*parts, rule), z) for rule in rules)
     for other in others:
         agree(other, first)
+
+
+@pytest.mark.parametrize(
+    "own", [{"initial_mean": [0.0]}, {"initial_covariance": [[1e-4]]}], ids=lambda o: next(iter(o))
+)
+def test_a_filter_with_an_initial_law_of_its_own_is_not_exact(own):
+    plant, sensor = hg.LinearPlant([[0.95]], 0.01, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0)
+    filters = {
+        "cubature": hg.cubature_filter(plant, sensor, hg.perfect(), **own),
+        "kalman": hg.kalman_filter(plant, sensor, **own),
+        "open": hg.open_loop_filter(plant, **own),
+    }
+    central = hg.filters.sequential_filter([filters["kalman"], hg.kalman_filter(plant, sensor)])
+    ahead = hg.filters.prediction_of(filters["cubature"])
+    assert {item.claim for item in (*filters.values(), central, ahead)} == {"nominal"}
+    assert hg.kalman_filter(plant, sensor).claim == "exact"

@@ -74,13 +74,20 @@ def test_on_the_example_it_is_far_better_than_any_polynomial():
     assert found.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
 
 
+def test_a_combination_without_randomness_is_believed_where_z_agrees_with_it_and_only_there():
+    """A link that is off says 0 or 1 by its own noise: a point mass, against which a density is nothing."""
+    plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], TWO)
+    channel = hg.hop(hg.random_affine.bernoulli(0.5), hg.random_affine.FiniteSupport([[0.0], [1.0]], [0.5, 0.5]))
+    off = one_step(plant, sensor, channel, 1.0)
+    np.testing.assert_allclose([off.mean[0], off.covariance[0, 0]], [0.0, 1.25], rtol=1e-14)
+    on = one_step(plant, sensor, channel, 0.75)
+    assert on.covariance[0, 0] < 1.0 and abs(on.mean[0]) > 0.1
+
+
 def test_what_has_no_atoms_is_refused():
     plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], TWO)
     with pytest.raises(ValueError, match="gains of finitely many values, got Rayleigh"):
         hg.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
-    with pytest.raises(ValueError, match="resolution above 0"):
-        hg.mixture_filter(plant, sensor, hg.hop(hg.random_affine.bernoulli(0.5), TWO))
-    hg.mixture_filter(plant, sensor, hg.hop(hg.random_affine.bernoulli(0.5), TWO), resolution=0.01)
     many = hg.random_affine.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
     with pytest.raises(ValueError, match="at most 4,096 combinations of atoms, got 10,000"):
         hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, many), hg.hop(1.0, many)]))

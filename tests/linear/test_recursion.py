@@ -90,13 +90,35 @@ def test_units_of_a_measurement_do_not_matter_to_a_singular_innovation():
     assert plain[0, 0] == pytest.approx(2.0, rel=1e-10)  # all that g holds
 
 
-def test_lost_digits_are_told():
-    """A plant that grows by half at each step behind a known channel: the moments outgrow the error's."""
-    skewed = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
-    plant, sensor = hg.LinearPlant([[1.5]], skewed, [0.0], 1.0), hg.LinearSensor([[1.0]], skewed)
-    hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), 2, 15))
+SKEWED = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+
+
+def test_a_state_that_outgrows_its_error_costs_no_digits():
+    """Growth by half at each step, 60 of them: E[x^2] is 1e21, and the error's is that of the Riccati equation."""
+    plant, sensor = hg.LinearPlant([[1.5]], SKEWED, [0.0], 1.0), hg.LinearSensor([[1.0]], SKEWED)
+    found = {d: hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), d, 60)) for d in (1, 2)}
+    p = 1.0
+    for _ in range(60):
+        p = 1 / (1 / (2.25 * p + 1) + 1)
+    assert found[1].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
+    assert all(schedule.claim == "exact" for schedule in found.values())
+    assert found[2].gains.covariance[10, 0, 0] < p * (1 - 1e-6)  # what squares add vanishes as x grows
+    assert found[2].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
+
+
+def test_digits_lost_lower_the_claim_and_what_is_left_is_no_better_than_the_linear_filter():
+    """Far from zero the square of x and x itself agree to all digits but few, or to all."""
+
+    def design(mean):
+        plant, sensor = hg.LinearPlant([[1.0]], SKEWED, [mean], 1.0), hg.LinearSensor([[1.0]], SKEWED)
+        return hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), 2, 5))
+
+    assert design(10.0).claim == "exact"
     with pytest.warns(UserWarning, match=r"rounding is .* of a claimed variance .*; use a shorter horizon"):
-        hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), 2, 60))
+        assert design(1e4).claim == "nominal"
+    with pytest.warns(UserWarning, match="nominal"):
+        far = design(1e6)
+    assert far.claim == "nominal" and far.gains.covariance[0, 0, 0] >= 2 / 3  # (1 + 1) and 1 in parallel
 
 
 def test_schedules_are_saved_and_loaded(tmp_path):

@@ -1,6 +1,8 @@
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import heliograph as hg
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
 
@@ -66,3 +68,46 @@ def test_the_worst_direction_is_found_and_not_biased_by_the_search():
 def test_worst_direction_needs_runs():
     with pytest.raises(ValueError, match="at least 4 runs"):
         statistics(draws(BOUND, runs=2), BOUND).worst_direction()
+
+
+class Breaking(hg.AbstractFilter):
+    """Its covariance is no number where z > 2, from then on."""
+
+    claim: str = "exact"
+    states: tuple[str, ...] = ("x",)
+    inputs: tuple[str, ...] = ()
+    received: int = 1
+
+    @hg.filters.in_float64
+    def init(self):
+        return jnp.ones((1, 1))
+
+    @hg.filters.predicts
+    def predict(self, state, u=(), k=0):
+        return state
+
+    @hg.filters.corrects
+    def correct(self, state, z, k=0):
+        return jnp.where(z > 2, jnp.nan, state), hg.filters.gaussian_innovation(z, jnp.zeros(1), jnp.eye(1))
+
+    @hg.filters.in_float64
+    def estimate(self, state):
+        return hg.Estimate(jnp.zeros(1), state, self.claim)
+
+
+def test_runs_that_fail_are_counted_and_no_figure_hides_them():
+    plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    network = hg.Network(
+        plant, {"node": hg.Node(sensor, hg.perfect(), {"b": Breaking(), "open": hg.open_loop_filter(plant)})}
+    )
+    record = hg.monte_carlo(network, 6, 100, 0)
+    found = hg.monte_carlo(network, 6, 100, 0, keep=hg.Statistics())
+    above = (record.measurements["node"][..., 0] > 2).any(axis=1).sum()
+    assert 0 < above < 100
+    assert found.failures() == record.failures() == [f"node/b: no valid covariance from step 0 in {above} of 100 runs"]
+    for one in (found["node"]["b"], hg.simulation.error_statistics(record, "node", "b")):
+        assert one.failed_runs == above
+        for figure in (one.rmse, one.nees_per_dimension, one.worst_direction, one.mean_trace, one.rmse_over_time):
+            with pytest.warns(UserWarning, match=f"no valid covariance from step 0 in {above} of 100 runs"):
+                figure()
+    assert not found["node"]["open"].failure and np.isfinite(found["node"]["open"].rmse()[0])

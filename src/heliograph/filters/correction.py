@@ -23,6 +23,7 @@ from heliograph.numerics.small_matrix import (
     times,
     trace,
     transpose,
+    with_rounding,
 )
 from heliograph.random_affine.second_moments import SecondOrder
 
@@ -68,10 +69,10 @@ def young_correction(
     w = homogeneous(signal.second, signal.mean, 1.0)
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
-    base = channel.spread(w, present) + absent(present)
     cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
-        return gain_and_bound(prior, cross, base + mean_part)
+        return gain_and_bound(prior, cross, channel.spread.middle(w, present) + absent(present) + mean_part)
+    base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
     def omega(beta: jax.Array) -> jax.Array:
@@ -94,12 +95,16 @@ def zero_mean_correction(
     """The update of `ZeroMean`."""
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     own = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
-    base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
     cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
-        return gain_and_bound(prior, cross, base)
+        omega_known = channel.power.middle(own, present) + channel.spread.middle(known_part, present)
+        return gain_and_bound(prior, cross, omega_known + absent(present))
+    base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
     shift, power = channel.shift(own, present), times(cross, transpose(cross))
-    explained = symmetric(times(signal.cross, solve(signal.covariance, transpose(signal.cross))))
+    used = heard(channel, present)
+    among = jnp.where(used[:, None] & used[None], signal.covariance, 0.0)
+    of_used = jnp.where(used, signal.cross, 0.0)
+    explained = symmetric(times(of_used, solve(among, transpose(of_used))))
 
     def omega(beta: jax.Array) -> jax.Array:
         return base + shift / beta
@@ -111,6 +116,14 @@ def zero_mean_correction(
     beta = settle(refine, [0.1], trace(power))[0] if scalar is None else jnp.asarray(scalar)
     gain, bound = gain_and_bound(prior, cross, omega(beta))
     return gain, bound + beta * explained
+
+
+def heard(channel: SecondOrder, present: jax.Array) -> jax.Array:
+    """Which components of the signal have a part in what arrived: the others say nothing, as if never measured."""
+    m, p = channel.mean_gain.shape[:2]
+    reached = (channel.power.center != 0) | (channel.power.radius != 0)
+    parts = [[reached[i, i, a, a] & present[i] for i in range(m)] for a in range(p)]
+    return jnp.stack([jnp.any(jnp.stack(rows), axis=0) for rows in parts])
 
 
 def gain_weight(omega: jax.Array, power: jax.Array) -> jax.Array:
@@ -188,7 +201,10 @@ def absent(present: jax.Array) -> jax.Array:
 
 
 def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """K = C' Omega^-1 and P - C' Omega^-1 C, which minimise P - K C - C' K' + K Omega K'."""
+    """K = C' Omega^-1 and P - C' Omega^-1 C, which minimise P - K C - C' K' + K Omega K'.
+
+    The difference is known to rounding of P alone, which the bound carries.
+    """
     solved = _solved(omega, cross)
     return transpose(solved), _bound(prior, cross, solved)
 
@@ -198,4 +214,4 @@ _solved = runs_last(solve)
 
 @runs_last
 def _bound(prior: jax.Array, cross: jax.Array, solved: jax.Array) -> jax.Array:
-    return symmetric(prior - times(transpose(cross), solved))
+    return symmetric(with_rounding(prior, len(cross)) - times(transpose(cross), solved))

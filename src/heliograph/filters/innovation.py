@@ -7,6 +7,9 @@ import numpy as np
 from heliograph.filters.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.small_matrix import (
+    NEGATIVE_TOLERANCE,
+    OFF_SUPPORT,
+    OFF_VALUE,
     PIVOT_TOLERANCE,
     UNROLL_LIMIT,
     congruence,
@@ -15,9 +18,6 @@ from heliograph.numerics.small_matrix import (
 )
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.second_moments import SecondOrder
-
-OFF_SUPPORT = 1e-6  # standard deviations, and
-OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
 
 def gaussian_innovation(
@@ -44,7 +44,7 @@ def innovation_covariance(signal: Signal, channel: SecondOrder) -> Float[Array, 
 def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     second = homogeneous(signal.second, signal.mean, 1.0)
     everything = jnp.ones((len(channel.mean_gain), *second.shape[2:]), dtype=bool)
-    return congruence(channel.mean_gain, signal.covariance) + channel.nominal(second, everything)
+    return congruence(channel.mean_gain, signal.covariance) + channel.nominal.middle(second, everything)
 
 
 @runs_last
@@ -62,13 +62,14 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
     left = jnp.where(present[:, None] & present[None], covariance, 0.0)
     rest = jnp.broadcast_to(rest, left.shape[1:])
     variance = jnp.stack([left[j, j] for j in range(m)]) if m else rest
-    tolerance = rounding(PIVOT_TOLERANCE, value) * variance
     reach = OFF_SUPPORT * jnp.sqrt(variance) + OFF_VALUE * jnp.where(present, size, 0.0)
 
     def condition(j: int | jax.Array, carry: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
         rest, left, total = carry
         pivot = left[j, j]
-        determined = jnp.abs(pivot) <= tolerance[j]
+        determined = (pivot <= rounding(PIVOT_TOLERANCE, value) * variance[j]) & (
+            pivot >= -rounding(NEGATIVE_TOLERANCE, value) * variance[j]
+        )
         safe = jnp.where(determined, 1.0, pivot)
         density = -(rest[j] ** 2 / safe + jnp.log(2 * np.pi * safe)) / 2
         agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)

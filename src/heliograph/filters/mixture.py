@@ -11,6 +11,7 @@ from scipy.linalg import block_diag
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief
+from heliograph.filters.innovation import log_density
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -19,7 +20,8 @@ from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.types import Array, ArrayLike, Float, Int
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
@@ -91,16 +93,21 @@ class MixtureFilter(AbstractFilter):
             value = z - gain @ mean - offset
             heard = jnp.where(present, value, 0.0)
             solved = psd_solve(total, jnp.concatenate([cross, heard[:, None]], axis=1))
-            likelihood = -heard @ solved[:, -1] / 2 - jnp.sum(jnp.log(jnp.diagonal(cholesky(total))))
-            return likelihood, cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
+            free = jnp.diagonal(cholesky(total)) > 0
+            likelihood = log_density(value, total, jnp.abs(z) + jnp.abs(z - value))
+            return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
 
-        likelihood, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
-        weighed = likelihood + jnp.log(c.weight)
+        likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        weighed = sharpest(likelihood, certain) + jnp.log(c.weight)
         weight = jax.nn.softmax(weighed)
         shift = weight @ moved
         apart = moved - shift
-        after = spread - jnp.einsum("a,aij->ij", weight, known) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
-        density = jax.nn.logsumexp(weighed) - jnp.sum(present) * np.log(2 * np.pi) / 2
+        after = (
+            with_rounding(spread, len(z))
+            - jnp.einsum("a,aij->ij", weight, known)
+            + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
+        )
+        density = jax.nn.logsumexp(weighed)
         heard = _mixed(jnp.asarray(c.weight), value, jnp.where(both, total, jnp.nan), density)
         return Belief(mean + shift, symmetrize(after)), heard
 
@@ -108,6 +115,16 @@ class MixtureFilter(AbstractFilter):
     def estimate(self, state: Belief) -> Estimate:
         """The belief."""
         return Estimate(state.mean, state.covariance, self.claim)
+
+
+def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
+    """-inf for a combination that another one, which z agrees with, outweighs by a density that knows no bound.
+
+    A combination that says `certain` components exactly has a point mass there, against which a density is nothing.
+    """
+    agrees = jnp.isfinite(likelihood)
+    most = jnp.max(jnp.where(agrees, certain, -1))
+    return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
 
 
 def _mixed(weight: jax.Array, value: jax.Array, total: jax.Array, density: jax.Array) -> Innovation:
@@ -122,14 +139,14 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     """The near limit of what the measurements hold, for gains and noises of finitely many values.
 
     Gains may be constant or discrete, noises of finite support (used atom by atom) or Gaussian. `resolution` is a
-    standard deviation added to z: needed where some combination of atoms leaves z without any randomness, as a link
-    that is off does.
+    standard deviation added to z, for a z that is not the model's to the last digit: a combination of atoms that
+    leaves z without any randomness, as a link that is off does, is believed where z agrees with it, and only there.
 
     Claim: "nominal".
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, a law with no atoms, more than
-            COMPONENT_LIMIT combinations, or a combination whose z is certain and no resolution.
+            COMPONENT_LIMIT combinations.
     Source: Ackerson and Fu (1970), first-order generalised pseudo-Bayes.
     """
     if not is_linear(plant, sensor):
@@ -159,10 +176,6 @@ def _components(sensor: AnySensor, channel: AbstractRandomAffine, floor: float) 
     found = [c for c in atoms_of(route) if c.weight > 0]
     weight, gain, offset, noise = (np.array(column) for column in zip(*found, strict=True))
     noise = noise + floor * np.eye(noise.shape[-1])
-    for g, r in zip(gain, noise, strict=True):
-        if np.linalg.matrix_rank(g @ g.T + r) < len(r):  # a positive definite P is all that would be left
-            expected = "measurements that are random for every combination of atoms, or a resolution above 0"
-            raise fail("mixture filter", expected, f"gain {g.tolist()} without Gaussian noise")
     return Components(weight, gain, offset, noise)
 
 

@@ -7,15 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.centre import Centre, centre_of, without_mean
 from heliograph.filters.innovation import log_density
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
-from heliograph.linear.lift import lifted_system
+from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.memory import memory_system
 from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import OverTime, first, steps_covered, unstack
+from heliograph.model.over_time import OverTime, at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
@@ -25,18 +26,27 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.monomials import count, monomials, position
 
 
+class Centred(NamedTuple):
+    """The inner filter's state, and the mean (n,) of x that it does not see."""
+
+    inner: PyTree
+    mean: Float[Array, " n"]
+
+
 class PolynomialFilter(AbstractFilter):
     """Give a filter all monomials of z up to `degree` in place of z; with a component, every monomial of it is missing.
 
     `inner` is a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system. The innovation is that of z itself,
     among its monomials, with its exact covariance; the log-likelihood is Gaussian with it. `endless`: the last step's
-    matrices hold for ever, so that it may go on beyond them.
+    matrices hold for ever, so that it may go on beyond them. `centre`: what is taken off z, and added to the estimate,
+    of an inner filter that knows x - E[x] only.
 
     Raises:
         ValueError: an inner filter that hears no such monomials.
     """
 
     inner: AbstractFilter
+    centre: Centre | None
     degree: int = eqx.field(static=True)
     endless: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -44,8 +54,9 @@ class PolynomialFilter(AbstractFilter):
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
 
-    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False):
+    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
+        self.centre = centre
         self.states, self.inputs = inner.states, inner.inputs
         fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
         if not fitting:
@@ -59,32 +70,43 @@ class PolynomialFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> PyTree:
-        """The inner filter's state."""
-        return self.inner.init()
+        """The inner filter's state, and the mean that it does not see."""
+        start = np.zeros(len(self.states)) if self.centre is None else self.centre.start
+        return Centred(self.inner.init(), jnp.asarray(start))
 
     @predicts
-    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+    def predict(self, state: Centred, u: ArrayLike = (), k: Step = 0) -> Centred:
         """The inner filter's prediction."""
-        return self.inner.predict(state, u, k)
+        inner = self.inner.predict(state.inner, u, k)
+        if self.centre is None:
+            return Centred(inner, state.mean)
+        c = at(self.centre, k)
+        return Centred(inner, c.transition @ state.mean + c.drift)
 
     @corrects
-    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+    def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
         """Lift z and correct the inner filter."""
-        after, heard = self.inner.correct(state, monomials(jnp.asarray(z), self.degree)[:-1], k)
-        return after, _of_degree_one(heard, jnp.asarray(z), self.degree)
+        z = jnp.asarray(z)
+        z = z if self.centre is None else z - at(self.centre, k).heard @ state.mean
+        after, heard = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
+        return Centred(after, state.mean), _of_degree_one(heard, z, self.degree)
 
     @in_float64
-    def estimate(self, state: PyTree) -> Estimate:
-        """The inner filter's."""
-        return self.inner.estimate(state)
+    def estimate(self, state: Centred) -> Estimate:
+        """The inner filter's, about the mean."""
+        return _moved(self.inner.estimate(state.inner), state.mean)
 
-    def after_step(self, state: PyTree, k: Step) -> Estimate:
-        """The inner filter's."""
-        return self.inner.after_step(state, k)
+    def after_step(self, state: Centred, k: Step) -> Estimate:
+        """The inner filter's, about the mean."""
+        return _moved(self.inner.after_step(state.inner, k), state.mean)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """The inner filter planned."""
-        return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless)
+        return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
+
+
+def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
+    return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
 def _of_degree_one(heard: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
@@ -104,16 +126,29 @@ def polynomial_filter(
     estimates the whole state, a dynamical bias included, and its covariance is recomputed where z has gaps. For many
     complete runs `scheduled_polynomial_filter` does the same with saved gains.
 
-    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are trusted). Covers `horizon`
-    steps; a stream may go on beyond them where nothing varies over time and the matrices have settled by then.
+    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are trusted), or where rounding is
+    more than 1e-6 of a claimed variance, with a warning: behind a random gain, far from zero. Behind a known gain all
+    moments are about the mean. Covers `horizon` steps; a stream may go on beyond them where nothing varies over time
+    and the matrices have settled by then.
 
     Raises:
         ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
     Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
     """
-    system = lifted_system(plant, sensor, channel, degree, horizon)
-    inner = LinearSystemFilter(system, claim_of(channel), first(plant).states)
-    return PolynomialFilter(inner, degree, _settled(plant, sensor, channel, system))
+    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    claim = lmmse(system, claim_of(channel)).claim
+    inner = LinearSystemFilter(system, claim, first(plant).states)
+    return PolynomialFilter(inner, degree, _settled(plant, sensor, channel, system), centre)
+
+
+def _lifted(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
+) -> tuple[Centre | None, LinearSystem]:
+    """The lift of the model about its mean, where the gain is known."""
+    check_model(plant, sensor, channel)
+    centre = centre_of(plant, sensor, channel)
+    about = plant if centre is None else without_mean(plant)
+    return centre, lifted_system(about, sensor, channel, degree, horizon)
 
 
 def _settled(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
@@ -132,8 +167,9 @@ def scheduled_polynomial_filter(
         ValueError: what `polynomial_filter` refuses.
     Source: as `polynomial_filter`.
     """
-    system = lifted_system(plant, sensor, channel, degree, horizon)
-    return PolynomialFilter(ScheduledFilter(lmmse(system, claim_of(channel)), first(plant).states), degree)
+    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    inner = ScheduledFilter(lmmse(system, claim_of(channel)), first(plant).states)
+    return PolynomialFilter(inner, degree, centre=centre)
 
 
 class MemoryState(NamedTuple):
@@ -200,9 +236,9 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     """
     claim = claim_of(channel)
     linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
-    products = lmmse(memory_system(plant, sensor, channel, linear), claim)
+    products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)
     names = first(plant).states
-    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), claim)
+    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim)
 
 
 def claim_of(channel: Channel) -> Claim:

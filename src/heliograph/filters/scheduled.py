@@ -20,6 +20,7 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import names
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -168,7 +169,10 @@ class LinearSystemFilter(AbstractFilter):
         expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
         gain = _solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
-        after = Belief(mean + gain @ jnp.where(present, z - expected, 0.0), symmetrize(spread - gain @ cross))
+        after = Belief(
+            mean + gain @ jnp.where(present, z - expected, 0.0),
+            symmetrize(with_rounding(spread, len(z)) - gain @ cross),
+        )
         return after, gaussian_innovation(z, expected, total)
 
     @in_float64

@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.numerics.small_matrix import (
     add,
     diagonal,
+    factor,
     inner,
     rounding,
     runs_last,
@@ -25,6 +26,7 @@ GAP = 1e-10  # certified relative excess of the trace over its minimum; rounding
 LOOP = 1000  # units of rounding below which the certificate makes no progress
 ITERATIONS = 60  # of the interior point method; it needs about 12
 STEP_BACK = 0.99  # share of the way to the boundary
+KNOWN = 1e-8  # of a variance: what stands for none, so that neither it nor the rounding beside it is more than this
 SEARCH_STEPS = 40  # golden-section steps for one weight: the interval shrinks to 1e-8, the flat minimum to 1e-16
 
 
@@ -150,10 +152,11 @@ def intersect_inversely(
     a: Float[jax.Array, "n"], p: Float[jax.Array, "n n"], b: Float[jax.Array, "n"], q: Float[jax.Array, "n n"]
 ) -> tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]:
     """Inverse covariance intersection of (a, P) and (b, Q), with its weight by golden-section search."""
-    p_information, q_information = inverse(p), inverse(q)
+    both = jnp.stack([p, q])
+    p_information, q_information = inverses(both)
 
     def fused_information(w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        common = inverse(w * p + (1 - w) * q)
+        common = inverses((w * p + (1 - w) * q)[None])[0]
         return p_information + q_information - common, common
 
     def cost(w: jax.Array) -> jax.Array:
@@ -172,7 +175,7 @@ def intersect_inversely(
     information, common = fused_information(w)
     covariance = inverse(information)
     mean = covariance @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
-    return mean, symmetric(covariance)
+    return mean, without_known(symmetric(covariance), both)
 
 
 @runs_last
@@ -183,5 +186,28 @@ def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]
 
 
 def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
-    """Of each of several."""
-    return jax.vmap(inverse)(matrices)
+    """P_k^-1 of several covariances of one state; what an estimate knows exactly is taken as known to KNOWN.
+
+    A component that those before it determine has KNOWN of its own variance in place of none, and one that is known by
+    itself KNOWN of the largest variance that any of the estimates has for it (1 where all know it): the limit, to
+    KNOWN of each component's own scale.
+    """
+    own = jnp.diagonal(matrices, axis1=1, axis2=2)
+    largest = jnp.max(own, axis=0)
+    reference = jnp.where(own > 0, own, jnp.where(largest > 0, largest, 1.0))
+    return jax.vmap(_widened_inverse)(matrices, KNOWN * reference)
+
+
+@runs_last
+def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
+    _, scales = factor(a)
+    none = jnp.stack([jnp.where(s == 0, 1.0, 0.0) for s in scales])
+    return inverse(a + diagonal(none * least))
+
+
+def without_known(
+    covariance: Float[jax.Array, "n n"], inputs: Float[jax.Array, "count n n"]
+) -> Float[jax.Array, "n n"]:
+    """The fused covariance, exactly zero for a component that one of the inputs knows exactly."""
+    known = jnp.any(jnp.diagonal(inputs, axis1=1, axis2=2) == 0, axis=0)
+    return jnp.where(known[:, None] | known, 0.0, covariance)

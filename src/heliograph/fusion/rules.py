@@ -7,7 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.intersection import intersect, intersect_inversely, inverses, trace_optimal_weights
+from heliograph.fusion.intersection import (
+    intersect,
+    intersect_inversely,
+    inverses,
+    trace_optimal_weights,
+    without_known,
+)
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
@@ -80,7 +86,7 @@ class CovarianceIntersection(AbstractFusion):
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Find the weights and intersect."""
         information = inverses(covariances)
-        return intersect(means, information, trace_optimal_weights(information))
+        return _intersection(means, covariances, information, trace_optimal_weights(information))
 
 
 class EqualIntersection(AbstractFusion):
@@ -96,7 +102,7 @@ class EqualIntersection(AbstractFusion):
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Intersect with equal weights."""
         count = means.shape[0]
-        return intersect(means, inverses(covariances), jnp.full(count, 1 / count))
+        return _intersection(means, covariances, inverses(covariances), jnp.full(count, 1 / count))
 
 
 class FixedIntersection(AbstractFusion):
@@ -122,7 +128,7 @@ class FixedIntersection(AbstractFusion):
 
     def combine(self, means: Means, covariances: Covariances) -> Fused:
         """Intersect with the given weights."""
-        return intersect(means, inverses(covariances), jnp.asarray(self.weights))
+        return _intersection(means, covariances, inverses(covariances), jnp.asarray(self.weights))
 
 
 class WeightedFusion(AbstractFusion):
@@ -174,6 +180,11 @@ class InverseCovarianceIntersection(AbstractFusion):
         for other, other_covariance in zip(means[1:], covariances[1:], strict=True):
             mean, covariance = intersect_inversely(mean, covariance, other, other_covariance)
         return mean, covariance
+
+
+def _intersection(means: Means, covariances: Covariances, information: Covariances, weights: jax.Array) -> Fused:
+    mean, covariance = intersect(means, information, weights)
+    return mean, without_known(covariance, covariances)
 
 
 def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:

@@ -12,16 +12,19 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
-from heliograph.numerics.types import Float
+from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, exponents
+from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
 from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.second_moments import has_known_gain
 
 T = TypeVar("T")
+EPS = float(np.finfo(np.float64).eps)
 
 
 class Route(NamedTuple):
@@ -51,9 +54,10 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
     routes = model_routes(plant, sensor, channel, 2 * degree, horizon)
-    moments, parts, rounding = initial_moments(start, 2 * degree), [], []
+    moments, parts, lost = initial_moments(start, 2 * degree), [], []
     before = second_moments(moments, n + 1, degree)
-    mean, spread = before[:-1, -1], before[:-1, :-1] - np.outer(before[:-1, -1], before[:-1, -1])
+    mean, spread = mean_and_spread(before)
+    start_lost = EPS * np.diag(before)[:-1]
     last: Route | None = None
     for route in routes:
         if last is None or not eqx.tree_equal(route.plant, last.plant):
@@ -61,14 +65,51 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         if last is None or not eqx.tree_equal(route.measurement, last.measurement):
             measured = np.asarray(route.measurement.moments(degree).matrix)
         last = route
+        process, process_lost = conditional_spread(route.plant, degree, moments, moved)
         moments = np.asarray(push(route.plant, 2 * degree, moments))
-        after = second_moments(moments, n + 1, degree)
-        heard = second_moments(push(route.measurement, 2 * degree, moments), m + 1, degree)
-        process, noise = after - moved @ before @ moved.T, heard - measured @ after @ measured.T
-        parts.append((*affine(moved), process[:-1, :-1], *affine(measured), noise[:-1, :-1]))
-        rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
-        before = after
-    return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), mean, spread, linear_rows(n, degree), rounding)
+        noise, noise_lost = conditional_spread(route.measurement, degree, moments, measured)
+        parts.append((*affine(moved), process, *affine(measured), noise))
+        lost.append((process_lost, noise_lost))
+    steps = Steps(*map(np.array, zip(*parts, strict=True)))
+    process_rounding, heard_rounding = map(np.array, zip(*lost, strict=True))
+    want = linear_rows(n, degree)
+    return LinearSystem(steps, mean, spread, want, process_rounding, heard_rounding, start_lost)
+
+
+def conditional_spread(
+    route: AbstractRandomAffine, degree: int, moments: Float[Array, "M"], matrix: Float[np.ndarray, "m n"]
+) -> tuple[Float[np.ndarray, "m-1 m-1"], Float[np.ndarray, "m-1"]]:
+    """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K' of the monomials Z of z = G y + n, and the rounding of its diagonal.
+
+    With a known G the part of Cov(Z_i, Z_j | y) that has no n in both is none: it is a polynomial of y of degree
+    deg Z_i + deg Z_j - 2. So moments of y of a higher degree, which would only cancel, are left out for that entry:
+    what y is worth, far from zero or growing, costs no digits of the noise.
+    """
+    n, m = route.inputs, route.outputs
+    given = degrees(n, 2 * degree)
+    wanted = degrees(m, degree)[:, None] + degrees(m, degree)
+    if not has_known_gain(route):
+        wanted = np.full_like(wanted, 2 * degree + 2)
+    result, lost = np.zeros(wanted.shape), np.zeros(len(wanted))
+    for highest in range(2, int(wanted.max()) + 1):
+        here = wanted == highest
+        if not here.any():
+            continue
+        low = np.where(given <= highest - 2, np.asarray(moments), 0.0)
+        after = np.asarray(second_moments(push(route, 2 * degree, low), m + 1, degree))
+        left = after - matrix @ np.asarray(second_moments(low, n + 1, degree)) @ matrix.T
+        result = np.where(here, left, result)
+        lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
+    return result[:-1, :-1], lost[:-1]
+
+
+def mean_and_spread(
+    second: Float[Array, "N N"],
+) -> tuple[Float[np.ndarray, "N-1"], Float[np.ndarray, "N-1 N-1"]]:
+    """Mean and covariance from the second moments of (y, 1), with the rounding of the difference."""
+    second = np.asarray(second)
+    mean = second[:-1, -1]
+    return mean, with_rounding(second[:-1, :-1], len(mean)) - np.outer(mean, mean)
 
 
 def affine(

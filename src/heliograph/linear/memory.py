@@ -7,6 +7,7 @@ from heliograph.linear.lift import (
     check_model,
     initial_moments,
     linear_rows,
+    mean_and_spread,
     model_routes,
     refuse_lift,
 )
@@ -46,8 +47,7 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     beginning = _homogeneous(np.eye(total, n), np.concatenate([np.zeros(n), linear.start, np.zeros(m)]))
     moments = push_known(beginning, 4, initial_moments(start, 4))
     before = second_moments(moments, total + 1, 2)
-    mean = before[:-1, -1]
-    spread = before[:-1, :-1] - np.outer(mean, mean)
+    mean, spread = mean_and_spread(before)
     heard, parts, rounding, kept = _heard(n, m), [], [], _Kept()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
         move, listen = kept.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))

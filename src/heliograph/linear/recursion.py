@@ -7,12 +7,13 @@ import numpy as np
 
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
-from heliograph.model.estimate import Claim
+from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail
+from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
-DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which the design warns
+DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
 
 
 class Corrected(NamedTuple):
@@ -31,7 +32,7 @@ def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
     predicted = s.transition @ spread @ s.transition.T + s.process
     cross = s.output @ predicted
     gain = solve_innovation(cross @ s.output.T + s.noise, cross).T
-    after = predicted - gain @ cross
+    after = with_rounding(predicted, len(cross)) - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
 
 
@@ -49,16 +50,15 @@ def solve_innovation(innovation: Float[np.ndarray, "m m"], cross: Float[np.ndarr
 def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     """The best linear filter of x = W y from z_1 ... z_k: an ordinary Kalman recursion, since w and v are white.
 
-    `claim` is what the covariance is worth: "exact" if the system's moments are the world's.
-
-    Warns where rounding in the system's own covariances reaches a visible part of the error's (unstable plants).
+    `claim` is what the covariance is worth: "exact" if the system's moments are the world's. It is lowered to
+    "nominal", with a warning, where rounding in the system's own covariances reaches a visible part of the error's.
 
     Raises:
         ValueError: an unknown claim.
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     spread, want, parts = system.covariance, system.want, []
-    rounding, worst, when = np.zeros_like(spread), 0.0, 0
+    rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
     for k in range(system.horizon):
         s = system.step(k)
         gain, predicted, spread = covariance_step(spread, s)
@@ -70,16 +70,24 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         parts.append((transition, gain, offset, *estimate, *expected, claimed, *before))
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
+        rounding += (gain * system.heard_rounding[k]) @ gain.T
         error = np.diag(want @ rounding @ want.T)
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
-    if worst > DIGITS_TOLERANCE:
+    return Schedule(Gains(*map(np.array, zip(*parts, strict=True))), system.mean, _supported(claim, worst, when))
+
+
+def _supported(claim: Claim, lost: float, step: int) -> Claim:
+    """The claim that is left where rounding is `lost` of a claimed variance."""
+    remedy = "use a shorter horizon, a lower degree, units in which the state is near zero, or linear_filter"
+    if lost > DIGITS_TOLERANCE:
         warnings.warn(
-            f"lmmse: rounding is {worst:.1g} of a claimed variance at step {when}: the state's own moments have "
-            "outgrown the error's (an unstable plant); use a shorter horizon or a lower degree",
-            stacklevel=2,
+            f"lmmse: rounding is {lost:.1g} of a claimed variance at step {step}: the state's own moments have "
+            f"outgrown the error's, so the claim is nominal; {remedy}",
+            stacklevel=3,
         )
-    return Schedule(Gains(*map(np.array, zip(*parts, strict=True))), system.mean, claim)
+        return weakest([claim, "nominal"])
+    return claim
 
 
 def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarray, "time q q"]:

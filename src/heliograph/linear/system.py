@@ -30,8 +30,8 @@ class LinearSystem(eqx.Module):
     C as their means, and as Cov(w), Cov(v) what is left over, E[(H - EH) y y' (H - EH)'] plus noise. A measurement
     that shares the step's noise (a relay that listens while it sends) is made a component of y and read with v = 0.
 
-    mean, covariance: of y before the first step. want: W. rounding: an absolute rounding error of the diagonal of
-    `process`, where it came out of a subtraction.
+    mean, covariance: of y before the first step. want: W. rounding, heard_rounding, start_rounding: absolute rounding
+    errors of the diagonals of `process`, `noise` and `covariance`, where these came out of a subtraction.
 
     Raises:
         ValueError: shapes that do not fit, or a start that has no covariance.
@@ -42,9 +42,18 @@ class LinearSystem(eqx.Module):
     covariance: Float[np.ndarray, "N N"]
     want: Float[np.ndarray, "q N"]
     rounding: Float[np.ndarray, "time N"]
+    heard_rounding: Float[np.ndarray, "time m"]
+    start_rounding: Float[np.ndarray, "N"]
 
     def __init__(
-        self, steps: Steps, mean: ArrayLike, covariance_: ArrayLike, want: ArrayLike, rounding: ArrayLike | None = None
+        self,
+        steps: Steps,
+        mean: ArrayLike,
+        covariance_: ArrayLike,
+        want: ArrayLike,
+        rounding: ArrayLike | None = None,
+        heard_rounding: ArrayLike | None = None,
+        start_rounding: ArrayLike | None = None,
     ):
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
@@ -55,7 +64,9 @@ class LinearSystem(eqx.Module):
         self.mean = array("mean of the start", mean, (n,))
         self.covariance = covariance("covariance of the start", covariance_, n)
         self.want = array("what is to be known", want, (None, n))
-        self.rounding = np.zeros((time, n)) if rounding is None else array("rounding", rounding, (time, n))
+        self.rounding = _rounding(rounding, (time, n))
+        self.heard_rounding = _rounding(heard_rounding, (time, m))
+        self.start_rounding = _rounding(start_rounding, (n,))
 
     @property
     def horizon(self) -> int:
@@ -65,6 +76,11 @@ class LinearSystem(eqx.Module):
     def step(self, k: int) -> Steps:
         """The matrices of one step, without time axis."""
         return Steps(*(field[k] for field in self.steps))
+
+
+def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
+    found: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
+    return found
 
 
 class StateMoments(NamedTuple):

@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 
 from heliograph.numerics.traced import is_traced
 
-SYMMETRY_TOLERANCE = 1e-10  # relative to the largest entry: covariances are computed, so rounding is allowed
-DEFINITENESS_TOLERANCE = 1e-10  # relative to the largest eigenvalue, for the same reason
+SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
+DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units
 MOST = 2**32 - 1  # of runs and steps, since each has a key of its own in which 32 bits count
 PROBABILITY_TOLERANCE = 1e-9  # sums of decimal fractions such as .1 + .2 + .7
 
@@ -124,14 +124,25 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
         raise fail(name, "a square matrix", f"shape {result.shape}")
     if is_traced(result):
         return (result + result.T) / 2
-    largest = np.max(np.abs(result), initial=0.0)
-    skew = np.max(np.abs(result - result.T), initial=0.0)
-    if skew > SYMMETRY_TOLERANCE * largest:
-        raise fail(name, "a symmetric matrix", f"entries that differ by {skew:.3g} across the diagonal")
-    smallest = np.min(np.linalg.eigvalsh(result), initial=np.inf)
-    if smallest < -DEFINITENESS_TOLERANCE * largest:
-        raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {smallest:.3g}")
+    unit = own_units(result)
+    skew = np.abs(result - result.T)
+    if np.any(skew > SYMMETRY_TOLERANCE * np.outer(unit, unit)):
+        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
+    smallest = np.min(np.linalg.eigvalsh(result / np.outer(unit, unit)), initial=np.inf)
+    if smallest < -DEFINITENESS_TOLERANCE:
+        raise fail(name, "a positive semidefinite matrix", f"smallest eigenvalue {np.linalg.eigvalsh(result)[0]:.3g}")
     return (result + result.T) / 2
+
+
+def own_units(matrix: np.ndarray) -> np.ndarray:
+    """Standard deviations (..., n) of covariances (..., n, n), by which a matrix is judged in any units.
+
+    A component of variance zero has the least one that its entries beside the others could belong to, 1 if none.
+    """
+    diagonal = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
+    others = np.where(diagonal > 0, diagonal, np.inf)
+    beside = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
+    return np.asarray(np.where(diagonal > 0, diagonal, np.where(beside > 0, beside, 1.0)))
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:

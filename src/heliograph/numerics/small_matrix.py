@@ -13,15 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
-from jax.scipy.linalg import cho_solve
+from jax.scipy.linalg import solve_triangular
 
 from heliograph.numerics.types import Array, PyTree
 
 UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
-PIVOT_TOLERANCE = 1e-14  # relative to the largest diagonal entry: a pivot this small is zero up to rounding
+PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
+NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
+OFF_SUPPORT = 1e-6  # standard deviations, and
+OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
 P = ParamSpec("P")
 R = TypeVar("R")
+A = TypeVar("A", jax.Array, np.ndarray)
 
 
 def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
@@ -122,39 +126,50 @@ def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
     return max(tolerance, units * float(np.finfo(like.dtype).eps))
 
 
+def with_rounding(p: A, terms: int) -> A:
+    """P with (terms + 2) units of rounding more of each variance: what a difference P - B'B of so many terms may miss.
+
+    So what a precise measurement leaves is never less than nothing. P (n, n, ...), NumPy's or JAX's.
+    """
+    units = (terms + 2) * float(np.finfo(p.dtype).eps)
+    return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
+
+
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     """Columns of the lower factor, (n, ...) each, and the reciprocals of its diagonal (zero for a zero column).
 
-    Column by column: what is left of a column after those before it, times the reciprocal root of its pivot.
+    Column by column: what is left of a column after those before it, times the reciprocal root of its pivot. A pivot is
+    judged by the component's own diagonal entry, so that units do not decide what is singular.
     """
-    n = a.shape[0]
-    tolerance = rounding(PIVOT_TOLERANCE, a) * jnp.max(jnp.abs(jnp.stack([a[i, i] for i in range(n)])), axis=0)
     columns: list[jax.Array] = []
     scales: list[jax.Array] = []
-    for j in range(n):
+    for j in range(a.shape[0]):
         rest = add([a[j:, j], *(-c[j:] * c[j] for c in columns)])
-        scales.append(pivot_scale(rest[0], tolerance))
+        scales.append(pivot_scale(rest[0], a[j, j]))
         columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
     return columns, scales
 
 
-def pivot_scale(pivot: jax.Array, tolerance: jax.Array) -> jax.Array:
-    """1 / root of a pivot; 0 for one that is zero up to rounding, NaN for a negative one.
+def pivot_scale(pivot: jax.Array, own: jax.Array) -> jax.Array:
+    """1 / root of a pivot; 0 for one that is zero up to rounding of the diagonal entry `own`, NaN for a negative one.
 
     The root is taken of a positive number in any case, so that what a zero pivot leaves out has the derivative 0.
     """
-    positive = pivot > tolerance
+    positive = pivot > rounding(PIVOT_TOLERANCE, pivot) * own
     scale = 1 / jnp.sqrt(jnp.where(positive, pivot, 1.0))
-    return jnp.where(positive, scale, jnp.where(jnp.abs(pivot) <= tolerance, 0.0, jnp.nan))
+    none = jnp.where(pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * own, 0.0, jnp.nan)
+    return jnp.where(positive, scale, none)
 
 
 def solve(a: jax.Array, b: jax.Array) -> jax.Array:
-    """X with A X = B for a positive definite A; NaN for any other."""
+    """X with A X = B for a positive semidefinite A and B in its range; NaN for an indefinite A.
+
+    A component that those before it determine gets zeros: B' X is B' A^+ B whatever is chosen there.
+    """
     n = a.shape[0]
     if n > UNROLL_LIMIT:
-        return _each(lambda a, b: jnp.asarray(cho_solve((jnp.linalg.cholesky(a), True), b)), a, b)
+        return _each(_long_solve, a, b)
     columns, scales = factor(a)
-    scales = [jnp.where(s == 0, jnp.nan, s) for s in scales]
     forward: list[jax.Array] = []
     for i in range(n):  # L Y = B
         forward.append(add([b[i], *(-columns[j][i] * forward[j] for j in range(i))]) * scales[i])
@@ -164,17 +179,50 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.stack(backward)
 
 
-def squared_distance(a: jax.Array, x: jax.Array) -> jax.Array:
-    """x' A^-1 x = |L^-1 x|^2 for a positive definite A = L L'; NaN for any other."""
+def long_factor(a: jax.Array) -> jax.Array:
+    """The lower factor of one larger matrix by the same rule."""
+    n, own = a.shape[-1], jnp.diagonal(a)
+
+    def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        a, done = carry
+        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], own[j]), 0.0)
+        return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
+
+    result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
+    return result
+
+
+def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
+    lower = long_factor(a)
+    none = jnp.diagonal(lower) == 0
+    lower = lower + jnp.diag(none.astype(lower.dtype))
+    forward = jnp.where(none[:, None], 0.0, solve_triangular(lower, b, lower=True))
+    return jnp.asarray(solve_triangular(lower, forward, lower=True, trans=1))
+
+
+def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
+    """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
+
+    A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
+    say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
+    """
     n = a.shape[0]
+    own = jnp.stack([a[i, i] for i in range(n)])
+    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own, 0.0)) + OFF_VALUE * jnp.abs(size)
     if n > UNROLL_LIMIT:
-        return add(list(x * solve(a, x[:, None])[:, 0]))
-    columns, scales = factor(a)
+        lower = _each(lambda a, _: long_factor(a), a, a)
+        columns, scales = list(jnp.moveaxis(lower, 1, 0)), [lower[i, i] for i in range(n)]
+        scales = [jnp.where(s == 0, 0.0, 1 / jnp.where(s == 0, 1.0, s)) for s in scales]
+    else:
+        columns, scales = factor(a)
     forward: list[jax.Array] = []
+    total: list[jax.Array] = []
     for i in range(n):  # L y = x
-        scale = jnp.where(scales[i] == 0, jnp.nan, scales[i])
-        forward.append(add([x[i], *(-columns[j][i] * forward[j] for j in range(i))]) * scale)
-    return add([y * y for y in forward])
+        rest = add([x[i], *(-columns[j][i] * forward[j] for j in range(i))])
+        forward.append(rest * scales[i])
+        agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
+        total.append(jnp.where(scales[i] == 0, agrees, forward[i] ** 2))
+    return add(total)
 
 
 def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:

@@ -15,6 +15,8 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.random_affine.monomials import Exponents, exponents
 
+OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance
+
 Number = float | jax.Array
 Vector = Float[jax.Array | np.ndarray, " n"]
 Matrix = Float[jax.Array | np.ndarray, "n m"]
@@ -61,8 +63,7 @@ class Gaussian(AbstractNoise):
         if is_traced(self.covariance):  # eigenvectors have no derivative where eigenvalues are equal
             self.factor = cholesky(jnp.asarray(self.covariance))
             return
-        values, vectors = np.linalg.eigh(self.covariance)
-        self.factor = vectors * np.sqrt(np.maximum(values, 0.0))
+        self.factor = _root(self.covariance)
 
     def sample(self, key: jax.Array) -> jax.Array:
         """Draw mean + A w with w standard normal."""
@@ -85,6 +86,22 @@ class Gaussian(AbstractNoise):
             return total
 
         return expectation(tuple(powers))
+
+
+def _root(covariance_: Square) -> np.ndarray:
+    """A with A A' = S from eigenvectors of S; of its correlations, where those of S lose digits of a component's own.
+
+    An eigenvalue is known to rounding of the largest one, so that a component in small units would be lost.
+    """
+    matrix = np.asarray(covariance_)
+    deviation = np.sqrt(np.diagonal(matrix))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    for scale in (np.ones_like(unit), unit):
+        values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
+        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
+        if np.all(np.abs(factor @ factor.T - matrix) <= OWN_DIGITS * np.outer(unit, unit)):
+            break
+    return factor
 
 
 class FiniteSupport(AbstractNoise):

@@ -15,7 +15,7 @@ from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.monomials import product_table
 
-PROPORTIONAL_TOLERANCE = 1e-12  # relative: two tensors computed by different sums are one multiple of the other
+PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
 
 
 Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
@@ -25,8 +25,9 @@ Matrix = Float[jax.Array | np.ndarray, "m p"]
 class QuadraticMap(eqx.Module):
     """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
 
-    Value: C:W + diag_i(sum_j R_ij:|W|). The second term is zero where one law dominates all others; otherwise
-    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin).
+    Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
+    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin,
+    in units d of each component's own, d_i^2 = |C_ii:W| + R_ii:|W|).
 
     Shapes: center, radius (m, m, p + 1, p + 1).
     """
@@ -37,9 +38,15 @@ class QuadraticMap(eqx.Module):
     def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
         mask = present[:, None] & present[None, :]
-        center = jnp.where(mask, contract(self.center, second_moment), 0.0)
+        center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        return center + diagonal(add([entries[:, j] for j in range(entries.shape[1])]))
+        m = range(entries.shape[0])
+        own = jnp.stack([jnp.sqrt(_or_one(jnp.abs(center[i, i]) + entries[i, i])) for i in m])
+        return center + diagonal(own * add([entries[:, j] / own[j] for j in m]))
+
+    def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """C:W alone, which is all where the law is known."""
+        return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
 class SecondOrder(eqx.Module):
@@ -62,20 +69,25 @@ class SecondOrder(eqx.Module):
     uncertain: bool = eqx.field(static=True)
 
 
+def _or_one(value: jax.Array) -> jax.Array:
+    return jnp.where(value > 0, value, 1.0)
+
+
 def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
     """Whether z depends on y through anything but a known gain; a law with traced parameters counts as random."""
     if described.uncertain or is_traced(described.spread):
-        return described.uncertain or not _has_constant_gain(channel)
+        return described.uncertain or not has_known_gain(channel)
     block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
-    return bool(np.any(block > 0)) and not _has_constant_gain(channel)
+    return bool(np.any(block > 0)) and not has_known_gain(channel)
 
 
-def _has_constant_gain(channel: AbstractRandomAffine) -> bool:
+def has_known_gain(channel: AbstractRandomAffine) -> bool:
+    """Whether z = G y + n with one G that never varies."""
     match channel:
         case GainAndNoise():
             return isinstance(channel.law, Constant)
         case Series() | Stack():
-            return all(_has_constant_gain(part) for part in channel.maps)
+            return all(has_known_gain(part) for part in channel.maps)
     return False
 
 
@@ -173,18 +185,24 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    tolerance = PROPORTIONAL_TOLERANCE * xp.max(xp.abs(tensors), initial=0.0)
+    each: Matrix = xp.abs(mean[:, :-1])
+    own = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(each, each)
+    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    reach = xp.sqrt(xp.einsum("iiaa->ia", own))[:, None, :] * loud[:, None]
     size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
-    residual = xp.max(xp.abs(gains - multiples[:, None, None, None, None] * shape), initial=0.0)
+    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
     largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
-    gaps = xp.linalg.eigvalsh(_still(largest - noises))
-    holds = (residual <= tolerance) & (xp.max(xp.abs(cross), initial=0.0) <= tolerance)
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = _still(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * own)
+    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
     widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
     exact = widened + largest[:, :, None, None] * corner
-    return exact, holds & (xp.min(gaps, initial=0.0) >= -tolerance)
+    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
 
 
 def _still(value: Matrix) -> Matrix:

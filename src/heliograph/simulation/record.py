@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
 from heliograph.simulation.network import FUSED, Network
 
 Result = TypeVar("Result")
@@ -98,8 +98,9 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     bound = np.asarray(estimate.covariance)
     finite = finite & np.isfinite(bound).all(axis=(-1, -2))
     safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
-    values = np.linalg.eigvalsh((safe + np.swapaxes(safe, -1, -2)) / 2)
-    result: np.ndarray = finite & (values[..., 0] >= -1e-12 * np.abs(values[..., -1]))  # rounding of an eigenvalue
+    unit = own_units(safe)
+    correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
+    result: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
     return result
 
 

@@ -1,6 +1,7 @@
 """Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,8 @@ class ErrorStatistics:
 
     count (batch,), pairs = sum e_i e_j and claimed_pairs = mean claimed covariance (batch, time, pair i <= j, row by
     row), nees = sum e' B^-1 e (batch, time), claim as the filter states it; uplink of a fusion that has quantizers.
-    Where no covariance is claimed, what is made of covariances is NaN.
+    Where no covariance is claimed, what is made of covariances is NaN. failed (time,): in how many runs there was no
+    valid estimate at each step, failed_runs: at some step; then figures are NaN, and say so.
     """
 
     count: np.ndarray
@@ -29,6 +31,21 @@ class ErrorStatistics:
     nees: np.ndarray
     claim: Claim
     uplink: Uplink | None = None
+    failed: np.ndarray | None = None
+    failed_runs: int = 0
+
+    @property
+    def failure(self) -> str:
+        """What is wrong with the estimates, in the words of a record's failures; empty if nothing is."""
+        if not self.failed_runs:
+            return ""
+        what = "mean" if self.claim == "none" else "covariance"
+        step = 0 if self.failed is None else int(np.argmax(self.failed > 0))
+        return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
+
+    def _tell(self) -> None:
+        if self.failed_runs:
+            warnings.warn(self.failure, stacklevel=3)
 
     @property
     def outer(self) -> np.ndarray:
@@ -58,6 +75,7 @@ class ErrorStatistics:
 
     def mean_trace(self) -> float:
         """Mean over time of the trace of the claimed covariance."""
+        self._tell()
         return float(np.trace(self.claimed(), axis1=-2, axis2=-1).mean())
 
     def rmse(self) -> tuple[float, float]:
@@ -65,6 +83,7 @@ class ErrorStatistics:
 
         The error of a root: se(mse) / (2 rmse), with se(mse) from the batch means.
         """
+        self._tell()
         squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
         mse, error = _batch_mean(squared, self.count)
         root = float(np.sqrt(mse))
@@ -72,6 +91,7 @@ class ErrorStatistics:
 
     def rmse_over_time(self) -> np.ndarray:
         """Root mean squared error at each step, (time,)."""
+        self._tell()
         result: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
         return result
 
@@ -80,6 +100,7 @@ class ErrorStatistics:
 
         The interval is from the batch means, so correlation over time within a run does no harm.
         """
+        self._tell()
         n = self.outer.shape[-1]
         mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
         width = float(stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
@@ -98,6 +119,7 @@ class ErrorStatistics:
         if self.runs < 4:
             raise fail("worst direction", "at least 4 runs", self.runs)
         broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
+        self._tell()
         if np.any(broken):
             nowhere = np.full(self.outer.shape[-1], np.nan)
             return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), nowhere)
@@ -147,6 +169,8 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
         np.concatenate([s.claimed_pairs for s in parts], axis=1),
         np.concatenate([s.nees for s in parts], axis=1),
         weakest([s.claim for s in parts]),
+        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in parts]),
+        failed_runs=max(s.failed_runs for s in parts),
     )
 
 
@@ -178,8 +202,14 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
 
 
 def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive definite B."""
-    values, vectors = np.linalg.eigh(b)
-    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))[..., None, :]
-    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ a @ root)
-    return inner, root @ rotated
+    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
+
+    In units of each component's own B_ii, and where that is zero of its A_ii.
+    """
+    own = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
+    unit = np.where(own[0] > 0, own[0], np.where(own[1] > 0, own[1], 1.0))
+    both = unit[..., :, None] * unit[..., None, :]
+    values, vectors = np.linalg.eigh(b / both)
+    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]
+    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ (a / both) @ root)
+    return inner, (root @ rotated) / unit[..., None]

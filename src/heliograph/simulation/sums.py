@@ -1,5 +1,6 @@
 """The sums from which statistics of errors are made, run by run in bounded memory, or from kept trajectories."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.small_matrix import squared_distance
@@ -19,7 +20,23 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.record import AbstractReducer, Record, Uplink, by_name, uplinks_of
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
-StatisticsByName = dict[str, dict[str, ErrorStatistics]]
+
+class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
+    """Statistics by node and filter; fused ones under "fused"."""
+
+    def failures(self) -> list[str]:
+        """One line for each filter whose estimate was no number, or its covariance none, in some run, as of a record.
+
+        One line more for each uplink that saturated.
+        """
+        lines = []
+        for node, filters in self.items():
+            lines += [f"{node}/{name}: {found.failure}" for name, found in filters.items() if found.failed_runs]
+            for name, found in filters.items():
+                for one, share in (found.uplink.saturated_share() if found.uplink else {}).items():
+                    if share:
+                        lines.append(f"{node}/{name}: the quantizer of node {one} saturated in {share:.2%} of samples")
+        return lines
 
 
 class Sums(eqx.Module):
@@ -27,6 +44,8 @@ class Sums(eqx.Module):
 
     Run r goes to batch r mod BATCHES; the last axis is longer, so that a block of consecutive runs lies in one piece,
     and what is beyond folds back in the end. A covariance that all runs share is summed once, without batches.
+    failed (2, time, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
+    then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
     `order`: whose estimates the parts are, kinds first and then fused ones; the first `own` have their own covariances.
     """
 
@@ -35,6 +54,8 @@ class Sums(eqx.Module):
     nees: jax.Array
     claimed: jax.Array
     shared: jax.Array
+    failed: jax.Array
+    failed_runs: jax.Array
     uplinks: PyTree
     order: tuple[int, ...] = eqx.field(static=True)
     own: int = eqx.field(static=True)
@@ -56,6 +77,8 @@ class Statistics(AbstractReducer[StatisticsByName]):
             nees=jnp.zeros((steps, total, wide)),
             claimed=jnp.zeros((steps, mine, pairs, wide)),
             shared=jnp.zeros((steps, total - mine, pairs)),
+            failed=jnp.zeros((2, steps, total)),
+            failed_runs=jnp.zeros((2, 1, total)),
             uplinks=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["uplinks"]),
             order=order,
             own=own,
@@ -71,8 +94,12 @@ class Statistics(AbstractReducer[StatisticsByName]):
         mine = [jnp.where(valid, _claimed(parts[i]), unit) for i in order[:own]]
         bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(parts[i]) for i in order[own:]]) if b]
         split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
-        nees = jnp.concatenate([_squared_distance(b, e) for b, e in zip(bounds, split, strict=True)], axis=1)
+        size = batch["truth"].transpose(2, 1, 0)[:, :, None]
+        nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
         counted = valid.astype(float)
+        bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)]) & valid
+        failed = carry.failed + jnp.sum(bad, axis=-1)
+        failed_runs = carry.failed_runs + jnp.sum(jnp.any(bad, axis=1, keepdims=True), axis=-1)
         claimed, shared = carry.claimed, carry.shared
         if own:
             claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), start)
@@ -82,27 +109,33 @@ class Statistics(AbstractReducer[StatisticsByName]):
         uplinks = jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent)
         pairs = _pairs(errors[:, None] * errors[None])
         sums = _dealt(carry.count, counted, start), _dealt(carry.pairs, pairs, start), _dealt(carry.nees, nees, start)
-        return Sums(*sums, claimed, shared, uplinks, order, own), ()
+        return Sums(*sums, claimed, shared, failed, failed_runs, uplinks, order, own), ()
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
         """Statistics by node and filter."""
         parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
         kinds = len(network.kinds)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
-        pairs, nees, claimed = (by_name(network, named, itemgetter(i), axis) for i, axis in enumerate((-3, -2, -3)))
+        axes = enumerate((-3, -2, -3, -2, -2))
+        each = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
         count = _folded(carry.count)
-        result = {
-            node: {
-                name: ErrorStatistics(count, pairs[node][name], claimed[node][name], nees[node][name], claim)
-                for name, claim in claims.items()
+        result = StatisticsByName()
+        for node, claims in network.claims().items():
+            result[node] = {
+                name: _statistics(count, [part[node][name] for part in each], claim) for name, claim in claims.items()
             }
-            for node, claims in network.claims().items()
-        }
         for name, uplink in uplinks_of(network, carry.uplinks).items():
             fused = result[FUSED][name]
             means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
             result[FUSED][name] = replace(fused, uplink=means)
         return result
+
+
+def _statistics(count: np.ndarray, sums: Sequence[np.ndarray], claim: Claim) -> ErrorStatistics:
+    pairs, nees, claimed, failed, failed_runs = sums
+    which = 0 if claim == "none" else slice(None)  # no distance where no covariance is claimed
+    by_step, runs = np.max(np.atleast_2d(failed[which]), axis=0), float(np.max(failed_runs[which]))
+    return ErrorStatistics(count, pairs, claimed, nees, claim, failed=by_step, failed_runs=round(runs))
 
 
 def _parts(batch: PyTree) -> tuple[list[Estimate], tuple[int, ...], int]:
@@ -149,11 +182,12 @@ def _folded(sums: jax.Array | np.ndarray) -> np.ndarray:
 
 
 def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, ...]]:
-    """Of each kind and fused estimate: sums of pairs and of NEES by batch, and the batches' mean claimed covariances.
+    """Of each kind and fused estimate: sums of pairs and of NEES by batch, mean claimed covariances by batch, failures.
 
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
     count, pairs, nees = _folded(carry.count), _folded(carry.pairs), _folded(carry.nees)
+    failed, failed_runs = np.asarray(carry.failed), np.asarray(carry.failed_runs)
     own = _folded(carry.claimed)
     own /= np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
@@ -164,7 +198,8 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, 
         offset = own.shape[2] if position >= carry.own else 0
         claimed = (shared if offset or position >= carry.own else own)[:, :, rows.start - offset : rows.stop - offset]
         result[i] = tuple(
-            a.reshape(*a.shape[:2], *axes, *a.shape[3:]) for a in (pairs[:, :, rows], nees[:, :, rows], claimed)
+            a.reshape(*a.shape[:2], *axes, *a.shape[3:])
+            for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
         )
         place = rows.stop
     return [result[i] for i in range(len(result))]
@@ -180,10 +215,10 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
     estimate = record.estimates[node][name]
     sums = _of_record(record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
-    ((pairs, nees, claimed),) = _split(sums, [])
+    (parts,) = _split(sums, [])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
-    return ErrorStatistics(_folded(sums.count), pairs, claimed, nees, estimate.claim, uplink)
+    return replace(_statistics(_folded(sums.count), parts, estimate.claim), uplink=uplink)
 
 
 @compiled

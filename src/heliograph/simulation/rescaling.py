@@ -1,0 +1,186 @@
+"""The same filters in other units: every state, output, measurement and input multiplied by a factor of its own."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.centre import Centre
+from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.linear import LinearFilter, OpenLoop
+from heliograph.filters.mixture import Components, MixtureFilter
+from heliograph.filters.polynomial import PolynomialFilter
+from heliograph.filters.prediction import PredictionFilter
+from heliograph.filters.scheduled import LinearSystemFilter
+from heliograph.filters.sequential import SequentialFilter
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.over_time import OverTime, first, over_time, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant, Plant
+from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Array, Float
+from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
+from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
+
+
+class Units(NamedTuple):
+    """Factors of the states (n,), of a sensor's outputs (p,), of what arrives (m,) and of the inputs."""
+
+    states: Float[np.ndarray, " n"]
+    outputs: Float[np.ndarray, " p"]
+    received: Float[np.ndarray, " m"]
+    inputs: Float[np.ndarray, " u"]
+
+
+def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
+    """The filter that has the estimate S xhat where this one, given z and u, has xhat, and that one Q z and U u.
+
+    Raises:
+        ValueError: a filter of a kind that this does not know.
+    """
+    s = units.states
+    match item:
+        case GaussianFilter():
+            return replace(
+                item,
+                plant=_plant(item.plant, units),
+                sensor=_sensor(item.sensor, units),
+                channel=_channel(item.channel, units),
+                initial_mean=s * item.initial_mean,
+                initial_covariance=np.outer(s, s) * item.initial_covariance,
+            )
+        case LinearFilter():
+            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            return replace(item, plant=plant, sensor=sensor, channel=_channel(item.channel, units))
+        case OpenLoop():
+            return replace(
+                item,
+                plant=_plant(item.plant, units),
+                initial_mean=s * item.initial_mean,
+                initial_covariance=np.outer(s, s) * item.initial_covariance,
+            )
+        case MixtureFilter():
+            return replace(item, plant=_plant(item.plant, units), components=_components(item.components, units))
+        case PolynomialFilter(inner=LinearSystemFilter()):
+            assert isinstance(item.inner, LinearSystemFilter)
+            inner = _system(item.inner, item.degree, units)
+            return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
+        case PredictionFilter():
+            return PredictionFilter(_gaussian(rescaled(item.base, units)))
+        case SequentialFilter():
+            return replace(item, filters=tuple(_gaussian(f) for f in _in_turn(item, units)))
+        case _:
+            raise fail("filter to rescale", "one of the package's that computes covariances", type(item).__name__)
+
+
+def _gaussian(item: AbstractFilter) -> GaussianFilter:
+    assert isinstance(item, GaussianFilter)
+    return item
+
+
+def _in_turn(item: SequentialFilter, units: Units) -> list[AbstractFilter]:
+    """Each part with its own outputs and measurements, which stand in `units` one after the other."""
+    result, heard, said = [], 0, 0
+    for part in item.filters:
+        m, p = part.received, len(first(part.sensor).outputs)
+        own = units._replace(outputs=units.outputs[said : said + p], received=units.received[heard : heard + m])
+        result.append(rescaled(part, own))
+        heard, said = heard + m, said + p
+    return result
+
+
+def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNoise:
+    if isinstance(law, Gaussian):
+        return Gaussian(np.outer(factors, factors) * law.covariance, factors * law.mean)
+    return Shaped(np.diag(factors), law)
+
+
+def _plant(item: AnyPlant, units: Units) -> AnyPlant:
+    if isinstance(item, OverTime):
+        return over_time([_plant(one, units) for one in unstack(item)])
+    s, u = units.states, units.inputs
+    law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
+    center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
+    names = {"states": item.states, "inputs": item.inputs}
+    if isinstance(item, LinearPlant):
+        assert isinstance(item.noise, AbstractNoise)
+        matrix, entry = s[:, None] * item.matrix / s, s[:, None] * item.input_matrix / u
+        return LinearPlant(matrix, _noise(item.noise, s), center, law, entry, **names)
+    given = item.noise
+    noise = (
+        _noise(given, s) if isinstance(given, AbstractNoise) else lambda v: np.outer(s, s) * jnp.asarray(given(v / u))
+    )
+    return Plant(lambda x, v: s * item.transition(x / s, v / u), noise, center, law, **names)
+
+
+def _sensor(item: AnySensor, units: Units) -> AnySensor:
+    if isinstance(item, OverTime):
+        return over_time([_sensor(one, units) for one in unstack(item)])
+    s, r = units.states, units.outputs
+    if isinstance(item, LinearSensor):
+        return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs)
+    return Sensor(lambda x: r * item.measure(x / s), _noise(item.noise, r), item.outputs)
+
+
+def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
+    if isinstance(item, OverTime):
+        return over_time([rescaled_channel(one, units) for one in unstack(item)])
+    return rescaled_channel(item, units)
+
+
+def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
+    """The description of z = Q G R^-1 y + Q n."""
+    q, r = units.received, np.append(units.outputs, 1.0)
+    factor = (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
+
+    def scaled(part: QuadraticMap) -> QuadraticMap:
+        return QuadraticMap(factor * part.center, factor * part.radius)
+
+    gain, offset = q[:, None] * item.mean_gain / units.outputs, q * item.offset
+    spread, shift, power, nominal = map(scaled, (item.spread, item.shift, item.power, item.nominal))
+    return SecondOrder(gain, offset, spread, shift, power, nominal, item.uncertain)
+
+
+def _components(item: Components | OverTime, units: Units) -> Components | OverTime:
+    values = item.values if isinstance(item, OverTime) else item
+    q = units.received
+    scaled = Components(
+        values.weight, q[:, None] * values.gain / units.states, q * values.offset, np.outer(q, q) * values.noise
+    )
+    return OverTime(scaled) if isinstance(item, OverTime) else scaled
+
+
+def _centre(item: Centre | None, units: Units) -> Centre | None:
+    if item is None:
+        return None
+    s = units.states
+
+    def scaled(part: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
+        return OverTime(factors * part.values) if isinstance(part, OverTime) else factors * part
+
+    heard = scaled(item.heard, units.received[:, None] / s)
+    return Centre(s * item.start, scaled(item.transition, s[:, None] / s), scaled(item.drift, s), heard)
+
+
+def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
+    y, z, s = _powers(units.states, degree), _powers(units.received, degree), item.steps.values
+    steps = Steps(
+        y[:, None] * s.transition / y,
+        y * s.drift,
+        np.outer(y, y) * s.process,
+        z[:, None] * s.output / y,
+        z * s.offset,
+        np.outer(z, z) * s.noise,
+    )
+    want = units.states[:, None] * item.want / y
+    system = LinearSystem(steps, y * item.mean, np.outer(y, y) * item.covariance, want)
+    return LinearSystemFilter(system, item.claim, item.states)
+
+
+def _powers(factors: Float[np.ndarray, " n"], degree: int) -> Float[np.ndarray, " N"]:
+    """Factors of the monomials up to `degree`."""
+    table = np.array(exponents(len(factors) + 1, degree))[:-1, :-1]
+    return np.asarray(np.prod(factors**table, axis=1))

@@ -1,0 +1,176 @@
+"""Whether the answers of a network depend on the user's units."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.linear import LinearFilter
+from heliograph.filters.prediction import PredictionFilter
+from heliograph.filters.sequential import SequentialFilter
+from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import first
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.types import ArrayLike
+from heliograph.random_affine.atoms import known
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.second_moments import SecondOrder, second_order
+from heliograph.simulation.network import FUSED, Network, Node
+from heliograph.simulation.rescaling import Units, rescaled, rescaled_channel
+from heliograph.simulation.simulate import monte_carlo, run
+
+DECADES = 9  # factors from 1e-9 to 1e9
+DIGITS = 1e-8  # of each component's own scale
+SEARCHED = 1e-6  # where a flat minimum is searched for: it fixes its weights to the root of rounding alone
+MISSING = 0.2  # share of the components that do not arrive
+
+
+def check_scaling(
+    network: Network, inputs: ArrayLike | None = None, steps: int = 5, seed: int = 0, trials: int = 1
+) -> float:
+    """Give every state, output, measurement and input of a network a unit of its own, and compare all estimates.
+
+    Factors from 1e-9 to 1e9 are drawn for each; every filter is told the model in the new units and hears the same
+    simulated measurements, some missing. Means and covariances must agree to 1e-8 of each component's own scale. A rule
+    that minimises a trace (covariance intersection, a bound with free scalars) adds squares of different units by
+    definition: with it all states get one factor, and the weights that it searches for agree to 1e-6. So do the
+    descriptions of the channels that filters are made from. Returns the largest difference, in its allowance.
+
+    Shapes: inputs (steps, inputs).
+
+    Raises:
+        AssertionError: naming the node, the filter and the step; an estimate that is not finite.
+        ValueError: a network of relays, a fusion with quantizers, a filter that has no covariances to compare.
+    """
+    check_count("steps", steps)
+    random = np.random.default_rng(seed)
+    world = monte_carlo(network, steps, 1, seed, inputs=inputs)
+    z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
+    for rows in z.values():
+        rows[random.random(rows.shape) < MISSING] = np.nan
+    u = np.zeros((steps, 0)) if inputs is None else np.asarray(inputs, dtype=float)
+    plain, worst = run(network, z, u).estimates, 0.0
+    for _ in range(trials):
+        for common in (False, True):
+            worst = max(worst, _compared(network, z, u, plain, _drawn(network, random, common), common))
+    return worst
+
+
+def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
+    """Units of each node, and of all nodes together under the name of what is fused."""
+
+    def factors(count: int) -> np.ndarray:
+        return np.asarray(10.0 ** random.uniform(-DECADES, DECADES, size=count))
+
+    n = len(network.states)
+    states = np.repeat(factors(1), n) if common else factors(n)
+    inputs, result = factors(len(network.inputs)), {}
+    for name in network.names:
+        node = network.nodes[name]
+        result[name] = Units(states, factors(len(node.outputs)), factors(node.received), inputs)
+    outputs, received = (np.concatenate([result[name][i] for name in network.names]) for i in (1, 2))
+    return result | {FUSED: Units(states, outputs, received, inputs)}
+
+
+def _compared(
+    network: Network,
+    z: dict[str, np.ndarray],
+    u: np.ndarray,
+    plain: dict[str, dict[str, Estimate]],
+    units: dict[str, Units],
+    common: bool,
+) -> float:
+    nodes = {name: _node(name, network, units[name]) for name in network.names}
+    fused = {name: _fused(name, item, units[FUSED]) for name, item in network.fused.items()}
+    scaled = Network(network.plant, nodes, fused)
+    shared = units[FUSED].inputs
+    found = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
+    worst = 0.0
+    for node, filters in plain.items():
+        for name, estimate in filters.items():
+            searches = _searches(network, node, name)
+            if common or not searches:
+                difference = _difference(estimate, found[node][name], units[node].states) / DIGITS
+                worst = max(worst, _judged(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0)))
+    return worst
+
+
+def _judged(name: str, differences: np.ndarray) -> float:
+    largest = float(np.max(differences, initial=0.0))
+    assert largest <= 1, f"{name}: expected the same estimate in other units, off at step {int(np.argmax(differences))}"
+    return largest
+
+
+def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
+    """Largest difference at each step, of each component's own scale: its mean and the largest deviation claimed."""
+    mean, other = np.asarray(a.mean), np.asarray(b.mean) / s
+    covariance, their = np.asarray(a.covariance), np.asarray(b.covariance) / np.outer(s, s)
+    claimed = a.claim != "none"
+    assert np.all(np.isfinite(mean)), "expected finite means"
+    assert not claimed or np.all(np.isfinite(covariance)), "expected finite covariances"
+    deviation = np.sqrt(np.abs(np.diagonal(covariance, axis1=1, axis2=2)).max(axis=0)) if claimed else 0.0
+    size = deviation + np.abs(mean).max(axis=0)
+    size = np.where(size > 0, size, 1.0)
+    result = np.nan_to_num(np.abs(mean - other) / size, nan=np.inf).max(axis=1)
+    if claimed:
+        apart = np.abs(covariance - their) / np.outer(size, size)
+        result = np.maximum(result, np.nan_to_num(apart, nan=np.inf).max(axis=(1, 2)))
+    return np.asarray(result)
+
+
+def _node(name: str, network: Network, units: Units) -> Node:
+    node = network.nodes[name]
+    if not isinstance(node, Node):
+        raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
+    channel = first(node.channel)
+    if not channel.remembers:
+        turned = Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
+        off = _apart(rescaled_channel(second_order(channel), units), second_order(turned))
+        assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
+    return Node(node.sensor, node.channel, {f: rescaled(item, units) for f, item in node.filters.items()})
+
+
+def _apart(a: SecondOrder, b: SecondOrder) -> float:
+    """Largest difference of two descriptions, of each entry's own scale: two reaches of z_i times two of y_a."""
+    each: list[Callable[[SecondOrder], np.ndarray]] = [
+        lambda d, part=part: np.asarray(getattr(d, part).center + getattr(d, part).radius)  # type: ignore[misc]
+        for part in ("spread", "shift", "power", "nominal")
+    ]
+    power = np.einsum("iiaa->ia", np.abs(each[0](a)) + np.abs(each[2](a)))
+    reach = np.sqrt(power + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
+    size = np.einsum("ia,jb->ijab", reach, reach)
+    size = size + size.swapaxes(2, 3)
+    return max(float(np.max(np.abs(one(a) - one(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for one in each)
+
+
+def _fused(name: str, item: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:
+    if isinstance(item, AbstractFilter):
+        return rescaled(item, units)
+    if item.quantizer is not None:
+        raise fail(f"fusion {name!r} to rescale", "one without quantizers, whose cells are in units", "quantizers")
+    return item
+
+
+def _searches(network: Network, node: str, name: str) -> bool:
+    """Whether a trace is minimised somewhere on the way to this estimate."""
+    if node != FUSED:
+        return _minimises(network.nodes[node].filters[name])
+    item = network.fused[name]
+    if isinstance(item, AbstractFilter):
+        return _minimises(item)
+    if isinstance(item.rule, CovarianceIntersection | InverseCovarianceIntersection):
+        return True
+    return any(_minimises(network.nodes[n].filters[item.filter]) for n in network.nodes_with(item.filter))
+
+
+def _minimises(item: AbstractFilter) -> bool:
+    match item:
+        case GaussianFilter() | LinearFilter():
+            return bool(first(item.channel).uncertain)
+        case PredictionFilter():
+            return _minimises(item.base)
+        case SequentialFilter():
+            return any(_minimises(part) for part in item.filters)
+    return False
