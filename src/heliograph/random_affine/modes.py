@@ -176,7 +176,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None) -> Join
     modes with the same mean, variance and correlation, which has probabilities.
 
     Raises:
-        ValueError: more than MODES modes.
+        ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
     """
     held = memories(channel)
     each = [_nodes(m, identity, channel, nodes) for identity, m in held.items()]
@@ -186,8 +186,10 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None) -> Join
     xp = library(each)
     initial = reduce(xp.kron, [one.initial for one in each], np.ones(1))
     transition = reduce(xp.kron, [one.transition for one in each], np.ones((1, 1)))
-    states = product(*(one.states for one in each))
-    return JointModes(initial, transition, tuple(given(channel, [s.item() for s in chosen]) for chosen in states))
+    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(one.states for one in each)))
+    for m in maps:
+        check_forgets("channel of a filter", m)
+    return JointModes(initial, transition, maps)
 
 
 def _nodes(memory: AbstractMemory, identity: str, channel: AbstractRandomAffine, nodes: int | None) -> Nodes:
