@@ -24,7 +24,6 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import nominal_spread
 
@@ -155,19 +154,27 @@ def _blocks(parts: jax.Array) -> jax.Array:
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
-    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
-    described = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    start = first(plant)
+    start, (initial, described) = first(plant), heard_over(channel)
     return ModalFilter(
         plant=plant,
         sensor=sensor,
-        channel=over_time(described) if isinstance(channel, OverTime) else described[0],
-        initial=steps[0].initial,
-        claim=claim_of_modes(steps),
+        channel=described,
+        initial=initial,
+        claim=claim_of_modes(channel),
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,
     )
+
+
+def heard_over(channel: Channel) -> tuple[Float[Array, " M"], Heard | OverTime]:
+    """Law of the modes at the first step, and what is heard at each; a channel that forgets has one mode."""
+    if not isinstance(channel, OverTime):
+        modes = joint_modes(channel)
+        return modes.initial, heard(modes, modes)
+    steps = [joint_modes(c) for c in unstack(channel)]
+    each = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(each)
 
 
 def heard(now: JointModes, before: JointModes) -> Heard:
@@ -177,7 +184,7 @@ def heard(now: JointModes, before: JointModes) -> Heard:
     return Heard(before.transition, mean, spread)
 
 
-def claim_of_modes(steps: list[JointModes]) -> Claim:
-    """ "exact" if every mode's law is known, "nominal" if some probability in it is uncertain."""
-    maps: list[AbstractRandomAffine] = [m for one in steps for m in one.maps]
-    return "exact" if all(m.corner_count() == 1 for m in maps) else "nominal"
+def claim_of_modes(channel: Channel) -> Claim:
+    """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
+    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
+    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"

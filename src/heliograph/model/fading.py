@@ -6,12 +6,14 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from heliograph.model.channel import hop
+from heliograph.model.channel import Channel, hop
+from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, scalar
 from heliograph.numerics.traced import library
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.chain import Autoregression, MarkovChain
-from heliograph.random_affine.modes import Faded, Modes
+from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
+from heliograph.random_affine.modes import Faded, Modes, joint_modes
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
@@ -80,3 +82,34 @@ def autoregressive_fading(
     """
     count = components(noise) or check_count("dimension of a hop", dimension)
     return Faded(Autoregression(correlation, name), mean, deviation, np.eye(count), as_noise("hop noise", noise, count))
+
+
+def without_memory(channel: Channel) -> Channel:
+    """The channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
+
+    Each step's draws have the law that they have in the channel (of one that does not vary: in the long run); no two
+    steps depend on each other. A channel that forgets is itself.
+
+    Raises:
+        ValueError: a channel that remembers in a way of its own.
+    """
+    if not first(channel).remembers:
+        return channel
+    if not isinstance(channel, OverTime):
+        return forgetful(channel)
+    steps = [joint_modes(one, order=2) for one in unstack(channel)]
+    return over_time([mixed(one, law) for one, law in zip(steps, laws(steps), strict=True)])
+
+
+def memory_matters(channel: Channel) -> bool:
+    """Whether mean gains are correlated over time, so that a linear filter that assumes no memory claims too much.
+
+    Memory in the variance of noise alone does not matter to it, nor in gains of mean zero in every mode.
+
+    Raises:
+        ValueError: a channel that remembers in a way of its own.
+    """
+    if not first(channel).remembers:
+        return False
+    steps = [joint_modes(one) for one in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    return not harmless(steps, not isinstance(channel, OverTime))
