@@ -18,6 +18,9 @@ from .model.over_time import (
 from .random_affine.base import (
     AbstractRandomAffine as AbstractRandomAffine,
 )
+from .random_affine.chain import (
+    MarkovChain as MarkovChain,
+)
 from .random_affine.law import (
     Discrete as Discrete,
     LogNormal as LogNormal,
@@ -44,6 +47,11 @@ from .model.channel import (
     parallel as parallel,
     perfect as perfect,
     with_direct_link as with_direct_link,
+)
+from .model.fading import (
+    autoregressive_fading as autoregressive_fading,
+    gilbert_elliott as gilbert_elliott,
+    markov_fading as markov_fading,
 )
 from .model.estimate import (
     Estimate as Estimate,
@@ -84,6 +92,9 @@ from .simulation.simulate import (
 )
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,
+)
+from .simulation.whiteness import (
+    memory_test as memory_test,
 )
 from .simulation.stream import (
     Stream as Stream,

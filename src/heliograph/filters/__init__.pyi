@@ -45,3 +45,6 @@ from .update import (
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
+from .truth import (
+    true_error as true_error,
+)

@@ -14,6 +14,7 @@ from heliograph.filters.gaussian import Belief
 from heliograph.filters.innovation import log_density
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -142,7 +143,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     standard deviation added to z, for a z that is not the model's to the last digit: a combination of atoms that
     leaves z without any randomness, as a link that is off does, is believed where z agrees with it, and only there.
 
-    Claim: "nominal".
+    Claim: "nominal". Of a channel that remembers it assumes no memory.
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, a law with no atoms, more than
@@ -153,6 +154,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
+    channel = without_memory(channel)
     floor, start = float(scalar("resolution", resolution, 0.0)) ** 2, first(plant)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
         components: Components | OverTime = _components(sensor, channel, floor)

@@ -7,6 +7,10 @@ from .channel import (
 from .estimate import (
     Innovation as Innovation,
 )
+from .fading import (
+    memory_matters as memory_matters,
+    without_memory as without_memory,
+)
 from .over_time import (
     OverTime as OverTime,
 )
