@@ -18,6 +18,9 @@ from .model.over_time import (
 from .random_affine.base import (
     AbstractRandomAffine as AbstractRandomAffine,
 )
+from .random_affine.chain import (
+    MarkovChain as MarkovChain,
+)
 from .random_affine.law import (
     Discrete as Discrete,
     LogNormal as LogNormal,
@@ -44,6 +47,11 @@ from .model.channel import (
     parallel as parallel,
     perfect as perfect,
     with_direct_link as with_direct_link,
+)
+from .model.fading import (
+    autoregressive_fading as autoregressive_fading,
+    gilbert_elliott as gilbert_elliott,
+    markov_fading as markov_fading,
 )
 from .model.estimate import (
     Estimate as Estimate,

@@ -11,6 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, describe
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
+from heliograph.filters.modal import ModalFilter, modal_filter
 from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
@@ -135,20 +136,26 @@ def _used(
     return after, jnp.where(jnp.any(present, axis=0), bound, prior), expected
 
 
-def linear_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None) -> LinearFilter:
+def linear_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
+) -> LinearFilter | ModalFilter:
     """The best linear filter for a linear plant and sensor behind any channel.
 
-    Claim: "exact"; "upper" where probabilities are uncertain. A sensor noise correlated with its own past, or a channel
-    that remembers, is outside.
+    Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
+    too. A sensor noise correlated with its own past is outside.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
-    Source: De Koning (1984), for multiplicative noise.
+    Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
     if not is_linear(plant, sensor):
         raise fail("linear filter", "a LinearPlant and a LinearSensor", f"{type(first(plant)).__name__} and "
                    f"{type(first(sensor)).__name__}")  # fmt: skip
     check_link(first(sensor), first(channel), len(first(plant).states))
+    if first(channel).remembers:
+        if update is not None:
+            raise fail("update", "none behind a channel that remembers", type(update).__name__)
+        return modal_filter(plant, sensor, channel)
     rule = Polytope() if update is None else update
     described = describe(channel, rule)
     uncertain = described.values.uncertain if isinstance(described, OverTime) else described.uncertain

@@ -4,6 +4,9 @@ from .atoms import (
     GainAndNoise as GainAndNoise,
     known as known,
 )
+from .chain import (
+    Autoregression as Autoregression,
+)
 from .combine import (
     Lift as Lift,
     Mixture as Mixture,
@@ -16,6 +19,11 @@ from .law import (
     Constant as Constant,
     GivenMoments as GivenMoments,
     bernoulli as bernoulli,
+)
+from .modes import (
+    Faded as Faded,
+    Modes as Modes,
+    joint_modes as joint_modes,
 )
 from .moment_noise import (
     NoiseMoments as NoiseMoments,

@@ -1,6 +1,7 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -9,7 +10,11 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.traced import is_traced
+from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.monomials import exponents, monomials
+
+T = TypeVar("T")
 
 
 class Moments(eqx.Module):
@@ -46,7 +51,8 @@ class AbstractRandomAffine(eqx.Module):
 
     A map that forgets is drawn independently at each step: it defines `sample`. A map that remembers has a state, of
     which the next draw depends: it defines `init` and `draw`, and says so by `remembers`. A map that holds others
-    remembers where one of them does, and then must pass their states on.
+    remembers where one of them does, and then must pass their states on; but not those of modes (`AbstractModal`),
+    which are known here: a map is drawn given the states of the memories inside, one for each however often it is held.
     """
 
     @property
@@ -67,16 +73,32 @@ class AbstractRandomAffine(eqx.Module):
     @property
     def remembers(self) -> bool:
         """Whether what is drawn depends on what was drawn before; unless told, whether a map held inside does."""
-        return any(part.remembers for part in _held(self))
+        return any(part.remembers for part in held_maps(self))
 
     def init(self, key: jax.Array) -> PyTree[jax.Array]:
         """State before the first draw; () where the map forgets."""
+        held = memories(self)
+        if not held:
+            return self._init(key)
+        rest, *keys = jax.random.split(key, len(held) + 1)
+        return begin(self, rest, keys)
+
+    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+        held = memories(self)
+        if not held:
+            return self._draw(state, key)
+        rest, *keys = jax.random.split(key, len(held) + 1)
+        return advance(self, state, rest, keys)
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """`init` of a map that holds no modes."""
         if self.remembers:
             raise fail(f"init of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         return ()
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
-        """Next state, of the same structure and shapes, and H of shape (outputs + 1, inputs + 1)."""
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """`draw` of a map that holds no modes."""
         if self.remembers:
             raise fail(f"draw of {type(self).__name__}", "one of its own, since it or a map inside remembers", "none")
         if type(self).sample is AbstractRandomAffine.sample:
@@ -122,13 +144,81 @@ class AbstractRandomAffine(eqx.Module):
         return generator.normal(size=self.inputs)
 
 
-def _held(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
+def held_maps(channel: AbstractRandomAffine) -> list[AbstractRandomAffine]:
     """The maps in a map's fields, at any depth of lists, dictionaries and other modules, but not those inside them."""
 
     def is_map(item: object) -> bool:
         return isinstance(item, AbstractRandomAffine)
 
     return [leaf for leaf in jax.tree.leaves(list(vars(channel).values()), is_leaf=is_map) if is_map(leaf)]
+
+
+class AbstractModal(AbstractRandomAffine):
+    """A map that is drawn anew at each step by a law that depends on the state of a memory."""
+
+    memory: eqx.AbstractVar[AbstractMemory]
+
+    @property
+    def remembers(self) -> bool:
+        """It does."""
+        return True
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
+        """The map that forgets, for this state of the memory."""
+        raise NotImplementedError
+
+
+class Remembered(NamedTuple):
+    """States of the memories that a map holds, in order of appearance, and of the map given them."""
+
+    memories: tuple[jax.Array, ...]
+    rest: PyTree[jax.Array]
+
+
+def begin(channel: AbstractRandomAffine, key: jax.Array, keys: Sequence[jax.Array]) -> Remembered:
+    """State before the first draw of a map that holds modes, with one key for each of `memories`."""
+    states = tuple(m.begin(k) for m, k in zip(memories(channel).values(), keys, strict=True))
+    return Remembered(states, given(channel, states).init(key))
+
+
+def advance(
+    channel: AbstractRandomAffine, state: Remembered, key: jax.Array, keys: Sequence[jax.Array]
+) -> tuple[Remembered, jax.Array]:
+    """H given the memories' states, and the states that follow."""
+    rest, h = given(channel, state.memories).draw(state.rest, key)
+    held = memories(channel).values()
+    return Remembered(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
+
+
+def memories(channel: AbstractRandomAffine) -> dict[str, AbstractMemory]:
+    """The memories on which a map's modes depend, each once, by identity in order of appearance.
+
+    Raises:
+        ValueError: one name for memories that differ.
+    """
+    found: dict[str, AbstractMemory] = {}
+    for part in jax.tree.leaves(channel, is_leaf=_is_modal):
+        if _is_modal(part):
+            known = found.setdefault(part.memory.identity, part.memory)
+            if not (known is part.memory or is_traced(known, part.memory) or eqx.tree_equal(known, part.memory)):
+                raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
+    return found
+
+
+def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
+    """The map that forgets which modes, for the states of its `memories`; whatever is combined of maps stays so."""
+    assert isinstance(channel, AbstractRandomAffine)
+    by_identity = dict(zip(memories(channel), states, strict=True))
+
+    def chosen(part: Any) -> Any:
+        return part.given(by_identity[part.memory.identity]) if _is_modal(part) else part
+
+    result: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
+    return result
+
+
+def _is_modal(item: object) -> bool:
+    return isinstance(item, AbstractModal)
 
 
 def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:

@@ -40,7 +40,7 @@ class _Parts(AbstractRandomAffine):
         """Whether one of the maps does."""
         return any(m.erases for m in self.maps)
 
-    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """The maps' states."""
         keys = jax.random.split(key, len(self.maps))
         return tuple(m.init(k) for m, k in zip(self.maps, keys, strict=True)) if self.remembers else ()
@@ -75,7 +75,7 @@ class Series(_Parts):
         """Inputs of the first map."""
         return self.maps[0].inputs
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and multiply."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         then = _after if self.erases else jnp.matmul
@@ -130,7 +130,7 @@ class Mixture(_Parts):
         """Inputs of each map."""
         return self.maps[0].inputs
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw which map, and every map."""
         choice_key, *keys = jax.random.split(key, len(self.maps) + 1)
         state, drawn = self._draw_each(state, keys)
@@ -186,7 +186,7 @@ class Stack(_Parts):
         """Inputs of each map."""
         return self.maps[0].inputs
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw each map and stack the rows."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         rows = [h[:-1] for h in drawn]
@@ -256,11 +256,11 @@ class Lift(AbstractRandomAffine):
         """Monomials of y of degree 1 to `degree`."""
         return count(self.base.inputs + 1, self.degree) - 1
 
-    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """State of the base map."""
         return self.base.init(key)
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw Sym^degree(H)."""
         state, h = self.base.draw(state, key)
         return state, jnp.asarray(symmetric_power(h, self.degree))

@@ -35,11 +35,11 @@ class Erasure(AbstractRandomAffine):
         """It does."""
         return True
 
-    def init(self, key: jax.Array) -> PyTree[jax.Array]:
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """State of the map."""
         return self.base.init(key)
 
-    def draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
         """Draw whether it arrives, and the map, whose state moves in any case."""
         arrives, drawn = jax.random.split(key)
         state, h = self.base.draw(state, drawn)

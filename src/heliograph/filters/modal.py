@@ -1,0 +1,183 @@
+"""The best linear filter behind links that remember: it estimates the state together with the mode of the links.
+
+With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its step and what is heard of it are linear and their noises
+white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so that a
+Kalman filter of zeta is the best linear filter of x = sum_j zeta^j.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.correction import absent, gain_and_bound
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.plan import plan
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.second_moments import nominal_spread
+
+
+class Heard(eqx.Module):
+    """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
+
+    transition: of the modes from the step before to this one.
+
+    Shapes: transition (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
+    """
+
+    transition: Float[Array, "M M"]
+    mean: Float[Array, "M m p1"]
+    spread: Float[Array, "M m m p1 p1"]
+
+
+class ModalBelief(NamedTuple):
+    """Estimate of zeta, mode after mode, its error's covariance, E[x~ x~' 1{mode}] before any data, and if it moved.
+
+    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1).
+    """
+
+    mean: Float[jax.Array, " N"]
+    covariance: Float[jax.Array, "N N"]
+    moments: Float[jax.Array, "M n1 n1"]
+    moved: Bool[jax.Array, ""]
+
+
+class ModalFilter(AbstractFilter):
+    """The linear minimum-mean-square-error filter of a linear plant behind links that remember.
+
+    The estimate of zeta holds that of the modes' probabilities; its covariance is singular, since the modes' indicators
+    sum to 1, and is never inverted. Which components arrive must not depend on the modes. The innovation's covariance
+    is exact; it is not Gaussian, so its Gaussian likelihood is nominal.
+
+    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: Heard | OverTime
+    initial: Float[Array, " M"]
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ModalBelief:
+        """The prior, independent of the mode: Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x x~_0 x~_0'."""
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
+        spread, square = _padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
+        covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
+        moments = law[:, None, None] * (spread + square)
+        return ModalBelief(jnp.kron(law, mean), covariance, moments, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
+        """The plant moves x~, the chain the mode; at the first use the mode has its initial law.
+
+        Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
+        """
+        plant, channel, u = at(self.plant, k), at(self.channel, k), jnp.asarray(u)
+        shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), _padded(plant.noise_covariance(u))
+        move = _padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+        modes, size = len(state.moments), len(move)
+        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
+        carried = move @ state.moments @ move.T
+        added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
+        moments = jnp.einsum("ij,iab->jab", rows, carried) + added
+        chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
+        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + _blocks(added)
+        step = jnp.kron(rows.T, move)
+        covariance = symmetrize(step @ state.covariance @ step.T + fresh)
+        return ModalBelief(step @ state.mean, covariance, moments, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
+        """Use what arrived of z.
+
+        Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
+        """
+        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        mean, noise = jnp.asarray(channel.mean), _padded(jnp.asarray(sensor.noise.covariance))
+        measure = _padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+        heard = jnp.concatenate(list(mean @ measure), axis=1)
+        law, present = state.moments[:, -1, -1], ~jnp.isnan(z)
+        both = present[:, None] & present
+        second = measure @ state.moments @ measure.T + law[:, None, None] * noise
+        added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
+        added = added + jnp.einsum("j,jma,ab,jlb->ml", law, mean, noise, mean)
+        cross, expected = heard @ state.covariance, heard @ state.mean
+        total = cross @ heard.T + added
+        gain, covariance = gain_and_bound(
+            state.covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
+        )
+        after = state.mean + gain @ jnp.where(present, z - expected, 0.0)
+        return state._replace(mean=after, covariance=covariance), gaussian_innovation(z, expected, total)
+
+    @in_float64
+    def estimate(self, state: ModalBelief) -> Estimate:
+        """x = sum_j zeta^j."""
+        want = self._want()
+        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs, np.asarray(self._want()))
+
+    def _want(self) -> Float[Array, "n N"]:
+        n = len(self.states)
+        return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
+
+
+def _padded(a: jax.Array) -> jax.Array:
+    """[[A, 0], [0, 0]]."""
+    return jnp.pad(a, ((0, 1), (0, 1)))
+
+
+def _blocks(parts: jax.Array) -> jax.Array:
+    """(M, s, s) on the diagonal of (M s, M s)."""
+    modes, size, _ = parts.shape
+    placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
+    return placed.reshape(modes * size, modes * size)
+
+
+def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
+    """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
+    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    described = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    start = first(plant)
+    return ModalFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=over_time(described) if isinstance(channel, OverTime) else described[0],
+        initial=steps[0].initial,
+        claim=claim_of_modes(steps),
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def heard(now: JointModes, before: JointModes) -> Heard:
+    """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
+    parts = [(m.moments(1).mean[:-1], nominal_spread(m).center) for m in now.maps]
+    mean, spread = (np.stack([np.asarray(part[i]) for part in parts]) for i in range(2))
+    return Heard(before.transition, mean, spread)
+
+
+def claim_of_modes(steps: list[JointModes]) -> Claim:
+    """ "exact" if every mode's law is known, "nominal" if some probability in it is uncertain."""
+    maps: list[AbstractRandomAffine] = [m for one in steps for m in one.maps]
+    return "exact" if all(m.corner_count() == 1 for m in maps) else "nominal"

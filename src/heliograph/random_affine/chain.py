@@ -1,0 +1,199 @@
+"""What links remember: a chain of modes, or a fading that drifts. It moves by itself, whatever is sent."""
+
+from functools import cache
+from math import comb, factorial
+from typing import NamedTuple
+from uuid import uuid4
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.polynomial.hermite_e import hermegauss, hermevander
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
+from heliograph.numerics.traced import is_traced, library
+
+Rows = Float[jax.Array | np.ndarray, "modes modes"]
+Law = Float[jax.Array | np.ndarray, " modes"]
+
+
+class Nodes(NamedTuple):
+    """A memory as finitely many states: their law at the first use, and row by row that of the next given the present.
+
+    The rows sum to 1. Their entries are probabilities for a chain; for a drifting fading they reproduce all
+    expectations of polynomials up to a degree, and may be negative.
+    """
+
+    states: jax.Array | np.ndarray
+    initial: Law
+    transition: Rows
+
+
+class AbstractMemory(eqx.Module):
+    """A state that moves from step to step and on which the law of what is drawn depends.
+
+    Links that hold one memory share it: they are in one shadow. One memory is the same object, or the same `name`; the
+    name also keys its draws, so that nodes of a network that share a memory need one.
+    """
+
+    name: eqx.AbstractVar[str | None]
+    identity: eqx.AbstractVar[str]
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw the state at the first use."""
+        raise NotImplementedError
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """Draw the next state."""
+        raise NotImplementedError
+
+    def nodes(self, degree: int) -> Nodes:
+        """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
+        raise NotImplementedError
+
+
+class MarkovChain(AbstractMemory):
+    """Modes 0, 1, ..., of which the next depends on the present one: transition[i, j] = P(next j | now i).
+
+    initial: law of the mode at the first use; the stationary law unless given. Where the transition varies in time
+    (channels in `over_time`), that of step k leads from step k to step k + 1. radius: each probability may be off by
+    this much, differently at each step.
+
+    Shapes: transition (modes, modes), initial (modes,).
+
+    Raises:
+        ValueError: rows that are no probabilities; no initial law, and more than one stationary law.
+    """
+
+    transition: Rows
+    initial: Law
+    radius: np.ndarray
+    name: str | None = eqx.field(static=True)
+    identity: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        transition: ArrayLike,
+        initial: ArrayLike | None = None,
+        name: str | None = None,
+        radius: ArrayLike = 0.0,
+    ):
+        self.transition = rows = array("transition matrix", transition, (None, None))
+        if rows.shape[0] != rows.shape[1] or not rows.size:
+            raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")
+        for i, row in enumerate(rows):
+            probabilities(f"transition from mode {i}", row)
+        self.radius = radii("radius of the transition", radius, rows)
+        self.initial = stationary(rows) if initial is None else probabilities("initial law", initial, len(rows))
+        self.name, self.identity = name, _identity(name)
+
+    @property
+    def modes(self) -> int:
+        """Number of modes."""
+        return int(self.transition.shape[-1])
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw the mode at the first use."""
+        return _chosen(jnp.asarray(self.initial), key)
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """Draw the next mode."""
+        return _chosen(jnp.asarray(self.transition)[state], key)
+
+    def nodes(self, degree: int) -> Nodes:
+        """The modes."""
+        return Nodes(np.arange(self.modes), self.initial, self.transition)
+
+
+class Autoregression(AbstractMemory):
+    """A standard Gaussian that drifts, c+ = rho c + sqrt(1 - rho^2) e, stationary from the first use on.
+
+    Raises:
+        ValueError: a correlation outside [-1, 1].
+    """
+
+    correlation: Float[jax.Array | np.ndarray, ""]
+    name: str | None = eqx.field(static=True)
+    identity: str = eqx.field(static=True)
+
+    def __init__(self, correlation: ArrayLike, name: str | None = None):
+        self.correlation = scalar("correlation from step to step", correlation, -1.0, 1.0)
+        self.name, self.identity = name, _identity(name)
+
+    def begin(self, key: jax.Array) -> jax.Array:
+        """Draw N(0, 1)."""
+        return jax.random.normal(key, dtype=float)
+
+    def move(self, state: jax.Array, key: jax.Array) -> jax.Array:
+        """rho c + sqrt(1 - rho^2) e."""
+        rho = jnp.asarray(self.correlation)
+        return rho * state + jnp.sqrt(1 - rho**2) * jax.random.normal(key, dtype=float)
+
+    def nodes(self, degree: int) -> Nodes:
+        """Gauss-Hermite nodes: the Lagrange polynomials on them take the place of the indicators of modes.
+
+        With N = degree + 1 nodes x and weights w, E[L_j(c+) | c = x_i] = sum_{m < N} rho^m h_m(x_i) h_m(x_j) w_j, h_m
+        the normalised Hermite polynomials. Expectations of polynomials of degree 2 N - 1 are exact; for a degree of 1
+        this is a chain, x = -1, 1 that switches with probability (1 - rho) / 2.
+        """
+        x, w, hermite = _hermite(check_count("degree", degree, 0) + 1)
+        powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
+        return Nodes(x, w, (hermite * powers) @ hermite.T * w)
+
+    def chain(self, modes: int) -> Nodes:
+        """A chain with the same mean, variance and correlation: binomial nodes, E[c+ | c] = rho c, no negative entry.
+
+        Source: Rouwenhorst, Asset pricing implications of equilibrium business cycle models (1995).
+        """
+        n = check_count("modes of a fading", modes, 2) - 1
+        xp = library(self.correlation)
+        stays = (1 + xp.asarray(self.correlation)) / 2
+        rows = [xp.convolve(_binomial(i, stays), _binomial(n - i, 1 - stays)) for i in range(n + 1)]
+        return Nodes(np.sqrt(n) * np.linspace(-1, 1, n + 1), _binomial(n, np.asarray(0.5)), xp.stack(rows))
+
+
+def stationary(transition: Rows) -> Law:
+    """The law p = p Pi of a chain that has only one.
+
+    Raises:
+        ValueError: more than one.
+    """
+    m = len(transition)
+    xp = library(transition)
+    if not is_traced(transition) and np.linalg.matrix_rank(transition - np.eye(m), tol=PROBABILITY_TOLERANCE) < m - 1:
+        raise fail("initial law", "one, since the chain has several stationary laws", "none")
+    balance = xp.concatenate([(transition.T - np.eye(m))[:-1], np.ones((1, m))])
+    law = xp.linalg.solve(balance, np.eye(m)[-1])
+    result: Law = xp.maximum(law, 0.0) / xp.maximum(law, 0.0).sum()
+    return result
+
+
+def _identity(name: str | None) -> str:
+    """What tells memories apart, through copies and in other processes; no draw depends on it."""
+    if name is not None and (not isinstance(name, str) or not name):
+        raise fail("name of a memory", "a text", repr(name))
+    return uuid4().hex if name is None else f"named {name}"
+
+
+def _chosen(law: jax.Array, key: jax.Array) -> jax.Array:
+    """Invert the distribution function at a uniform draw."""
+    return jnp.sum(jax.random.uniform(key, dtype=float) > jnp.cumsum(law)[:-1])
+
+
+def _binomial(n: int, p: jax.Array | np.ndarray) -> jax.Array | np.ndarray:
+    """Probabilities of 0, ..., n successes."""
+    k = np.arange(n + 1)
+    ways = np.array([comb(n, i) for i in k], dtype=float)
+    result: jax.Array | np.ndarray = ways * p**k * (1 - p) ** (n - k)
+    return result
+
+
+@cache
+def _hermite(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gauss-Hermite nodes x, weights w, and (node, m) normalised Hermite polynomials h_m(x), m < count."""
+    x, w = hermegauss(count)
+    scale = np.sqrt([float(factorial(m)) for m in range(count)])
+    return x, w / np.sqrt(2 * np.pi), hermevander(x, count - 1) / scale

@@ -1,0 +1,213 @@
+"""Maps whose law depends on a memory, and any map made of them as one chain with a map that forgets for each mode."""
+
+from collections.abc import Sequence
+from functools import reduce
+from itertools import product
+from math import prod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.check import array, fail, scalar, shown
+from heliograph.numerics.traced import library, stacked
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import (
+    AbstractModal,
+    AbstractRandomAffine,
+    as_maps,
+    check_forgets,
+    given,
+    memories,
+)
+from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
+from heliograph.random_affine.combine import Lift, Mixture, Stack
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
+
+MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
+
+
+class Modes(AbstractModal):
+    """One map for each mode of a chain: at each step it is drawn from the map of the present mode.
+
+    Links that name one chain are in one mode at a time; everything else in them is independent. In series, stacked,
+    mixed or erased they stay maps for each mode.
+
+    Raises:
+        ValueError: not one map for each mode, maps of several shapes, a map that itself remembers.
+    """
+
+    memory: MarkovChain
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def __init__(self, chain: MarkovChain, maps: Sequence[AbstractRandomAffine]):
+        if not isinstance(chain, MarkovChain):
+            raise fail("chain", "a MarkovChain", shown(chain))
+        self.memory, self.maps = chain, as_maps("maps of the modes", maps)
+        if len(self.maps) != chain.modes:
+            raise fail("maps of the modes", f"{chain.modes}, one for each mode", len(self.maps))
+        if len({(m.outputs, m.inputs) for m in self.maps}) != 1:
+            raise fail("maps of the modes", "maps of one shape", [(m.outputs, m.inputs) for m in self.maps])
+        for m in self.maps:
+            check_forgets("map of a mode", m)
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of each map."""
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of each map."""
+        return self.maps[0].inputs
+
+    @property
+    def erases(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.erases for m in self.maps)
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> AbstractRandomAffine:
+        """The map of this mode; of a traced one, a map with its numbers, or if they differ in kind a choice of maps."""
+        if isinstance(state, int | np.integer):
+            return self.maps[state]
+        leaves, trees = zip(*(jax.tree.flatten(m) for m in self.maps), strict=True)
+        shapes = {tuple(np.shape(leaf) for leaf in part) for part in leaves}
+        if len(set(trees)) > 1 or len(shapes) > 1:
+            return _Chosen(self.maps, jnp.asarray(state))
+        numbers = [jnp.stack([jnp.asarray(leaf) for leaf in same])[state] for same in zip(*leaves, strict=True)]
+        result: AbstractRandomAffine = jax.tree.unflatten(trees[0], numbers)
+        return result
+
+
+class _Chosen(AbstractRandomAffine):
+    """One of several maps, by a traced index."""
+
+    maps: tuple[AbstractRandomAffine, ...]
+    index: jax.Array
+
+    @property
+    def outputs(self) -> int:
+        return self.maps[0].outputs
+
+    @property
+    def inputs(self) -> int:
+        return self.maps[0].inputs
+
+    @property
+    def erases(self) -> bool:
+        return any(m.erases for m in self.maps)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        return jnp.stack([m.sample(key) for m in self.maps])[self.index]
+
+
+class Faded(AbstractModal):
+    """z = (mean + deviation c) A y + n, with c a standard Gaussian that drifts (`Autoregression`).
+
+    Shapes: matrix A (outputs, inputs).
+
+    Raises:
+        ValueError: a negative deviation, shapes that do not fit, numbers that are not finite.
+    """
+
+    memory: Autoregression
+    mean: Float[jax.Array | np.ndarray, ""]
+    deviation: Float[jax.Array | np.ndarray, ""]
+    matrix: Matrix
+    noise: AbstractNoise
+
+    def __init__(
+        self,
+        drift: Autoregression,
+        mean: ArrayLike,
+        deviation: ArrayLike,
+        matrix: ArrayLike,
+        noise: AbstractNoise | ArrayLike,
+    ):
+        if not isinstance(drift, Autoregression):
+            raise fail("drift", "an Autoregression", shown(drift))
+        self.memory, self.mean = drift, scalar("mean gain", mean)
+        self.deviation = scalar("deviation of the gain", deviation, 0.0)
+        self.matrix = array("gain matrix", matrix, (None, None))
+        self.noise = as_noise("channel noise", noise, self.matrix.shape[0])
+
+    @property
+    def outputs(self) -> int:
+        """Length of z."""
+        return int(self.matrix.shape[-2])
+
+    @property
+    def inputs(self) -> int:
+        """Length of y."""
+        return int(self.matrix.shape[-1])
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
+        """The map with the gain mean + deviation c."""
+        return GainAndNoise(Constant(self.mean + self.deviation * state), self.matrix, self.noise)
+
+
+class JointModes(eqx.Module):
+    """A map as one chain and one map that forgets for each of its modes.
+
+    Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
+    `transition` need not be probabilities. A map that forgets has one mode.
+
+    Shapes: initial (modes,), transition (modes, modes).
+    """
+
+    initial: Law
+    transition: Rows
+    maps: tuple[AbstractRandomAffine, ...]
+
+    def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
+        """E[Sym^order(H) | mode] of each mode; times transition[i, j] it is the block (j, i) of the joint moments."""
+        return stacked([m.moments(order).matrix for m in self.maps])
+
+
+def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None) -> JointModes:
+    """The memories of a map as one chain, the first slowest: transition Pi_a x Pi_b (Kronecker), and the map given it.
+
+    f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j); of maps that share one, f(a_i, b_i). Fading
+    that drifts has as many nodes as make means and second moments exact; given `nodes`, it is the chain of that many
+    modes with the same mean, variance and correlation, which has probabilities.
+
+    Raises:
+        ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
+    """
+    held = memories(channel)
+    each = [_nodes(m, identity, channel, nodes) for identity, m in held.items()]
+    total = prod(len(one.initial) for one in each)
+    if total > MODES:
+        raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
+    xp = library(each)
+    initial = reduce(xp.kron, [one.initial for one in each], np.ones(1))
+    transition = reduce(xp.kron, [one.transition for one in each], np.ones((1, 1)))
+    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(one.states for one in each)))
+    for m in maps:
+        check_forgets("channel of a filter", m)
+    return JointModes(initial, transition, maps)
+
+
+def _nodes(memory: AbstractMemory, identity: str, channel: AbstractRandomAffine, nodes: int | None) -> Nodes:
+    if nodes is not None and isinstance(memory, Autoregression):
+        return memory.chain(nodes)
+    return memory.nodes(_degree(channel, identity))
+
+
+def _degree(channel: AbstractRandomAffine, identity: str) -> int:
+    """Degree of H, as a polynomial in the state of a memory: one for each map in series that it fades."""
+    match channel:
+        case AbstractModal():
+            return int(channel.memory.identity == identity)
+        case Stack() | Mixture():
+            return max(_degree(part, identity) for part in channel.maps)
+        case Lift():
+            return channel.degree * _degree(channel.base, identity)
+    parts = jax.tree.leaves(
+        channel, is_leaf=lambda item: item is not channel and isinstance(item, AbstractRandomAffine)
+    )
+    return sum(_degree(part, identity) for part in parts if isinstance(part, AbstractRandomAffine))
