@@ -155,6 +155,75 @@ def test_what_nothing_disturbs_may_stay_at_rest():
     assert judged(begun, (hg.LinearSensor([[1.0]], 1.0), lossy(0.1))).verdict == "impossible"
 
 
+def bursts(fail, recover, name=None):
+    return hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.0), fail, recover, name)
+
+
+@pytest.mark.parametrize(("recover", "verdict"), [(0.3, "impossible"), (0.359, "impossible"), (0.361, "certified")])
+def test_bursts_must_end_fast_enough(recover, verdict):
+    """Losses last longer than P can bear if (1 - recover) a^2 >= 1, however rare they are."""
+    assert scalar(bursts(0.01, recover)).verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("fail", "recover", "bound"), [(0.1, 0.6, 4.5801), (0.3, 0.6, 6.5848), (0.1, 0.9, 3.6612), (0.4, 0.6, 7.3266)]
+)
+def test_bounds_under_bursts(fail, recover, bound):
+    np.testing.assert_allclose(scalar(bursts(fail, recover)).bound, bound, atol=5e-5)
+
+
+def test_links_in_one_shadow_fail_together():
+    """Two sensors: on chains of their own both are silent for long with rho 0.5^2, in one shadow with rho 0.5."""
+    sensor = hg.LinearSensor([[1.0]], 1.0)
+    own = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))
+    shared = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5, "hill")), (sensor, bursts(0.2, 0.5, "hill")))
+    assert own.verdict == "certified"
+    assert shared.verdict == "impossible"
+    np.testing.assert_allclose(shared.growth, 0.5 * 1.6**2)
+
+
+def test_modes_that_are_hidden_are_random_gains():
+    """Gains of 0.2 and 1 that nobody tells; losses told beside them help nothing; a drifting gain is as random."""
+    hidden = hg.markov_fading([0.2, 1.0], [[0.95, 0.05], [0.03, 0.97]], noise=0.05)
+    for channel in (hidden, hg.erasure(hidden, 0.9), hg.autoregressive_fading(1.0, 0.3, 0.95, 0.1)):
+        found = scalar(channel)
+        assert found.verdict == "impossible" and "random gains" in found.reason
+    steady = hg.autoregressive_fading(1.0, 0.0, 0.95, 0.1)
+    np.testing.assert_allclose(scalar(steady).bound, scalar(hg.hop(1.0, 0.1)).bound, rtol=1e-9)
+
+
+def test_a_mode_that_shows_itself_by_its_losses_only_in_probability():
+    """Losses with 0.1 or 0.9 by a hidden mode: the receiver knows the losses, and the bound holds for what it knows."""
+    soft = hg.gilbert_elliott(hg.erasure(hg.perfect(), 0.9), hg.erasure(hg.perfect(), 0.1), 0.1, 0.5)
+    found = scalar(soft)
+    assert found.verdict == "certified" and len(found.gains) == 2
+    assert mean_error_of_hidden_modes(0.1, 0.5, (0.9, 0.1)) < found.bound
+    clear = hg.gilbert_elliott(hg.erasure(hg.perfect(), 1.0), hg.erasure(hg.perfect(), 0.0), 0.1, 0.5)
+    np.testing.assert_allclose(scalar(clear).bound, scalar(bursts(0.1, 0.5)).bound, rtol=1e-12)
+
+
+def mean_error_of_hidden_modes(fail, recover, arrival, steps=20_000):
+    """E P of a scalar plant along one long path."""
+    draws, p, bad, total = np.random.default_rng(0).random((steps, 2)), 1.0, 0, 0.0
+    for change, arrives in draws:
+        total += p
+        p = 1.25**2 * (p * 2.5 / (p + 2.5) if arrives < arrival[bad] else p) + 1.0
+        bad = int(change < fail) if bad == 0 else int(change >= recover)
+    return total / steps
+
+
+def test_a_mode_that_is_never_reached_does_not_matter():
+    chain = hg.MarkovChain([[1.0, 0.0], [0.1, 0.9]], initial=[1.0, 0.0])
+    links = hg.markov_fading([hg.perfect(), hg.erasure(hg.perfect(), 0.0)], chain)
+    np.testing.assert_allclose(scalar(links).bound, scalar(hg.perfect()).bound, rtol=1e-9)
+
+
+def test_uncertain_transitions_are_refused():
+    chain = hg.MarkovChain([[0.9, 0.1], [0.5, 0.5]], radius=0.01)
+    with pytest.raises(ValueError, match="boundedness: expected chains of known transition"):
+        scalar(hg.markov_fading([hg.perfect(), hg.erasure(hg.perfect(), 0.0)], chain))
+
+
 def test_what_varies_or_filters_is_refused():
     sensor = hg.LinearSensor([[1.0]], 1.0)
     with pytest.raises(ValueError, match="boundedness: expected channels that do not vary"):

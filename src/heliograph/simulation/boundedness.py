@@ -22,7 +22,9 @@ from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.told import Outcome, outcomes, second_moments
 from heliograph.simulation.network import Network, Node
 
@@ -98,8 +100,16 @@ def _links(network: Network, states: int) -> Links:
     means = [np.asarray(first(node.sensor).noise.mean) for node in nodes]
     channels = [_constant(node.channel) for node in nodes]
     joint = parallel(channels) if len(channels) > 1 else channels[0]
+    for memory in memories(joint).values():
+        if isinstance(memory, MarkovChain) and np.any(memory.radius > 0):
+            raise fail("boundedness", "chains of known transition", "one whose probabilities are uncertain")
+    modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
+    initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
+    happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
+    told = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
     noise = scipy.linalg.block_diag(*noises)
-    return Links(np.ones(1), np.ones((1, 1)), [outcomes(joint)], np.concatenate(matrices), np.concatenate(means), noise)
+    links = initial[happens], chain[np.ix_(happens, happens)], told
+    return Links(*links, np.concatenate(matrices), np.concatenate(means), noise)
 
 
 def _constant(channel: Channel) -> AbstractRandomAffine:
