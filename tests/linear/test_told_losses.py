@@ -13,7 +13,9 @@ from heliograph.linear.told_losses import (
     spectral_radius,
     steady,
 )
-from tests.riccati import mean_error, riccati
+from heliograph.papers.intermittent_observations import setting
+from heliograph.papers.intermittent_observations.mean_error import mean_error
+from tests.riccati import riccati
 
 SCALAR = ([[-1.25]], [[1.0]], [[1.0]], [[2.5]])  # A, C, Q, R
 COUPLED = ([[1.25, 0.0], [1.0, 1.1]], [[1.0, 1.0]], 20 * np.eye(2), [[2.5]])
@@ -64,7 +66,7 @@ def test_the_bound_solves_the_modified_riccati_equation():
 )
 def test_bursts_of_losses(fail, recover, upper, mean):
     system = lossy(SCALAR, [[1 - fail, fail], [recover, 1 - recover]])
-    found = mean_error(-1.25, 1.0, 1.0, 2.5, fail, recover)
+    found = mean_error(setting.SCALAR, fail, recover)
     np.testing.assert_allclose((bound(system)[0, 0], found), (upper, mean), atol=5e-5)  # four decimals
     assert lower_bound(system).sum() < found < bound(system)[0, 0]
 

@@ -36,8 +36,24 @@ def test_a_scalar_plant_has_one_threshold(arrival, verdict):
     assert (found.growth >= 1) == (verdict == "impossible")
 
 
-def test_the_bound_is_that_of_the_published_example():
-    np.testing.assert_allclose(scalar(lossy(0.6)).bound, 7.32659, rtol=1e-6)
+def test_the_bound_and_the_gain_are_those_of_the_published_example():
+    found = scalar(lossy(0.6))
+    np.testing.assert_allclose(found.bound, 7.32659, rtol=1e-6)
+    np.testing.assert_allclose(found.gains[True,], -0.93199, rtol=1e-5)
+    np.testing.assert_array_equal(found.gains[False,], 0.0)
+
+
+def test_the_gains_have_the_radius_that_is_said():
+    """Two links that amplify: K acts on what is received, whatever units it has."""
+    a, c = np.array([[1.2, 0.3], [0.0, 1.1]]), np.eye(2)
+    links = hg.parallel([hg.erasure(hg.hop(5.0, 0.1), 0.9), hg.erasure(hg.hop(0.01, 0.1), 0.7)])
+    found = judged(plant(a), (hg.LinearSensor(c, np.eye(2)), links))
+    assert found.verdict == "certified" and len(found.gains) == 4
+    total = 0.0
+    for (one, two), gain in found.gains.items():
+        loop = a - gain @ np.diag([5.0, 0.01]) @ c
+        total = total + (0.9 if one else 0.1) * (0.7 if two else 0.3) * np.kron(loop, loop)
+    np.testing.assert_allclose(np.abs(np.linalg.eigvals(total)).max(), found.radius, rtol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from heliograph.numerics.types import Float, Int
 
 ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
 SETTLED = 1e-13  # relative change of the gains from step to step
-ITERATIONS, POLISHING = 300, 50  # of the covariance recursion in search of gains, and of what follows it
+ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
 NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
 SIZE_LIMIT = 4096  # rows of the operator that acts on all entries of all covariances
 

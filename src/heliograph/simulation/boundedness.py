@@ -36,9 +36,10 @@ Verdict = Literal["certified", "impossible", "undecided"]
 class Boundedness(NamedTuple):
     """What is known of E P as time goes on, P the error covariance of the filter that hears all nodes, before each z.
 
-    "certified": bounded, since `radius` < 1, the spectral radius of E[e e'] -> E[e+ e+'] under fixed `gains`, one
-    for each set of losses. "impossible": without bound for every filter, since `growth` >= 1: an eigenvector of the
-    plant grows by that, in the mean of its square over one step, while the links do not show it. "undecided": neither.
+    "certified": bounded, since `radius` < 1, the spectral radius of E[e e'] -> E[e+ e+'] under fixed `gains`
+    {what arrived: K (n, received)} of xhat+ = A xhat + K (z - what is expected), one for each set of losses.
+    "impossible": without bound for every filter, since `growth` >= 1: an eigenvector of the plant grows by that, in
+    the mean of its square over one step, while the links do not show it. "undecided": neither.
 
     `bound` (n, n): E P is at most this after long; None where it is not certified or no such matrix is at hand.
     """
@@ -47,7 +48,7 @@ class Boundedness(NamedTuple):
     reason: str
     radius: float
     growth: float
-    gains: KindGains
+    gains: dict[tuple[bool, ...], Float[np.ndarray, "n received"]]
     bound: Float[np.ndarray, "n n"] | None
 
 
@@ -85,10 +86,10 @@ def certify_boundedness(network: Network) -> Boundedness:
         radius = certified_radius(told.system, gains)
         if radius < ONE:
             bound = steady(told.system, gains, told.system.source(gains)).sum(axis=0) if told.exact else None
-            return Boundedness("certified", _certified(a, radius), radius, 0.0, gains, bound)
+            return Boundedness("certified", _certified(a, radius), radius, 0.0, told.gains(gains), bound)
     unseen = fastest_unseen(a, told.system.chain, [told.system.outputs[s] for s in told.system.told])
     verdict, reason = _refused(network, links, growing, told, unseen, radius)
-    return Boundedness(verdict, reason, radius, unseen.growth, gains, None)
+    return Boundedness(verdict, reason, radius, unseen.growth, told.gains(gains), None)
 
 
 def _links(network: Network, states: int) -> Links:
@@ -125,11 +126,25 @@ def _unstable(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
 
 
 class Told(NamedTuple):
-    """What a receiver can rely on: `exact` if that is all it hears, `random` if random gains leave something out."""
+    """What a receiver can rely on, for each of the `kinds` of losses."""
 
     system: ToldSystem
-    exact: bool
-    random: bool
+    kinds: list[tuple[bool, ...]]
+    parts: list["Certain"]
+
+    @property
+    def exact(self) -> bool:
+        """Whether that is all it hears."""
+        return all(part.exact for part in self.parts)
+
+    @property
+    def random(self) -> bool:
+        """Whether random gains leave something out."""
+        return any(part.random for part in self.parts)
+
+    def gains(self, gains: KindGains) -> dict[tuple[bool, ...], np.ndarray]:
+        """Gains on what arrives, from those on its certain sums."""
+        return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
 def _told(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> Told:
@@ -137,8 +152,8 @@ def _told(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "
 
     Modes that tell the same are one kind: a gain that differs between them is not told.
     """
-    kinds = list(dict.fromkeys(tuple(o.arrived) for each in links.outcomes for o in each))
-    weights = [(i, o, kinds.index(tuple(o.arrived))) for i, each in enumerate(links.outcomes) for o in each]
+    kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for each in links.outcomes for o in each))
+    weights = [(i, o, kinds.index(tuple(o.arrived.tolist()))) for i, each in enumerate(links.outcomes) for o in each]
     parts = [_certain([o for _, o, s in weights if s == kind], links, space) for kind in range(len(kinds))]
     told = np.array([s for _, _, s in weights])
     mode = np.array([i for i, _, _ in weights])
@@ -147,7 +162,7 @@ def _told(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(parts[s].noise(o, links) for _, o, s in weights)
     system = ToldSystem(a, q, chain, law, told, tuple(part.rows for part in parts), noises)
-    return Told(system, all(part.exact for part in parts), any(part.random for part in parts))
+    return Told(system, kinds, parts)
 
 
 class Certain(NamedTuple):
