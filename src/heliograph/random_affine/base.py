@@ -190,8 +190,8 @@ def advance(
     return Remembered(tuple(m.move(s, k) for m, s, k in zip(held, state.memories, keys, strict=True)), rest), h
 
 
-def memories(channel: AbstractRandomAffine) -> dict[str, AbstractMemory]:
-    """The memories on which a map's modes depend, each once, by identity in order of appearance.
+def memories(channel: PyTree) -> dict[str, AbstractMemory]:
+    """The memories on which the modes of a map (or of all maps in a tree) depend, by identity in order of appearance.
 
     Raises:
         ValueError: one name for memories that differ.
@@ -214,6 +214,19 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
         return part.given(by_identity[part.memory.identity]) if _is_modal(part) else part
 
     result: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
+    return result
+
+
+def anonymous(channel: T) -> T:
+    """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
+    labels = {identity: str(i) for i, identity in enumerate(memories(channel))}
+
+    def relabelled(part: Any) -> Any:
+        if not _is_modal(part):
+            return part
+        return eqx.tree_at(lambda m: m.memory, part, part.memory.labelled(labels[part.memory.identity]))
+
+    result: T = jax.tree.map(relabelled, channel, is_leaf=_is_modal)
     return result
 
 

@@ -1,5 +1,6 @@
 """What links remember: a chain of modes, or a fading that drifts. It moves by itself, whatever is sent."""
 
+from copy import copy
 from functools import cache
 from math import comb, factorial
 from typing import NamedTuple
@@ -53,6 +54,13 @@ class AbstractMemory(eqx.Module):
     def nodes(self, degree: int) -> Nodes:
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
         raise NotImplementedError
+
+    def labelled(self, label: str) -> "AbstractMemory":
+        """A twin that no link holds yet: told from others by `label` alone."""
+        twin = copy(self)  # a construction would check numbers that may be stacked over time
+        object.__setattr__(twin, "name", None)
+        object.__setattr__(twin, "identity", label)
+        return twin
 
 
 class MarkovChain(AbstractMemory):

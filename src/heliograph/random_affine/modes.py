@@ -168,18 +168,19 @@ class JointModes(eqx.Module):
         return stacked([m.moments(order).matrix for m in self.maps])
 
 
-def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None) -> JointModes:
+def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: int = 1) -> JointModes:
     """The memories of a map as one chain, the first slowest: transition Pi_a x Pi_b (Kronecker), and the map given it.
 
     f(a, b) of maps with chains of their own is f(a_i, b_j) in mode (i, j); of maps that share one, f(a_i, b_i). Fading
-    that drifts has as many nodes as make means and second moments exact; given `nodes`, it is the chain of that many
-    modes with the same mean, variance and correlation, which has probabilities.
+    that drifts has as many nodes as make exact, of H's monomials up to `order`, the means in each mode and the products
+    over time; given `nodes`, it is the chain of that many modes with the same mean, variance and correlation, which has
+    probabilities.
 
     Raises:
         ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
     """
     held = memories(channel)
-    each = [_nodes(m, identity, channel, nodes) for identity, m in held.items()]
+    each = [_nodes(m, order * _degree(channel, identity), nodes) for identity, m in held.items()]
     total = prod(len(one.initial) for one in each)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -192,10 +193,10 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None) -> Join
     return JointModes(initial, transition, maps)
 
 
-def _nodes(memory: AbstractMemory, identity: str, channel: AbstractRandomAffine, nodes: int | None) -> Nodes:
+def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
     if nodes is not None and isinstance(memory, Autoregression):
         return memory.chain(nodes)
-    return memory.nodes(_degree(channel, identity))
+    return memory.nodes(degree)
 
 
 def _degree(channel: AbstractRandomAffine, identity: str) -> int:

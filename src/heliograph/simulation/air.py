@@ -15,9 +15,10 @@ from heliograph.model.over_time import OverTime, at, first, over_time, stack, st
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
-from heliograph.random_affine.base import apply
-from heliograph.simulation.draws import CHANNEL, CHANNEL_START, SENSOR, Number, checksum, draw_key
+from heliograph.random_affine.base import anonymous
+from heliograph.simulation.draws import SENSOR, checksum, draw_key
 from heliograph.simulation.network import OWN, Network, Node
+from heliograph.simulation.shadows import deliver, memory_places, start
 
 Heard = tuple[jax.Array, ...]  # (node, received) of each group
 
@@ -39,11 +40,15 @@ class AbstractAir(eqx.Module):
 
 
 class Antenna(eqx.Module):
-    """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws."""
+    """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws.
+
+    Shapes: checksums (node,), memories (node, memories of a channel): checksums of what the channels remember.
+    """
 
     sensor: AnySensor
     channel: Channel
     checksums: jax.Array | np.ndarray
+    memories: jax.Array | np.ndarray
 
 
 class OwnChannels(AbstractAir):
@@ -55,7 +60,7 @@ class OwnChannels(AbstractAir):
         """States of the channels, by group, with a leading node axis."""
 
         def one(antenna: Antenna) -> PyTree:
-            return _begin(antenna.channel, key, antenna.checksums)
+            return start(antenna.channel, key, antenna.checksums, antenna.memories)
 
         return tuple(eqx.filter_vmap(one, in_axes=(eqx.if_array(0),))(antenna) for antenna in self.antennas)
 
@@ -65,22 +70,11 @@ class OwnChannels(AbstractAir):
         def one(antenna: Antenna, memory: PyTree) -> tuple[PyTree, jax.Array]:
             sensor = at(antenna.sensor, k)
             y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, antenna.checksums, SENSOR))
-            return _deliver(antenna.channel, memory, y, key, k, antenna.checksums)
+            return deliver(antenna.channel, memory, y, key, k, antenna.checksums, antenna.memories)
 
         both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
         results = [both(antenna, memory) for antenna, memory in zip(self.antennas, state, strict=True)]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
-
-
-def _begin(channel: Channel, key: jax.Array, place: Number) -> PyTree:
-    return at(channel, 0).init(draw_key(key, 0, place, CHANNEL_START))
-
-
-def _deliver(
-    channel: Channel, memory: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number
-) -> tuple[PyTree, jax.Array]:
-    memory, h = at(channel, k).draw(memory, draw_key(key, k, place, CHANNEL))
-    return memory, apply(h, y)
 
 
 class Relayed(NamedTuple):
@@ -99,13 +93,14 @@ class Slots(AbstractAir):
     relays: RelayNetwork
     own: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
+    memories: dict[str, np.ndarray]  # places of what each remembering hop's links hold
 
     def init(self, key: jax.Array) -> Relayed:
         """Every relay knows the initial mean."""
         mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
         hops = {
-            name: _begin(hop, key, checksum(f"{sender} to {listener}"))
-            for name, (_, listener, sender, hop) in self._remembering().items()
+            name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
+            for name, (_, listener, sender, hop) in _remembering(self.relays).items()
         }
         return Relayed(jnp.tile(mean, (len(self.own), 1)), hops)
 
@@ -117,9 +112,9 @@ class Slots(AbstractAir):
         sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
         heard = self._forgetful(k, sent, key)
         hops, slot = {}, k % len(self.relays.slots)
-        for name, (number, listener, sender, hop) in self._remembering().items():
+        for name, (number, listener, sender, hop) in _remembering(self.relays).items():
             place = checksum(f"{sender} to {listener}")
-            hops[name], z = _deliver(hop, state.hops[name], sent[sender], key, k, place)
+            hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, place, self.memories[name])
             heard[listener] = heard[listener] + jnp.where(slot == number, z, 0.0)
         order = [heard[name] for name in self.relays.filters]
         return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
@@ -128,15 +123,6 @@ class Slots(AbstractAir):
         """The relays' estimates, to be sent at the next step."""
         means = [estimates[kind].mean[f, i] for kind, f, i in self.own]
         return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
-
-    def _remembering(self) -> dict[str, tuple[int, str, str, Channel]]:
-        return {
-            f"{number} {listener} {sender}": (number, listener, sender, hop)
-            for number, slot in enumerate(self.relays.slots)
-            for listener, hops in slot.items()
-            for sender, hop in hops.items()
-            if first(hop).remembers
-        }
 
     def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
         """What each listener hears through hops that forget; NaN where nobody transmits to it."""
@@ -167,11 +153,22 @@ class Slots(AbstractAir):
         return branch
 
 
+def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
+    """Slot, listener, sender and hop of those that remember, by name."""
+    return {
+        f"{number} {listener} {sender}": (number, listener, sender, hop)
+        for number, slot in enumerate(relays.slots)
+        for listener, hops in slot.items()
+        for sender, hop in hops.items()
+        if first(hop).remembers
+    }
+
+
 def _hear(
     hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
 ) -> jax.Array:
     parts = [
-        _deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"))[1]
+        deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())[1]
         for sender, hop in hops.items()
         if not first(hop).remembers
     ]
@@ -188,10 +185,13 @@ def air_of(network: Network) -> AbstractAir:
             network.relays,
             tuple(places[name, OWN] for name in network.relays.relays),
             tuple(tuple(listeners[name] for name in names) for names in network.groups),
+            memory_places({name: hop for name, (_, _, _, hop) in _remembering(network.relays).items()}),
         )
     antennas = []
+    own = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    memories = memory_places({name: node.channel for name, node in own.items()})
     for names in network.groups:
-        nodes = [node for node in (network.nodes[name] for name in names) if isinstance(node, Node)]
-        parts = stack([(node.sensor, node.channel) for node in nodes])
-        antennas.append(Antenna(*parts, np.array([checksum(name) for name in names], dtype=np.uint32)))
+        parts = stack([(own[name].sensor, anonymous(own[name].channel)) for name in names])
+        checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
+        antennas.append(Antenna(*parts, checksums, np.stack([memories[name] for name in names])))
     return OwnChannels(tuple(antennas))

@@ -17,7 +17,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_horizon, fail
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, anonymous
 
 FUSED = "fused"  # the name under which results of several nodes stand
 OWN = "own"  # a relay's one filter
@@ -245,7 +245,7 @@ def _check_received(name: str, item: AbstractFilter, received: int) -> None:
 
 def _world(node: Node | Listener) -> object:
     """What decides how a node hears."""
-    return (node.sensor, node.channel) if isinstance(node, Node) else (node.received, node.complete)
+    return (node.sensor, anonymous(node.channel)) if isinstance(node, Node) else (node.received, node.complete)
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
