@@ -148,7 +148,12 @@ def _components(item: Components | OverTime, units: Units) -> Components | OverT
     values = item.values if isinstance(item, OverTime) else item
     q = units.received
     scaled = Components(
-        values.weight, q[:, None] * values.gain / units.states, q * values.offset, np.outer(q, q) * values.noise
+        values.weight,
+        q[:, None] * values.gain / units.states,
+        q * values.offset,
+        np.outer(q, q) * values.noise,
+        values.mode,
+        values.transition,
     )
     return OverTime(scaled) if isinstance(item, OverTime) else scaled
 
