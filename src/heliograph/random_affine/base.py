@@ -257,7 +257,7 @@ def apply(h: jax.Array, y: jax.Array) -> jax.Array:
 
 
 def conditional_moments(
-    channel: AbstractRandomAffine, y: Float[ArrayLike, " inputs"], order: int
+    channel: AbstractRandomAffine, y: ArrayLike, order: int
 ) -> Float[jax.Array | np.ndarray, " rows"]:
     """E[mono_order(z) | y] for a given point y."""
     return channel.moments(order).expect(monomials(array("point y", y, (channel.inputs,)), order))
