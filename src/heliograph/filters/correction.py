@@ -23,6 +23,7 @@ from heliograph.numerics.small_matrix import (
     transpose,
     with_rounding,
 )
+from heliograph.numerics.types import Array
 from heliograph.random_affine.second_moments import SecondOrder
 
 
@@ -53,11 +54,21 @@ class Scalars(eqx.Module):
             raise fail("scalars of the bound", "two positive numbers", (first, second))
 
 
+def as_array(scalars: Scalars | None) -> np.ndarray:
+    """Two numbers, NaN where the trace is to be minimised over them."""
+    return np.full(2, np.nan) if scalars is None else scalars.values
+
+
+def as_scalars(values: np.ndarray) -> Scalars | None:
+    """The way back."""
+    return None if np.isnan(values).any() else Scalars(*values)
+
+
 @runs_last
 def young_correction(
-    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Scalars | None
+    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The update of `Polytope` for any description of the channel."""
+    """The update of `Polytope` for any description of the channel; scalars (2,), NaN where they are to be found."""
     w = homogeneous(signal.second, signal.mean, 1.0)
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
@@ -67,20 +78,16 @@ def young_correction(
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
-    beta = (
-        smallest_scalars(young_sweep, [0.1, 0.1], (base, shift, mean_part, power, trace(prior)))
-        if scalars is None
-        else jnp.asarray(scalars.values)
-    )
+    beta = smallest_scalars(young_sweep, scalars, (base, shift, mean_part, power, trace(prior)))
     gain, bound = gain_and_bound(prior, cross, young_omega(beta, base, shift, mean_part))
     return gain, bound + beta[0] * prior
 
 
 @runs_last
 def zero_mean_correction(
-    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: jax.Array | np.ndarray | None
+    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: Array
 ) -> tuple[jax.Array, jax.Array]:
-    """The update of `ZeroMean`."""
+    """The update of `ZeroMean`; scalar (1,), NaN where it is to be found."""
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     own = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
@@ -94,11 +101,7 @@ def zero_mean_correction(
     of_used = jnp.where(used, signal.cross, 0.0)
     explained = symmetric(times(of_used, solve(among, transpose(of_used))))
 
-    beta = (
-        smallest_scalars(zero_mean_sweep, [0.1], (base, shift, power, trace(explained)))[0]
-        if scalar is None
-        else jnp.asarray(scalar)
-    )
+    beta = smallest_scalars(zero_mean_sweep, scalar, (base, shift, power, trace(explained)))[0]
     gain, bound = gain_and_bound(prior, cross, base + shift / beta)
     return gain, bound + beta * explained
 

@@ -12,7 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.small_matrix import inner, rounding, solve, times, trace, transpose
+from heliograph.numerics.types import Array
 
+START = 0.1
 SWEEPS = 200  # most steps towards the scalars; about 5 are needed
 LONGEST = 5.0  # Newton step in the logarithm of a scalar: a longer one is not trusted
 SETTLED = 1e-5  # change of a logarithm after which one more Newton step leaves 1e-10 squared
@@ -24,27 +26,29 @@ Slopes = list[list[jax.Array]]  # slopes[i][j] = d log f_i / d log beta_j
 Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(beta), slopes
 
 
-def smallest_scalars(sweep: Sweep, start: list[float], parts: Parts) -> jax.Array:
-    """Scalars (count, runs) that `sweep` leaves as they are, each run's own.
+def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
+    """Scalars (count, runs) as given, and where that is NaN those that `sweep` leaves as they are, each run's own.
 
-    Alternating minimisation creeps, so this is Newton's method, from one sweep after `start`. Where a step leads astray
+    Alternating minimisation creeps, so this is Newton's method, from one sweep after START. Where a step leads astray
     the sweep itself is taken; a run that has settled is left as it is. The last step is taken by all, outside the loop:
     its derivative is that of the root, by the implicit function theorem, in reverse too.
     """
     fixed = jax.lax.stop_gradient(parts)
+    free = jnp.isnan(given)
 
     def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
-        return jnp.any(jnp.abs(t - previous) > rounding(SETTLED, t, LOOP), axis=0)
+        return jnp.any(free & (jnp.abs(t - previous) > rounding(SETTLED, t, LOOP)), axis=0)
 
     def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         t, previous, sweeps = carry
         return jnp.where(moving(t, previous), newton_step(t, *sweep(t, *fixed)), t), t, sweeps + 1
 
-    first = jnp.stack([jnp.full_like(fixed[-1], np.log(value)) for value in start])
-    carry = sweep(first, *fixed)[0], first, jnp.asarray(1)
+    first = jnp.log(jnp.where(free, START, given))
+    first = jnp.broadcast_to(first, (len(given), *fixed[-1].shape))
+    carry = jnp.where(free, sweep(first, *fixed)[0], first), first, jnp.asarray(1)
     t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), again, carry)[0]
     refined, slopes = sweep(t, *parts)
-    return jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes)))
+    return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
 
 
 def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:

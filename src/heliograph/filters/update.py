@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.filters.correction import Scalars, Signal, young_correction, zero_mean_correction
+from heliograph.filters.correction import Scalars, Signal, as_array, as_scalars, young_correction, zero_mean_correction
 from heliograph.numerics.check import array, fail
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -59,7 +59,10 @@ class Polytope(AbstractUpdate):
     Source: cubature fusion under amplify-and-forward relays, Theorems 1 and 2, with the worst cases taken exactly.
     """
 
-    scalars: Scalars | None = None
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
         """Worst cases over the polytope."""
@@ -82,11 +85,11 @@ class ZeroMean(AbstractUpdate):
     `scalar` None: the trace is minimised over beta at each step.
     """
 
-    scalar: np.ndarray | None
+    scalar: np.ndarray
 
     def __init__(self, scalar: float | None = None):
-        self.scalar = None if scalar is None else array("scalar of the bound", scalar, ())
-        if self.scalar is not None and self.scalar <= 0:
+        self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
+        if np.any(self.scalar <= 0):
             raise fail("scalar of the bound", "a positive number", scalar)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
@@ -109,7 +112,10 @@ class Interval(AbstractUpdate):
     Source: cubature fusion under amplify-and-forward relays, equation (11), with the sign of its last term corrected.
     """
 
-    scalars: Scalars | None = None
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = as_array(scalars)
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.
@@ -121,7 +127,7 @@ class Interval(AbstractUpdate):
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""
-        return Polytope(self.scalars)
+        return Polytope(as_scalars(self.scalars))
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array

@@ -1,9 +1,10 @@
 """The paper's interval bound with the sign of its last term as printed."""
 
 import jax
+import numpy as np
 
 import heliograph as hg
-from heliograph.filters.correction import Signal, young_correction
+from heliograph.filters.correction import Signal, as_array, as_scalars, young_correction
 from heliograph.filters.update import AbstractUpdate, interval_description
 from heliograph.random_affine.second_moments import SecondOrder
 
@@ -17,7 +18,10 @@ class LooseInterval(AbstractUpdate):
     Source: cubature fusion under amplify-and-forward relays, equation (11) as printed.
     """
 
-    scalars: hg.filters.Scalars | None = None
+    scalars: np.ndarray
+
+    def __init__(self, scalars: hg.filters.Scalars | None = None):
+        self.scalars = as_array(scalars)
 
     def describe(self, channel: hg.AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.
@@ -29,7 +33,7 @@ class LooseInterval(AbstractUpdate):
 
     def described(self) -> AbstractUpdate:
         """Young's bound, as for a polytope."""
-        return hg.filters.Polytope(self.scalars)
+        return hg.filters.Polytope(as_scalars(self.scalars))
 
     def correct(
         self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
