@@ -13,6 +13,7 @@ QUANTIZERS = {
     "uniform": hg.fusion.UniformQuantizer(8, 3.0),
     "uniform by component": hg.fusion.UniformQuantizer(5, [1.0, 2.0], [0.5, 2.0]),
     "escape": ESCAPE,
+    "escape with an interval": hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3, interval=3),
     "escape by component": hg.fusion.EscapeQuantizer(3, [1e-2, 10.0], [0.3, 0.9], 0.0, [1e-3, 1.0]),
 }
 ROUNDING = 1e-15  # a few operations on numbers of the size of the amplitude
@@ -79,13 +80,14 @@ def test_a_receiver_of_symbols_alone_knows_value_and_amplitude(values, levels, g
             assert np.array_equal(other.value, received.value) and np.array_equal(other.error, received.error)
         assert 0 <= over_the_link.segment[0] < levels and not received.saturated[0]
         assert abs(received.value[0] - x) <= received.error[0] * (1 + 1e-12)
-        assert here[0] >= 1e-3
+        assert here.amplitude[0] >= 1e-3 and here.number[0] == there.number[0]
 
 
 def test_an_amplitude_off_by_rounding_does_not_lose_the_receiver():
     """Where the receiver was compiled otherwise: it takes no decision by its amplitude, so rounding stays rounding."""
     rng = np.random.default_rng(0)
-    here, there = ESCAPE.init(1), ESCAPE.init(1) * (1 + 1e-15)
+    here, there = ESCAPE.init(1), ESCAPE.init(1)
+    there = there._replace(amplitude=there.amplitude * (1 + 1e-15))
     for x in rng.normal(size=200) * 10 ** rng.uniform(-2, 2, 200):
         symbols = ESCAPE.encode(here, [x])
         (here, sent), (there, received) = ESCAPE.decode(here, symbols), ESCAPE.decode(there, symbols)
@@ -118,6 +120,68 @@ def check_no_number(quantizer):
     )
     beyond = quantizer.step(start, [np.inf, -1.7e308])[1]
     assert np.isnan(beyond.error[0])
+
+
+def sent_over(quantizer, values, arrives, restart=lambda k: False):
+    """What a receiver delivers that is told nothing of what did not arrive, and the states of both ends."""
+    here, there = quantizer.init(1), quantizer.init(1)
+    for k, x in enumerate(values):
+        symbols = quantizer.encode(here, [x], restart=restart(k))
+        here = quantizer.decode(here, symbols)[0]
+        if arrives[k]:
+            there, received = quantizer.decode(there, symbols)
+            yield k, x, received, there
+    assert np.all(here.synchronised)
+
+
+@settings(max_examples=10)
+@given(seed=st.integers(0, 10**6), interval=st.integers(1, 7), loss=st.floats(0, 0.5))
+def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_told_again_within_the_interval(seed, interval, loss):
+    rng = np.random.default_rng(seed)
+    values, arrives = rng.normal(size=25) * 10 ** rng.uniform(-4, 4, 25), rng.random(25) > loss
+    quantizer = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3, interval=interval)
+    missed = [k for k in range(25) if not arrives[k]]
+    for k, x, received, state in sent_over(quantizer, values, arrives):
+        told = np.isfinite(received.error[0])
+        assert told == state.synchronised[0] == np.isfinite(received.value[0])
+        assert not told or abs(received.value[0] - x) <= received.error[0] * (1 + 1e-12)
+        start = k - k % interval  # the last value that began from the first amplitude
+        assert told or any(start <= lost <= k for lost in missed)  # the values since then have not all arrived
+
+
+def test_without_an_interval_a_loss_is_told_and_a_request_mends_it():
+    values = [0.3, 40.0, 0.1, 0.2, 0.3, 0.4]
+    found = {k: (r.error[0], s.synchronised[0]) for k, _, r, s in
+             sent_over(ESCAPE, values, [True, False, True, True, True, True], lambda k: k == 4)}  # fmt: skip
+    assert (
+        [k for k, (error, _) in found.items() if np.isnan(error)]
+        == [2, 3]
+        == [k for k, (_, synchronised) in found.items() if not synchronised]
+    )
+
+
+def test_nothing_that_is_no_number_counts_as_lost():
+    found = [s.synchronised[0] for *_, s in sent_over(ESCAPE, [0.1, np.nan, 0.2], [True, False, True])]
+    assert found == [True, True]
+
+
+@settings(max_examples=40)
+@given(
+    x=st.floats(allow_nan=False, allow_infinity=True),
+    amplitude=st.floats(1e-290, 1e308),
+    levels=st.sampled_from([3, 10**9 + 1]),
+)
+def test_at_the_edge_of_numbers_a_value_saturates_with_a_flag(x, amplitude, levels):
+    escape = hg.fusion.EscapeQuantizer(levels, amplitude, 0.5, 0.1, 1e-290)
+    quantizers = [escape, hg.fusion.UniformQuantizer(levels, amplitude)]
+    for quantizer in quantizers:
+        state, sent = quantizer.step(quantizer.init(1), [x])
+        assert np.isfinite(sent.value[0]) and np.isnan(sent.error[0]) == sent.saturated[0]
+        if not sent.saturated[0]:  # by thirds, since the difference of two numbers may be none; to rounding
+            rounding = 1e-15 * abs(x) + np.finfo(float).tiny
+            assert abs(sent.value[0] / 3 - x / 3) <= sent.error[0] / 3 * (1 + 1e-12) + rounding
+        assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state))
+    assert escape.step(escape.init(1), [x])[1].saturated[0] <= (abs(x) > 1e307)
 
 
 def dominates(bound, p, d, directions):
@@ -173,6 +237,10 @@ def test_an_amplitude_that_follows_the_data_can_understate():
         (lambda: hg.fusion.UniformQuantizer(8, [[1.0], [2.0, 3.0]]), "amplitude: expected an array of numbers"),
         (lambda: hg.fusion.UniformQuantizer(8, 1.0, -1.0), "scale: expected positive numbers"),
         (lambda: hg.fusion.UniformQuantizer(8, "wide"), "amplitude: expected an array of numbers"),
+        (lambda: hg.fusion.UniformQuantizer(9, 5e-324), r"amplitude times scale: expected from 2e-307 to 1.8e\+308"),
+        (lambda: hg.fusion.UniformQuantizer(9, 1e200, 1e200), "amplitude times scale: expected from 2e-307"),
+        (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-320), "smallest amplitude: expected from 2e-307"),
+        (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3, 0), "interval: expected a positive whole number"),
         (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 1.0, 0.1, 1e-3), "decay: expected numbers between 0 and 1, got 1.0"),
         (lambda: hg.fusion.EscapeQuantizer(9, 1.0, 0.5, -0.1, 1e-3), "growth: expected no negative number"),
         (

@@ -12,6 +12,7 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Parameter = Float[Array, "..."]  # of all components, or of each
@@ -67,7 +68,8 @@ class UniformQuantizer(AbstractQuantizer):
     their bounds do not depend on the data, so what was "upper" stays so.
 
     Raises:
-        ValueError: fewer than two levels, an amplitude or scale that is not positive.
+        ValueError: fewer than two levels, an amplitude or scale that is not positive, a reach or an error beyond what
+            numbers hold.
     Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
     """
 
@@ -78,6 +80,7 @@ class UniformQuantizer(AbstractQuantizer):
     def __init__(self, levels: int, amplitude: ArrayLike, scale: ArrayLike = 1.0):
         self.levels = _levels(levels)
         self.amplitude, self.scale = _positive("amplitude", amplitude), _positive("scale", scale)
+        _check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
 
     def init(self, n: int) -> tuple[()]:
         """There is none."""
@@ -94,10 +97,35 @@ class UniformQuantizer(AbstractQuantizer):
 
 
 class Symbols(NamedTuple):
-    """What goes over the uplink: how many escapes, then the segment from 0; -1 says that there is no number."""
+    """What goes over the uplink for one value, by component.
+
+    How many escapes, then the segment from 0: -1 says that there is no number, `ABOVE` and `BELOW` that it is beyond
+    all that numbers hold. `number` counts the values that were sent; `restart` says that the first amplitude is used.
+    """
 
     escapes: Int[Array, "*n"]
     segment: Int[Array, "*n"]
+    number: Int[Array, "*n"]
+    restart: Bool[Array, "*n"]
+
+
+NOTHING, BELOW, ABOVE = -1, -2, -3  # segments that are none
+LOST = -1  # the number of the next value for a receiver that has missed one
+
+
+class UplinkState(NamedTuple):
+    """What one end of an uplink knows, by component: the next amplitude, and the number of the next value.
+
+    A receiver that has missed a value does not know the amplitude: `number` is negative then.
+    """
+
+    amplitude: Float[Array, "*n"]
+    number: Int[Array, "*n"]
+
+    @property
+    def synchronised(self) -> Bool[Array, "*n"]:
+        """Whether the end knows the amplitude."""
+        return self.number >= 0
 
 
 class EscapeQuantizer(AbstractQuantizer):
@@ -105,11 +133,17 @@ class EscapeQuantizer(AbstractQuantizer):
 
     Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
     Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
-    d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one.
+    d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one. Only a value whose d 2^m would
+    be no number saturates.
+
+    A value that is lost on the way leaves the receiver with a wrong d. It finds that from the number of the next one:
+    from then on it delivers NaN, without an error bound, and its state is not `synchronised`, until the sender restarts
+    from the first amplitude. That is so with every `interval`-th value, and with any that `encode` is told to restart
+    with. So after a loss the error bound holds again within `interval` values; without either, never.
 
     Raises:
-        ValueError: an even number of levels or fewer than three, amplitude or smallest amplitude not positive, decay
-            outside (0, 1), negative growth.
+        ValueError: an even number of levels or fewer than three, amplitude or smallest amplitude not positive or beyond
+            what numbers hold, decay outside (0, 1), negative growth, an interval below 1.
     """
 
     levels: Float[Array, ""]
@@ -117,45 +151,78 @@ class EscapeQuantizer(AbstractQuantizer):
     decay: Parameter
     growth: Parameter
     smallest: Parameter
+    interval: int | None = eqx.field(static=True)
 
-    def __init__(self, levels: int, amplitude: ArrayLike, decay: ArrayLike, growth: ArrayLike, smallest: ArrayLike):
+    def __init__(
+        self,
+        levels: int,
+        amplitude: ArrayLike,
+        decay: ArrayLike,
+        growth: ArrayLike,
+        smallest: ArrayLike,
+        interval: int | None = None,
+    ):
         self.levels = _levels(levels)
         if levels % 2 == 0:
             raise fail("levels", "an odd number, so that zero is a level", levels)
         self.amplitude, self.smallest = _positive("amplitude", amplitude), _positive("smallest amplitude", smallest)
+        for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
+            _check_range(name, value, np.ones(()), self.levels)
         self.decay, self.growth = _decay(decay), _growth(growth)
+        self.interval = None if interval is None else check_count("interval", interval)
 
     @in_float64
-    def init(self, n: int) -> Float[Array, "n"]:
+    def init(self, n: int) -> UplinkState:
         """The first amplitude, known to both ends."""
-        return jnp.broadcast_to(jnp.asarray(self.amplitude), (n,))
+        count = check_count("components", n)
+        return UplinkState(jnp.broadcast_to(jnp.asarray(self.amplitude), (count,)), jnp.zeros(count, int))
 
     @in_float64
-    def step(self, state: Float[Array, "*n"], value: ArrayLike) -> tuple[Float[Array, "*n"], Quantized]:
+    def step(self, state: UplinkState, value: ArrayLike) -> tuple[UplinkState, Quantized]:
         """What the receiver decodes of what the sender encodes."""
         return self.decode(state, self.encode(state, value))
 
     @in_float64
-    def encode(self, state: Float[Array, "*n"], value: ArrayLike) -> Symbols:
-        """The sender: symbols of a value (n,), from the amplitude that both ends know."""
+    def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
+        """The sender: symbols of a value (n,), from the amplitude that both ends know, or from the first one."""
         x = jnp.asarray(value, dtype=float)
-        (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(state)
+        anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
+        amplitude = self._amplitude(state, anew)
+        (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
         doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
-        escapes = jnp.where(jnp.isfinite(x) & (x != 0), jnp.maximum(doublings, 0), 0)
-        used = jnp.ldexp(state, escapes)
-        known = jnp.isfinite(x) & jnp.isfinite(used)
-        segment = jnp.where(known, _segment(x, used, self.levels), -1)
-        return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int))
+        most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
+        known, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
+        escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
+        segment = _segment(x, jnp.ldexp(amplitude, escapes), self.levels)
+        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(known, segment, NOTHING))
+        numbers = jnp.broadcast_to(state.number, x.shape)
+        return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int), numbers, anew & known)
 
     @in_float64
-    def decode(self, state: Float[Array, "*n"], symbols: Symbols) -> tuple[Float[Array, "*n"], Quantized]:
-        """The receiver: next amplitude and value, from the present amplitude and the symbols alone."""
-        escapes, segment = jnp.asarray(symbols.escapes), jnp.asarray(symbols.segment)
-        used, known = jnp.ldexp(state, escapes), segment >= 0
-        sent = _midpoint(segment, used, self.levels)
-        following = jnp.maximum(self.smallest, self.decay * used + self.growth * jnp.abs(sent))
-        value, error = jnp.where(known, sent, jnp.nan), jnp.where(known, used / self.levels, jnp.nan)
-        return jnp.where(known, following, state), Quantized(value, error, jnp.zeros_like(known), escapes + 1)
+    def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
+        """The receiver: next state and value, from the present state and the symbols alone."""
+        escapes, segment, number, restart = (jnp.asarray(part) for part in symbols)
+        restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
+        synchronised = restart | (state.number == number)
+        used = jnp.ldexp(self._amplitude(state, restart), escapes)
+        inside = _midpoint(segment, used, self.levels)
+        sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
+        largest = np.finfo(used.dtype).max
+        following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
+        known = there & synchronised
+        value = jnp.where(known, sent, jnp.nan)
+        error = jnp.where(known & ~beyond, used / self.levels, jnp.nan)
+        after = UplinkState(
+            jnp.where(known, following, state.amplitude),
+            jnp.where(there, jnp.where(synchronised, number + 1, LOST), state.number),
+        )
+        return after, Quantized(value, error, known & beyond, escapes + 1)
+
+    def _restarts(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
+        return number == 0 if self.interval is None else number % self.interval == 0
+
+    def _amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
+        return jnp.where(restart, self.amplitude, state.amplitude)
 
     def claim(self, claim: Claim) -> Claim:
         """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
@@ -192,8 +259,12 @@ def _segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Arra
 
 
 def _midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """The middle of a segment; exactly zero for the middle one of an odd number."""
-    return jnp.asarray((2 * segment + 1 - levels) * amplitude / levels)
+    """The middle of a segment; exactly zero for the middle one of an odd number.
+
+    The amplitude's power of two is taken out, which changes no bit, or its product with many levels would be no number.
+    """
+    fraction, power = jnp.frexp(jnp.asarray(amplitude))
+    return jnp.ldexp((2 * segment + 1 - levels) * fraction / levels, power)
 
 
 def _levels(value: int) -> Float[np.ndarray, ""]:
@@ -212,6 +283,18 @@ def _positive(name: str, value: ArrayLike) -> Parameter:
     if not isinstance(result, jax.Array) and np.any(result <= 0):
         raise fail(name, "positive numbers", value)
     return result
+
+
+def _check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
+    """Raise ValueError unless the reach and the error of a level are numbers, the latter to full precision."""
+    if is_traced(amplitude, scale):
+        return
+    with np.errstate(over="ignore", under="ignore"):
+        reach = np.asarray(amplitude) * scale
+        inside = np.isfinite(reach) & (reach / levels >= np.finfo(np.float64).tiny)
+    if not np.all(inside):
+        least = np.finfo(np.float64).tiny * float(levels)
+        raise fail(name, f"from {least:.3g} to {np.finfo(np.float64).max:.3g}", reach.tolist())
 
 
 def _decay(value: ArrayLike) -> Parameter:
