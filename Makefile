@@ -9,7 +9,7 @@ INSTALL := -m pip install --quiet --quiet --disable-pip-version-check
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 CREATED := .venv/.python$(VERSION)
 
-.PHONY: help demo test bench constraints clean
+.PHONY: help demo test bench soak constraints clean
 .NOTPARALLEL:
 
 help:  ## Show this list
@@ -26,6 +26,9 @@ test: .venv/.test  ## Lint, check types and run the tests
 
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
 	@$(BIN)/python benchmarks/run.py
+
+soak: .venv/.test  ## Try ten thousand random networks (an hour or more; goes on where it was stopped)
+	@$(BIN)/python benchmarks/soak.py
 
 clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache

@@ -252,7 +252,7 @@ def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_shou
     side = np.full(2, structured.BOX)
     finding = hg.h_infinity.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
     assert not finding.refuted and levels.certify(system, design, [finding]).certified
-    assert design.level == pytest.approx(7.2578, rel=1e-4)  # what a first run found
+    assert design.level == pytest.approx(7.2565, rel=1e-4)  # of which margins in a large system's units cost 1.7e-4
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(discriminating, "filters", lambda node, designs: {"ekf": kalman(node)})
         patch.setattr(discriminating, "ENERGIES", (1000.0,))

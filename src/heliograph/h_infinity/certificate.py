@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.h_infinity.growth_check import GrowthFinding
-from heliograph.h_infinity.system import GrowthSystem
+from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
+from heliograph.h_infinity.system import GrowthSystem, smallest_eigenvalue, symmetric_weight
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -18,8 +18,8 @@ class HInfinityCertificate(NamedTuple):
 
     largest_eigenvalues: of Theorem 1's matrix, which must be negative; steps_certified counts those from the
     first on that are. initial: the smallest eigenvalue of level^2 W - P_0, which must be positive. margin: the smallest
-    distance of all of them from failing, relative to the level squared. `reasons` lists what fails; `growth` what is
-    known about the growth constants.
+    distance of all of them from failing, with every matrix scaled to a diagonal of -1 or 1. `reasons` lists what fails;
+    `growth` what is known about the growth constants, `assumed` those that nothing proves.
     """
 
     certified: bool
@@ -30,6 +30,17 @@ class HInfinityCertificate(NamedTuple):
     margin: float
     growth: tuple[GrowthFinding, ...]
     reasons: tuple[str, ...]
+    assumed: tuple[str, ...]
+
+    @property
+    def text(self) -> str:
+        """What is guaranteed, and on what it rests, in a line."""
+        if not self.certified:
+            return f"level {self.level:g} is not certified: {'; '.join(self.reasons)}"
+        rests = (
+            f"assumed: {'; '.join(self.assumed)}" if self.assumed else "growth constants proved in their boxes, or zero"
+        )
+        return f"level {self.level:g} is certified; {rests}"
 
 
 def certify_level(
@@ -43,31 +54,74 @@ def certify_level(
     """Check that K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers guarantees the level.
 
     Multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~. `growth`: what
-    `check_growth` found; what rests on a refuted constant is not certified. Without it the certificate holds for the
-    constants as stated.
+    `check_growth` found; what rests on a refuted constant, or on a finding about a constant that is none of the
+    system's, is not certified. Constants that no finding proves are `assumed`, and the certificate says so.
 
     Raises:
-        ValueError: arrays of the wrong shape, or a level that is not positive.
+        ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)
-    K, P = array("gains", gains, (T, n, m)), array("weights", weights, (T + 1, 2 * n, 2 * n))
+    K = array("gains", gains, (T, n, m))
+    P = symmetric_weight("weights", array("weights", weights, (T + 1, 2 * n, 2 * n)))
     lam = _multipliers(array("multipliers", multipliers, (T, None)))
     matrices = [theorem_matrix(system, k, K[k], P[k], P[k + 1], lam[k], level) for k in range(T)]
     tops, negative = np.array([_largest(phi) for phi in matrices]), np.array([is_negative(phi) for phi in matrices])
-    initial = float(np.linalg.eigvalsh(level**2 * system.initial_weight - P[0])[0])
-    definite = np.array([np.linalg.eigvalsh((p + p.T) / 2)[0] for p in P])
-    margin = min(float(-tops.max()), initial) / level**2
+    allowed = level**2 * system.initial_weight
+    initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
+    own = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
+    definite = np.array([smallest_eigenvalue(p) for p in P])
+    margin = min(own, *(-_scaled_largest(phi) for phi in matrices))
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
-    if not initial > 0:
+    if not own > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
-    reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > 0))]
+    reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
-    reasons += [finding.text for finding in growth if finding.refuted]
+    constants = _constants(system)
+    for finding in growth:
+        if finding.refuted:
+            reasons.append(finding.text)
+        elif not any(_same(finding.constant, value) for value, _ in constants):
+            known = ", ".join(sorted({f"{value:g}" for value, _ in constants})) or "none"
+            reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
     count = T if negative.all() else int(np.argmin(negative))
-    return HInfinityCertificate(not reasons, float(level), tops, count, initial, margin, tuple(growth), tuple(reasons))
+    return HInfinityCertificate(
+        not reasons,
+        float(level),
+        tops,
+        count,
+        initial,
+        margin,
+        tuple(growth),
+        tuple(reasons),
+        _assumed(constants, growth),
+    )
+
+
+def _same(a: float, b: float) -> bool:
+    return abs(a - b) <= TOLERANCE * max(a, b)
+
+
+def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
+    """The growth constants that are not zero, each once, with what each bounds."""
+    found: dict[tuple[float, str], None] = {}
+    for letter, growth in (("f", system.growth), ("h", system.output_growth)):
+        for what, values in ((f"|{letter}(x)| <= a |x|", growth.state), ("", growth.error)):
+            whole = what or f"|{letter}(x) - {letter}(y)| <= a |x - y|"
+            found |= {(float(value), whole): None for value in values if value > 0}
+    return list(found)
+
+
+def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> tuple[str, ...]:
+    """What no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
+    result = []
+    for value, what in constants:
+        about = [finding for finding in growth if _same(finding.constant, value)]
+        if not about or not all(finding.proved for finding in about):
+            result.append(f"{what} with a = {value:g}")
+    return tuple(result)
 
 
 def theorem_matrix(
@@ -147,8 +201,13 @@ def is_negative(phi: Float[np.ndarray, "q q"]) -> bool:
 
     Scaling keeps definiteness and lets weights of very different sizes stand in one matrix.
     """
+    return _scaled_largest(phi) < -ROUNDING
+
+
+def _scaled_largest(phi: Float[np.ndarray, "q q"]) -> float:
+    """Largest eigenvalue after scaling the diagonal to -1; infinite where it is not negative."""
     diagonal = np.diagonal(phi)
     if not np.all(diagonal < 0):
-        return False
+        return np.inf
     scale = 1 / np.sqrt(-diagonal)
-    return _largest(phi * np.outer(scale, scale)) < -ROUNDING
+    return _largest(phi * np.outer(scale, scale))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.h_infinity.scaling import scale
 from heliograph.h_infinity.solver import (
     MARGIN,
     HorizonProblem,
@@ -27,7 +28,7 @@ from heliograph.h_infinity.step import (
     next_energy,
     step_matrices,
 )
-from heliograph.h_infinity.system import GrowthSystem
+from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -67,9 +68,10 @@ def recursive_design(
     """Solve one linear matrix inequality after another at a given level.
 
     Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved: `objective` is
-    "trace" (smallest tr L), "largest_eigenvalue" (of L), "log_determinant" (largest log det P) or "none" (whatever the
-    solver finds first: it often ends in a dead end). `initial` is P_0, or None for the largest allowed, level^2 W.
-    `separate` multipliers are less conservative. `search`: look for the smallest level if this one fails.
+    "trace" (smallest tr L; as the next, in coordinates of order one where no growth makes lengths comparable),
+    "largest_eigenvalue" (of L), "log_determinant" (largest log det P) or "none" (whatever the solver finds first: it
+    often ends in a dead end). `initial` is P_0, or None for the largest allowed, level^2 W. `separate` multipliers are
+    less conservative. `search`: look for the smallest level if this one fails.
 
     Raises:
         ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape.
@@ -79,7 +81,7 @@ def recursive_design(
     _check_level(level)
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
-    start = None if initial is None else array("initial weight P_0", initial, (2 * system.states,) * 2)
+    start = None if initial is None else _weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, separate)
     design = recursion.run(level, start)
     if design.feasible or not search:
@@ -106,9 +108,9 @@ def smallest_recursive_level(
     """
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
-    start = None if initial is None else array("initial weight P_0", initial, (2 * system.states,) * 2)
+    start = None if initial is None else _weight(initial, system.states)
     recursion = _Recursion(system, objective, solver, separate)
-    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, _scale(system))
+    smallest = _smallest(lambda trial: recursion.run(trial, start).feasible, recursion.coordinates.unit)
     if smallest is None:
         raise fail("smallest level", f"one below {SEARCH_LIMIT:g} times the norm of M", "none that works")
     return recursion.run(smallest, start)
@@ -124,7 +126,8 @@ def horizon_design(
     """The smallest level over the whole horizon, and gains that attain it: all steps as one convex problem.
 
     With P and Y = P2 K as unknowns in place of L and K every step is linear, and so is the level squared. `gains`
-    (steps, n, m) given: the smallest level that can be proven for those. `initial` is P_0, or None to choose it too.
+    (steps, n, m) given: the smallest level that can be proven for those. `initial` is P_0, or None for the largest
+    allowed, level^2 W, which is never worse than another.
     `separate`: one multiplier for each of f, f~, h, h~; never worse.
 
     Raises:
@@ -133,30 +136,36 @@ def horizon_design(
     Source: H-infinity fusion over amplify-and-forward relays, Theorems 1 and 2, solved jointly (not in the paper).
     """
     check_choice("solver", solver, Solver)
-    n, m, scale = system.states, system.received, _scale(system)
-    steps = [s._replace(wanted=s.wanted / scale**2) for s in step_matrices(system, separate)]
-    given = [None] * len(steps) if gains is None else list(array("gains", gains, (len(steps), n, m)))
-    layouts = [Layout(n, m, len(s.growth), gain) for s, gain in zip(steps, given, strict=True)]
-    start = None if initial is None else array("initial weight P_0", initial, (2 * n, 2 * n)) / scale**2
-    problem = HorizonProblem(steps, layouts, system.initial_weight, start)
+    n, m = system.states, system.received
+    given = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
+    steps, coordinates = scale(system, step_matrices(system, separate), given)
+    own = None if given is None else np.zeros((n, m))  # beside the given ones
+    layouts = [Layout(n, m, len(s.growth), own) for s in steps]
+    start = None if initial is None else coordinates.scaled_weight(_weight(initial, n), 0)
+    allowed = coordinates.unit**2 * coordinates.scaled_weight(system.initial_weight, 0)
+    problem = HorizonProblem(steps, layouts, allowed, start)
     status = run_solver(problem.problem, solver)
     values = problem.unknowns.value
     if not status.startswith("optimal") or values is None:
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     parts = [np.asarray(values[place]) for place in problem.places]
-    first = Layout(n, 0, 0).unpack(parts[1])
-    found = [layout.unpack(part) for layout, part in zip(layouts, parts[2:], strict=True)]
-    weights, square = np.array([_block(u) for u in [first, *found]]), float(parts[0][0])
+    found = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
+    square = float(parts[0][0])
+    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, found)]
     for k, (step, unknowns) in enumerate(zip(steps, found, strict=True)):
         fixed = step.wanted - square * step.energy
         fixed[: 2 * n, : 2 * n] -= weights[k]
         if not _holds(step, unknowns, fixed, SCREEN * square):
             text = f"the solver's answer fails at step {k} ({status})"
             return _empty(system, separate, float("nan"), text)._replace(failed_step=k)
-    weights, level = weights * scale**2, float(np.sqrt(square)) * scale
-    chosen = np.array([_gain(u) for u in found]) if gains is None else np.array(given)
-    multipliers = all_multipliers(system, np.array([u.multipliers for u in found]) * scale**2, separate)
-    return HInfinityDesign(level, chosen, weights, multipliers, True, status)
+    level = float(np.sqrt(square)) * coordinates.unit
+    chosen = given
+    if chosen is None:
+        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(found)])
+    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(found)])
+    unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
+    proven = all_multipliers(system, multipliers, separate)
+    return HInfinityDesign(level, chosen, unscaled, proven, True, status)
 
 
 class _Recursion:
@@ -164,34 +173,51 @@ class _Recursion:
 
     def __init__(self, system: GrowthSystem, objective: Objective, solver: Solver, separate: bool):
         self.system, self.objective, self.solver, self.separate = system, objective, solver, separate
-        self.steps = step_matrices(system, separate)
+        self.steps, self.coordinates = scale(system, step_matrices(system, separate))
         self.layout = Layout(system.states, system.received, len(self.steps[0].growth))
-        self.compiled: tuple[StepMatrices, StepProblem] | None = None
+        self.compiled: list[tuple[StepMatrices, tuple[float, float], np.ndarray | None, StepProblem]] = []
 
     def run(self, level: float, initial: Float[np.ndarray, "w w"] | None) -> HInfinityDesign:
         """Solve at one level, in units of the level squared."""
-        system, n = self.system, self.system.states
-        top = level**2 * system.initial_weight
-        present = (1 - MARGIN) * _diagonal_part(top, n) if initial is None else initial
+        system, n, c = self.system, self.system.states, self.coordinates
+        relative = (level / c.unit) ** 2
+        top = c.unit**2 * c.scaled_weight(system.initial_weight, 0)
+        present = (1 - MARGIN) * top if initial is None else c.scaled_weight(initial, 0) / relative
         design = _empty(system, self.separate, level, "")
         if np.linalg.eigvalsh(top - present)[0] <= 0 or np.linalg.eigvalsh(present)[0] <= 0:
             return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
-        design.weights[0] = present
+        design.weights[0] = relative * c.weight(present, 0)
         for k, step in enumerate(self.steps):
-            fixed = step.wanted / level**2 - step.energy
-            fixed[: 2 * n, : 2 * n] -= design.weights[k] / level**2
-            status, found = self._problem(step).solve(fixed)
+            fixed = step.wanted / relative - step.energy
+            fixed[: 2 * n, : 2 * n] -= present
+            status, found = self._problem(k, present if k == 0 else None).solve(fixed)
             if found is None or not _holds(step, found, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            design.gains[k], design.weights[k + 1] = _gain(found), _block(found) * level**2
-            design.multipliers[k] = all_multipliers(system, found.multipliers * level**2, self.separate)
+            present = _block(found)
+            design.gains[k] = c.gain(step.nominal + _gain(found), k)
+            design.weights[k + 1] = relative * c.weight(present, k + 1)
+            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(found, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
-    def _problem(self, step: StepMatrices) -> StepProblem:
-        if self.compiled is None or not all(map(np.array_equal, self.compiled[0], step)):
-            self.compiled = step, StepProblem(step, self.layout, self.objective, self.solver)
-        return self.compiled[1]
+    def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
+        step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
+        coupling = _coupling(start, self.system.states)
+        for one, own, coupled, problem in self.compiled:
+            if all(map(np.array_equal, one, step)) and own == sizes and coupled is coupling is None:
+                return problem
+        problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
+        self.compiled.append((step, sizes, coupling, problem))
+        return problem
+
+
+def _coupling(start: Float[np.ndarray, "w w"] | None, n: int) -> Float[np.ndarray, "w w"] | None:
+    """The weight where it couples x and e, which those of later steps do not."""
+    return None if start is None or not np.any(start[:n, n:]) else start
+
+
+def _weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
+    return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 
 
 def _holds(step: StepMatrices, found: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
@@ -203,7 +229,7 @@ def _holds(step: StepMatrices, found: Unknowns, fixed: Float[np.ndarray, "q q"],
 
 
 def _gain(found: Unknowns) -> Float[np.ndarray, "n m"]:
-    """K = P2^-1 Y."""
+    """K - K0 = P2^-1 Y."""
     return np.asarray(np.linalg.solve(found.error, found.product))
 
 
@@ -213,27 +239,11 @@ def _block(found: Unknowns) -> Float[np.ndarray, "w w"]:
     return np.block([[found.state, zero], [zero, found.error]])
 
 
-def _diagonal_part(weight: Float[np.ndarray, "w w"], n: int) -> Float[np.ndarray, "w w"]:
-    """The largest multiple of diag(W1, W2) below W."""
-    part = weight.copy()
-    part[:n, n:] = part[n:, :n] = 0.0
-    root = np.linalg.inv(np.linalg.cholesky(part))
-    return float(np.linalg.eigvalsh(root @ weight @ root.T)[0]) * part
-
-
 def _empty(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:
     n, steps = system.states, system.steps
     shapes = (steps, n, system.received), (steps + 1, 2 * n, 2 * n), (steps, 4 if separate else 2)
     gains, weights, multipliers = (np.full(shape, np.nan) for shape in shapes)
     return HInfinityDesign(level, gains, weights, multipliers, False, status)
-
-
-def _scale(system: GrowthSystem) -> float:
-    """Norm of M, the unit of levels."""
-    largest = float(np.max(np.linalg.norm(system.wanted, 2, axis=(1, 2))))
-    if largest == 0:
-        raise fail("wanted matrix", "one that is not zero", "zero at every step")
-    return largest
 
 
 def _smallest(works: Callable[[float], bool], guess: float) -> float | None:

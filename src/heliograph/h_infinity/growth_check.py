@@ -1,4 +1,4 @@
-"""Whether a function obeys a growth constant: slopes over a stated region, and a search for a pair that breaks it."""
+"""Whether a function obeys a growth constant: slopes over a stated region, a pair that breaks it, or a proof."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import qmc
 
+from heliograph.h_infinity.slope_bound import slope_bound
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import ArrayLike, Float
@@ -22,11 +23,14 @@ Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with 
 
 
 class GrowthFinding(NamedTuple):
-    """What was found about |f(x) - f(y)| <= constant |x - y| in the box from `low` to `high`.
+    """What was found about |f(x) - f(y)| <= constant |x - y|, f(0) = 0, in the box from `low` to `high`.
 
-    slope: the largest norm of a Jacobian found there, at `point`: at least this large is every true constant. pair and
-    ratio: the two points found with the largest |f(x) - f(y)| / |x - y|. `refuted` if the ratio exceeds the constant. A
-    finding that is not refuted is a search that failed, not a proof.
+    slope: the largest norm of a Jacobian found there, at `point`: at least this large is every true constant; infinite
+    where f is no number. pair and ratio: the points found with the largest |f(x) - f(y)| / |x - y|. at_zero: |f(0)|.
+    bound: no slope in the box is larger, by interval arithmetic on f's own operations; infinite where these cannot be
+    followed, for the `reason` given. differences: false for a finding about |f(x)| <= constant |x| alone.
+
+    `refuted` if anything found breaks the constant, `proved` if the bound keeps it; else it is assumed.
     """
 
     name: str
@@ -37,20 +41,51 @@ class GrowthFinding(NamedTuple):
     point: Float[np.ndarray, "n"]
     pair: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
     ratio: float
+    at_zero: float
+    bound: float
+    reason: str
+    differences: bool
+
+    @property
+    def limit(self) -> float:
+        """The constant, with what counts as rounding."""
+        return self.constant * (1 + TOLERANCE)
+
+    @property
+    def starts_at_zero(self) -> bool:
+        """Whether f(0) = 0, to rounding of what the constant allows over the box."""
+        return self.at_zero <= TOLERANCE * self.constant * float(np.linalg.norm(self.high - self.low))
 
     @property
     def refuted(self) -> bool:
-        """Whether a pair breaks the constant."""
-        return self.ratio > self.constant * (1 + TOLERANCE)
+        """Whether a pair, a slope or f(0) breaks the constant."""
+        steep = self.differences and not self.slope <= self.limit
+        return steep or not self.ratio <= self.limit or not self.starts_at_zero
+
+    @property
+    def proved(self) -> bool:
+        """Whether no slope in the box exceeds the constant, for certain."""
+        return not self.refuted and self.bound <= self.limit
 
     @property
     def text(self) -> str:
         """One line."""
         where = f"in the box from {np.round(self.low, 4).tolist()} to {np.round(self.high, 4).tolist()}"
+        if self.proved:
+            return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
         if not self.refuted:
-            return f"{self.name}: constant {self.constant:g} not refuted {where} (largest slope {self.slope:.6g})"
+            why = self.reason or f"slopes are proved below {self.bound:.6g} only"
+            found = f"not refuted {where} (largest slope {self.slope:.6g})"
+            return f"{self.name}: constant {self.constant:g} is assumed: {found}; {why}"
+        return f"{self.name}: constant {self.constant:g} is false {where}: {self._evidence()}"
+
+    def _evidence(self) -> str:
+        if not self.starts_at_zero:
+            return f"f(0) has the norm {self.at_zero:.6g}, not 0"
+        if self.ratio <= self.limit:
+            return f"slope {self.slope:.6g} at {np.round(self.point, 6).tolist()}"
         x, y = (np.round(p, 6).tolist() for p in self.pair)
-        return f"{self.name}: constant {self.constant:g} is false {where}: ratio {self.ratio:.6g} at {x} and {y}"
+        return f"ratio {self.ratio:.6g} at {x} and {y}"
 
 
 def check_growth(
@@ -60,7 +95,8 @@ def check_growth(
 
     Norms of Jacobians by automatic differentiation at 4,096 points of a Sobol sequence, then random moves of shrinking
     size from the steepest. Pairs start close together along the steepest directions, and far apart, and move likewise.
-    A box is convex, so in it the largest slope is the smallest true constant.
+    A box is convex, so in it the largest slope is the smallest true constant. Where f is written in operations that
+    interval arithmetic can follow, the constant is then proved by bounds of the Jacobian over parts of the box.
 
     Raises:
         ValueError: a negative constant, a box of the wrong shape or upside down.
@@ -75,7 +111,7 @@ def check_growth(
     far = bottom + (top - bottom) * random.random((POINTS, 2, len(bottom)))
     starts = np.concatenate([close, far.reshape(POINTS, -1)])
     pairs = _climb(tools.ratio, starts, np.tile(bottom, 2), np.tile(top, 2), random)
-    return _finding(name, constant, bottom, top, tools, points, pairs)
+    return _finding(name, constant, bottom, top, tools, points, pairs, True)
 
 
 def check_size(
@@ -97,7 +133,9 @@ def check_size(
         return tools.ratio(np.concatenate([points, np.zeros_like(points)], axis=1))
 
     points = _climb(from_zero, starts, bottom, top, random)
-    return _finding(name, constant, bottom, top, tools, points, np.concatenate([points, np.zeros_like(points)], axis=1))
+    return _finding(
+        name, constant, bottom, top, tools, points, np.concatenate([points, np.zeros_like(points)], axis=1), False
+    )
 
 
 def _check_box(
@@ -115,37 +153,56 @@ class _Tools:
     """Slopes and ratios of a function at many points (count, n) or pairs (count, 2n), compiled once."""
 
     def __init__(self, function: Function, width: float):
-        self.width = width
+        self.width, self.function = width, function
         self.jacobian = compiled(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))
         self.values = compiled(jax.vmap(lambda x: jnp.atleast_1d(function(x))))
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian."""
-        return np.asarray(np.linalg.norm(self.jacobian(points), 2, axis=(-2, -1)))
+        found = np.asarray(self.jacobian(points))
+        finite = np.isfinite(found).all(axis=(-2, -1))
+        safe = np.where(finite[:, None, None], found, 0.0)
+        return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
 
     def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
         """Unit direction in which the function changes most."""
-        return np.linalg.svd(self.jacobian(points))[2][:, 0]
+        return np.linalg.svd(np.nan_to_num(self.jacobian(points), posinf=0.0, neginf=0.0))[2][:, 0]
 
     def ratio(self, pairs: Float[np.ndarray, "count both"]) -> Float[np.ndarray, "count"]:
         """|f(x) - f(y)| / |x - y|, and 0 for points too close to tell."""
         x, y = np.split(pairs, 2, axis=1)
         distance = np.linalg.norm(x - y, axis=1)
         apart = distance > NEARBY * self.width / 2
-        return np.where(
-            apart, np.linalg.norm(self.values(x) - self.values(y), axis=1) / np.where(apart, distance, 1), 0
-        )
+        change = np.linalg.norm(np.asarray(self.values(x)) - self.values(y), axis=1)
+        return np.where(apart, np.where(np.isfinite(change), change, np.inf) / np.where(apart, distance, 1), 0)
+
+    def at_zero(self, n: int) -> float:
+        """|f(0)|, infinite where it is no number."""
+        size = float(np.linalg.norm(self.values(np.zeros((1, n)))))
+        return size if np.isfinite(size) else np.inf
 
 
 def _finding(
-    name: str, constant: float, low: np.ndarray, high: np.ndarray, tools: _Tools, points: np.ndarray, pairs: np.ndarray
+    name: str,
+    constant: float,
+    low: np.ndarray,
+    high: np.ndarray,
+    tools: _Tools,
+    points: np.ndarray,
+    pairs: np.ndarray,
+    differences: bool,
 ) -> GrowthFinding:
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
     best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[pair], 2)
-    return GrowthFinding(
-        name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair])
-    )
+    found = GrowthFinding(
+        name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair]),
+        tools.at_zero(len(low)), np.inf, "", differences,
+    )  # fmt: skip
+    if found.refuted:
+        return found
+    bound = slope_bound(tools.function, low, high, found.limit)
+    return found._replace(bound=bound.value, reason=bound.reason)
 
 
 def _climb(

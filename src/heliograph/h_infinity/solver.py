@@ -15,7 +15,6 @@ from heliograph.h_infinity.step import (
     Unknowns,
     independent_parts,
     linear_forms,
-    weight_form,
 )
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
@@ -23,7 +22,7 @@ from heliograph.numerics.types import Float
 if TYPE_CHECKING:
     from cvxpy import Constraint, Expression, Maximize, Minimize, Problem
 
-MARGIN = 1e-6  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
+MARGIN = 1e-7  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
 Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
 Solver = Literal["clarabel", "scs"]
 SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
@@ -72,10 +71,19 @@ class StepProblem:
 
     Everything is divided by the level squared before it comes here, so that the level does not matter to the solver.
     The objective picks one of the feasible P+ = L^-1: "trace" the smallest tr L, "largest_eigenvalue" that of L,
-    "log_determinant" the largest log det P+, "none" any.
+    "log_determinant" the largest log det P+, "none" any. `sizes`: those of x and e where S1 and S2 are numbers, so that
+    the first two are of L in the system's own units. `start`: a weight before the step that is not diag(P1, P2).
     """
 
-    def __init__(self, step: StepMatrices, layout: Layout, objective: Objective, solver: Solver):
+    def __init__(
+        self,
+        step: StepMatrices,
+        layout: Layout,
+        objective: Objective,
+        solver: Solver,
+        sizes: tuple[float, float] = (1.0, 1.0),
+        start: Float[np.ndarray, "w w"] | None = None,
+    ):
         cp = solvers()
         self.layout, self.solver = layout, solver
         self.unknowns = cp.Variable(layout.size)
@@ -83,13 +91,13 @@ class StepProblem:
         forms, q, n = linear_forms(step, layout), len(step.energy), layout.states
         phi = cp.reshape(forms.next @ self.unknowns, (q, q), order="C") + self.fixed
         constraints = [self.unknowns[layout.size - layout.multipliers :] >= 0]
-        for part in independent_parts(step, forms):
+        for part in independent_parts(step, forms, start):
             constraints.append(phi[part][:, part] << -MARGIN * np.eye(len(part)))
         for form in forms.positive:
             k = int(np.sqrt(len(form)))
             constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
-        goal, more = _goal(cp, objective, [weight[:n, :n], weight[n:, n:]])
+        goal, more = _goal(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes)
         self.problem = cp.Problem(goal, constraints + more)
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
@@ -102,7 +110,7 @@ class StepProblem:
 
 
 def _goal(
-    cp: ModuleType, objective: Objective, weights: list["Expression"]
+    cp: ModuleType, objective: Objective, weights: list["Expression"], sizes: tuple[float, float]
 ) -> tuple["Minimize | Maximize", list["Constraint"]]:
     """The objective on L = P+^-1 and the constraints that express it."""
     if objective == "none":
@@ -112,16 +120,17 @@ def _goal(
     eye = np.eye(weights[0].shape[0])
     if objective == "largest_eigenvalue":
         smallest = cp.Variable()
-        return cp.Maximize(smallest), [w >> smallest * eye for w in weights]
+        return cp.Maximize(smallest), [w >> smallest * s**2 * eye for w, s in zip(weights, sizes, strict=True)]
     inverses = [cp.Variable(w.shape, symmetric=True) for w in weights]
     above = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
-    return cp.Minimize(sum(cp.trace(inverse) for inverse in inverses)), above
+    return cp.Minimize(sum(s**2 * cp.trace(inverse) for inverse, s in zip(inverses, sizes, strict=True))), above
 
 
 class HorizonProblem:
-    """All steps at once, with P_0 ... P_T+1, the gains, the multipliers and the level squared as unknowns: convex.
+    """All steps at once, with P_1 ... P_T+1, the gains, the multipliers and the level squared as unknowns: convex.
 
-    One vector holds them all, so that each inequality is one sparse matrix: cvxpy then has next to nothing to do.
+    P_0 is the largest allowed, level^2 W up to MARGIN, unless `initial` gives it: a larger one is never worse. One
+    vector holds all unknowns, so that each inequality is one sparse matrix: cvxpy then has next to nothing to do.
     """
 
     def __init__(
@@ -133,37 +142,48 @@ class HorizonProblem:
     ):
         cp = solvers()
         self.layouts = layouts
-        start = Layout(layouts[0].states, 0, 0)
-        sizes = [1, start.size, *(layout.size for layout in layouts)]
+        sizes = [1, *(layout.size for layout in layouts)]
         self.places = [slice(b - a, b) for a, b in zip(sizes, np.cumsum(sizes), strict=True)]
         self.unknowns = cp.Variable(sum(sizes))
         self.constraints: list[Constraint] = []
-        present, eye = weight_form(start), np.eye(weight.shape[0])
-        self._require({0: (1 - MARGIN) * weight.ravel()[:, None], 1: -present}, 0 * eye)
+        first = weight if initial is None else initial
+        present = {0: (1 - MARGIN) * weight.ravel()[:, None]} if initial is None else {}
         if initial is not None:
-            self.constraints.append(present @ self.unknowns[self.places[1]] == initial.ravel())
+            self._require({0: (1 - MARGIN) * weight.ravel()[:, None]}, -initial)
         forms: LinearForms | None = None
         for k, (step, layout) in enumerate(zip(steps, layouts, strict=True)):
             if forms is None or layout.gain is not None or not all(map(np.array_equal, step, steps[k - 1])):
                 forms = linear_forms(step, layout)
-            self._add_step(k, step, forms, present)
-            self.constraints.append(self.unknowns[self.places[k + 2]][layout.size - layout.multipliers :] >= 0)
-            present = forms.weight
+            fixed = initial if k == 0 and initial is not None else np.zeros_like(weight)
+            self._add_step(k, step, forms, present, fixed, first if k == 0 else None)
+            self.constraints.append(self.unknowns[self.places[k + 1]][layout.size - layout.multipliers :] >= 0)
+            present = {k + 1: forms.weight}
         self.problem = cp.Problem(cp.Minimize(self.unknowns[0]), self.constraints)
 
-    def _add_step(self, k: int, step: StepMatrices, forms: LinearForms, present: np.ndarray) -> None:
-        """-Phi >= MARGIN level^2, for each part of eta that stands alone."""
-        q, width = len(step.energy), int(np.sqrt(len(present)))
-        for part in independent_parts(step, forms):
+    def _add_step(
+        self,
+        k: int,
+        step: StepMatrices,
+        forms: LinearForms,
+        present: dict[int, np.ndarray],
+        fixed: Float[np.ndarray, "w w"],
+        start: Float[np.ndarray, "w w"] | None,
+    ) -> None:
+        """-Phi >= MARGIN level^2, for each part of eta that stands alone; the weight before is `present` + `fixed`."""
+        q, width = len(step.energy), len(fixed)
+        constant = -step.wanted
+        constant[:width, :width] += fixed
+        for part in independent_parts(step, forms, start):
             entries = (part[:, None] * q + part).ravel()
-            energy = (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None]
-            before = np.zeros((q, q, present.shape[1]))
-            before[:width, :width] = present.reshape(width, width, -1)
-            blocks = {0: energy, k + 1: before.reshape(q * q, -1)[entries], k + 2: -forms.next[entries]}
-            self._require(blocks, -step.wanted[np.ix_(part, part)])
+            blocks = {0: (step.energy - MARGIN * np.eye(q)).ravel()[entries][:, None], k + 1: -forms.next[entries]}
+            for place, form in present.items():
+                before = np.zeros((q, q, form.shape[1]))
+                before[:width, :width] = form.reshape(width, width, -1)
+                blocks[place] = blocks.get(place, 0.0) + before.reshape(q * q, -1)[entries]
+            self._require(blocks, constant[np.ix_(part, part)])
         for form in forms.positive:
             size = int(np.sqrt(len(form)))
-            self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 2: form}, np.zeros((size, size)))
+            self._require({0: -MARGIN * np.eye(size).ravel()[:, None], k + 1: form}, np.zeros((size, size)))
 
     def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
         """The matrix sum_i blocks_i (unknowns in place i) + constant is positive semidefinite."""

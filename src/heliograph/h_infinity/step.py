@@ -4,7 +4,8 @@ With eta = (x, e, f, f~, h, h~, v, rho) the next stacked state is x+ = X eta, e+
 random W has E[W'QW] = sum_j U_j'Q U_j. The level holds if, at every step,
 Phi = X'P1 X + (E - K U)'P2 (E - K U) + sum_j U_j'K'P2 K U_j + S - diag(P_s, 0) + sum_i lambda_i N_i < 0,
 S = diag(0, M'M, 0, ..., -level^2 I), eta'N_i eta >= 0 the growth conditions. With Y = P2 K and any Z >= K'P2 K it is
-linear: (E - K U)'P2 (E - K U) becomes E'P2 E - E'Y U - U'Y'E + U'Z U, and [[Z, Y'], [Y, P2]] >= 0. This is the Schur
+linear: (E - K U)'P2 (E - K U) becomes E'P2 E - E'Y U - U'Y'E + U'Z U, and [[Z, Y'], [Y, P2]] >= 0. With K0 + K in
+place of K, and E - K0 U in place of E, no large numbers cancel where a measurement tells much. This is the Schur
 complement of the published inequality, after a congruence, at 14 + 4 rows in place of 34 in the published example.
 """
 
@@ -19,7 +20,7 @@ from heliograph.numerics.types import Float, Int
 
 
 class StepMatrices(NamedTuple):
-    """X, E, U, the U_j, M'M and I of S, and the diagonals of the N_i."""
+    """X, E - K0 U, U, the U_j, M'M and I of S, the diagonals of the N_i, and a gain K0 near which K is searched for."""
 
     state: Float[np.ndarray, "n q"]
     error: Float[np.ndarray, "n q"]
@@ -28,10 +29,11 @@ class StepMatrices(NamedTuple):
     wanted: Float[np.ndarray, "q q"]
     energy: Float[np.ndarray, "q q"]
     growth: Float[np.ndarray, "multipliers q"]
+    nominal: Float[np.ndarray, "n m"]
 
 
 class Unknowns(NamedTuple):
-    """P1, P2, Y, Z, lambda."""
+    """P1, P2, Y = P2 (K - K0), Z >= (K - K0)'P2 (K - K0), lambda."""
 
     state: Float[np.ndarray, "n n"]
     error: Float[np.ndarray, "n n"]
@@ -85,7 +87,7 @@ def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"],
     parts += [[(g, x, system.output_growth.state[k]), (dg, e, system.output_growth.error[k])]] if h else []
     groups = [[part] for pair in parts for part in pair] if separate else parts
     growth = np.array([_growth(q, group) for group in groups]).reshape(-1, q)
-    return StepMatrices(state, error, heard, varied, wanted, energy, growth)
+    return StepMatrices(state, error, heard, varied, wanted, energy, growth, np.zeros((n, system.received)))
 
 
 def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
@@ -103,7 +105,9 @@ def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q 
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
     result = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
-    result += np.einsum("jai,ab,jbk->ik", step.spreads, Z, step.spreads)
+    shifted = step.nominal.T @ Y
+    whole = Z + shifted + shifted.T + step.nominal.T @ p2 @ step.nominal  # K'P2 K, as Z is that of K - K0
+    result += np.einsum("jai,ab,jbk->ik", step.spreads, whole, step.spreads)
     return np.asarray(result + np.diag(multipliers @ step.growth))
 
 
@@ -180,11 +184,18 @@ def weight_form(layout: Layout) -> Float[np.ndarray, "ww size"]:
     return np.array([(np.kron(upper, u.state) + np.kron(lower, u.error)).ravel() for u in units]).T
 
 
-def independent_parts(step: StepMatrices, forms: LinearForms) -> list[Int[np.ndarray, "_"]]:
-    """Index sets of eta that Phi never couples: a smaller inequality for each says the same."""
+def independent_parts(
+    step: StepMatrices, forms: LinearForms, start: Float[np.ndarray, "w w"] | None = None
+) -> list[Int[np.ndarray, "_"]]:
+    """Index sets of eta that Phi never couples: a smaller inequality for each says the same.
+
+    `start`: the weight before the step, where it is not diag(P1, P2).
+    """
     q = len(step.energy)
     coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.wanted != 0) | (step.energy != 0)
     n = step.state.shape[0]
     coupled[:n, :n] = coupled[n : 2 * n, n : 2 * n] = True  # the weight diag(P1, P2) of this step
+    if start is not None:
+        coupled[: 2 * n, : 2 * n] |= start != 0
     count, labels = connected_components(coupled, directed=False)
     return [np.flatnonzero(labels == i) for i in range(count)]

@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, unstack
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
 
@@ -138,6 +138,25 @@ def _growth(steps: int, name: str, value: Varying | tuple[Varying, Varying]) -> 
 def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     weight = np.asarray(value, dtype=np.float64) * np.eye(2 * n) if np.ndim(value) == 0 else value
     result: np.ndarray = array("initial weight", weight, (2 * n, 2 * n))
-    if not np.allclose(result, result.T, rtol=1e-12) or np.linalg.eigvalsh(result)[0] <= 0:
+    if smallest_eigenvalue(symmetric_weight("initial weight", result)) <= 0:
         raise fail("initial weight", "a positive definite matrix", f"eigenvalues {np.linalg.eigvalsh(result)}")
     return result
+
+
+def symmetric_weight(name: str, matrix: Float[np.ndarray, "*many w w"]) -> Float[np.ndarray, "*many w w"]:
+    """The matrix made exactly symmetric.
+
+    Raises:
+        ValueError: entries that differ across the diagonal by more than rounding of what they weigh.
+    """
+    unit = own_units(matrix)
+    skew = np.abs(matrix - np.swapaxes(matrix, -1, -2))
+    if np.any(skew > SYMMETRY_TOLERANCE * unit[..., :, None] * unit[..., None, :]):
+        raise fail(name, "a symmetric matrix", f"entries that differ by {np.max(skew):.3g} across the diagonal")
+    return np.asarray((matrix + np.swapaxes(matrix, -1, -2)) / 2)
+
+
+def smallest_eigenvalue(matrix: Float[np.ndarray, "w w"], units: Float[np.ndarray, "w"] | None = None) -> float:
+    """Of a symmetric matrix whose diagonal is scaled to 1 or -1, so that units do not decide its sign."""
+    unit = own_units(matrix) if units is None else units
+    return float(np.linalg.eigvalsh(matrix / np.outer(unit, unit))[0])

@@ -1,0 +1,236 @@
+"""Ten thousand random networks: no result that is no number goes unflagged, and no claim is broken.
+
+Run: python benchmarks/soak.py [COUNT]. What is done is kept in out/soak.jsonl, so that a later start goes on; another
+seed or another release starts anew. Writes benchmarks/soak.json.
+
+Each network is simulated RUNS times. An estimate that is not finite, or a covariance that is indefinite, must be among
+the failures that the statistics list. Where "exact" or "upper" is claimed, e_d^2 is compared with the claimed variance
+at every step, along every component and one direction of all; what lies beyond SUSPECT standard errors is simulated
+again, AGAIN times with another seed, and judged there at that place alone: a claim is broken beyond the quantile that
+all comparisons together exceed by chance with probability FALSE_ALARM. Every SCALED-th network is also rescaled.
+"""
+
+import json
+import subprocess
+import sys
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy import stats
+from soak_networks import HORIZON, STRUCTURES, network
+
+import heliograph as hg
+from heliograph.testing import check_scaling
+
+HERE = Path(__file__).resolve().parent
+DONE, RESULTS = HERE.parent / "out" / "soak.jsonl", HERE / "soak.json"
+COUNT, SEED, RUNS, AGAIN, SCALED = 10_000, 1, 256, 20_000, 50
+SUSPECT, FALSE_ALARM = 4.0, 1e-3
+WORST = 10  # cases kept
+
+
+class Place(NamedTuple):
+    """Where a claim looks worst: its excess in standard errors, the step and the direction."""
+
+    z: float
+    step: int
+    direction: np.ndarray
+
+
+def excesses(found: Any, directions: np.ndarray) -> np.ndarray:
+    """(mean e_d^2 - claimed variance) in its standard errors, (time, direction); inf where a certainty is wrong."""
+    gap = np.einsum("di,btij,dj->btd", directions, found.outer - found.covariance, directions)
+    size = np.einsum("di,btij,dj->td", directions, found.covariance, directions) / found.runs
+    used = found.count > 0
+    gap, count = gap[used], found.count[used][:, None, None]
+    mean = gap.sum(axis=0) / count.sum()
+    spread = np.sqrt(np.sum((gap - mean * count) ** 2, axis=0) * len(gap) / (len(gap) - 1)) / count.sum()
+    certain = spread <= 1e-9 * np.abs(size)
+    off = np.where(np.abs(mean) <= 1e-6 * np.abs(size) + 1e-300, 0.0, np.inf)
+    return np.where(certain, off, mean / np.where(certain, 1.0, spread))
+
+
+def directions_of(found: Any, random: np.random.Generator) -> np.ndarray:
+    """Unit components, and one random direction in units of each component's own deviation."""
+    deviation = np.sqrt(np.maximum(np.diagonal(found.claimed(), axis1=1, axis2=2).max(axis=0), 0.0))
+    unit = np.where(deviation > 0, deviation, 1.0)
+    return np.concatenate([np.eye(len(unit)), (random.normal(size=len(unit)) / unit)[None]])
+
+
+def worst_place(found: Any, random: np.random.Generator) -> Place:
+    """The largest excess; of an exact claim also the largest lack."""
+    directions = directions_of(found, random)
+    z = excesses(found, directions)
+    judged = np.abs(z) if found.claim == "exact" else z
+    step, place = np.unravel_index(int(np.nanargmax(judged)), z.shape)
+    return Place(float(z[step, place]), int(step), directions[place])
+
+
+def hidden(found: Any) -> bool:
+    """Whether something that is no number, or no covariance, is not among the failures."""
+    if found.failed_runs:
+        return False
+    if not np.all(np.isfinite(found.outer)):
+        return True
+    if found.claim == "none":
+        return False
+    claimed = found.claimed()
+    if not (np.all(np.isfinite(claimed)) and np.all(np.isfinite(found.nees[..., :0]))):
+        return True
+    unit = np.sqrt(np.abs(np.diagonal(claimed, axis1=1, axis2=2)))
+    unit = np.where(unit > 0, unit, 1.0)
+    return bool(np.min(np.linalg.eigvalsh(claimed / (unit[:, :, None] * unit[:, None]))) < -1e-9)
+
+
+def soak(index: int) -> dict[str, Any]:
+    """Everything about one network, as it is kept."""
+    result: dict[str, Any] = {
+        "index": index,
+        "comparisons": 0,
+        "hidden": [],
+        "suspects": [],
+        "flagged": [],
+        "claims": {},
+    }
+    try:
+        item = network(index, SEED)
+    except ValueError as error:
+        return result | {"refused": str(error)}
+    found = hg.monte_carlo(item, HORIZON, RUNS, index, keep=hg.Statistics())
+    result["flagged"] = found.failures()
+    again: Any = None
+    random = np.random.default_rng([SEED, 2, index])
+    claims: Counter[str] = Counter()
+    for node, filters in found.items():
+        for name, one in filters.items():
+            claims[one.claim] += 1
+            if hidden(one):
+                result["hidden"].append(f"{node}/{name}")
+            if one.claim not in ("exact", "upper") or one.failed_runs:
+                continue
+            place = worst_place(one, random)
+            result["comparisons"] += one.outer.shape[1] * (one.outer.shape[2] + 1)
+            if (abs(place.z) if one.claim == "exact" else place.z) <= SUSPECT:
+                continue
+            if again is None:
+                again = hg.monte_carlo(item, HORIZON, AGAIN, index + 10**6, keep=hg.Statistics())
+            fresh = excesses(again[node][name], place.direction[None])[place.step, 0]
+            where = {
+                "at": f"{node}/{name}",
+                "claim": one.claim,
+                "step": place.step,
+                "first": place.z,
+                "again": float(fresh),
+            }
+            result["suspects"].append(where)
+    result["claims"] = dict(claims)
+    if index % SCALED == 0:
+        result["scaling"] = scaling(item)
+    return result
+
+
+def scaling(item: hg.Network) -> str:
+    """What `check_scaling` has to say, empty if nothing."""
+    try:
+        check_scaling(item, steps=HORIZON)
+    except (AssertionError, ValueError) as error:
+        return str(error)
+    return ""
+
+
+def release() -> str:
+    """What decides about the results: the sources' tree."""
+    paths = ["src", "benchmarks/soak.py", "benchmarks/soak_networks.py"]
+    found = subprocess.run(["git", "ls-files", "-s", "--", *paths], cwd=HERE.parent, capture_output=True, text=True)
+    return str(hash_of(found.stdout))
+
+
+def hash_of(text: str) -> str:
+    """A short checksum."""
+    from hashlib import sha256
+
+    return sha256(text.encode()).hexdigest()[:16]
+
+
+def kept(key: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """What an earlier start with the same key has done; a line cut short is done again."""
+    if not DONE.exists():
+        return {}
+    rows = []
+    for line in DONE.read_text().splitlines():
+        try:
+            rows.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return {row["index"]: row for row in rows if row.get("key") == key}
+
+
+def summary(rows: list[dict[str, Any]], key: dict[str, Any]) -> dict[str, Any]:
+    """The counts, and the worst cases."""
+    comparisons = sum(row["comparisons"] for row in rows)
+    limit = float(stats.norm.isf(FALSE_ALARM / 2 / max(comparisons, 1)))
+    suspects = [s | {"index": row["index"]} for row in rows for s in row["suspects"]]
+
+    def beyond(s: dict[str, Any]) -> float:
+        return abs(s["again"]) if s["claim"] == "exact" else s["again"]
+
+    suspects.sort(key=beyond, reverse=True)
+    claims: Counter[str] = Counter()
+    for row in rows:
+        claims.update(row["claims"])
+    scaled = [row for row in rows if "scaling" in row]
+    return {
+        **key,
+        "networks": len(rows),
+        "refused": Counter(row["refused"].split(":")[0] for row in rows if "refused" in row),
+        "errors": [{"index": row["index"], "error": row["error"]} for row in rows if "error" in row],
+        "estimates by claim": claims,
+        "comparisons": comparisons,
+        "limit in standard errors": limit,
+        "broken claims": [s for s in suspects if beyond(s) > limit],
+        "simulated again": len(suspects),
+        "worst": suspects[:WORST],
+        "unflagged": [{"index": row["index"], "at": row["hidden"]} for row in rows if row["hidden"]],
+        "networks with flagged failures": sum(bool(row["flagged"]) for row in rows),
+        "flagged": [{"index": row["index"], "failures": row["flagged"]} for row in rows if row["flagged"]][:WORST],
+        "rescaled": len(scaled),
+        "depend on units": [{"index": row["index"], "what": row["scaling"]} for row in scaled if row["scaling"]],
+        "seconds": round(sum(row["seconds"] for row in rows), 1),
+    }
+
+
+def main(count: int) -> int:
+    """Do what is not done, then sum up; 1 if a promise is broken."""
+    key = {"seed": SEED, "runs": RUNS, "structures": STRUCTURES, "release": release()}
+    done = kept(key)
+    DONE.parent.mkdir(exist_ok=True)
+    warnings.simplefilter("ignore")
+    with DONE.open("a") as file:
+        for index in range(count):
+            if index in done:
+                continue
+            begun = time.perf_counter()
+            try:
+                row = soak(index)
+            except Exception:  # a bug is what is looked for, and the others shall be tried too
+                row = {"index": index, "comparisons": 0, "hidden": [], "suspects": [], "flagged": [], "claims": {}}
+                row["error"] = traceback.format_exc(limit=-3)
+            row |= {"seconds": time.perf_counter() - begun, "key": key}
+            done[index] = row
+            file.write(json.dumps(row) + "\n")
+            file.flush()
+            print(f"\r{len(done):,} of {count:,} networks", end="", file=sys.stderr)
+    found = summary([done[i] for i in sorted(done) if i < count], key)
+    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
+    wrong = {name: len(found[name]) for name in ("errors", "broken claims", "unflagged", "depend on units")}
+    print(f"\n{found['networks']:,} networks, {found['comparisons']:,} comparisons: {wrong}")
+    return int(any(wrong.values()))
+
+
+if __name__ == "__main__":
+    sys.exit(main(int(sys.argv[1]) if len(sys.argv) > 1 else COUNT))

@@ -1,0 +1,188 @@
+"""Random networks for the soak: a few dozen structures, each filled with numbers of its own for every network.
+
+The structure decides what is compiled, the numbers decide what can go wrong: scales over twelve decades, parts without
+noise or variance, links that never or always deliver, states far from zero, components that say the same.
+"""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as hg
+
+STRUCTURES = 36
+HORIZON = 5
+SINGULAR = 0.15  # share of the variances that are zero
+
+
+def network(index: int, seed: int) -> hg.Network:
+    """The network of this number: its structure is index mod STRUCTURES."""
+    shape = np.random.default_rng([seed, 0, index % STRUCTURES])
+    values = np.random.default_rng([seed, 1, index])
+    n, p, nodes = int(shape.integers(1, 4)), int(shape.integers(1, 3)), int(shape.integers(1, 3))
+    kind = index % 3
+    plant = [linear_plant, skewed_plant, nonlinear_plant][kind](n, values)
+    units = 10.0 ** values.uniform(-6, 6, size=p) if kind < 2 else np.ones(p)
+    laws = [int(shape.integers(4)) for _ in range(p)]
+    wiring, erased = int(shape.integers(4)), shape.random() < 0.3
+    own = shape.random() < 0.3
+    result = {}
+    for number in range(nodes):
+        sensor = (nonlinear_sensor if kind == 2 else linear_sensor)(plant, units, values)
+        channel = wired(wiring, [hop(law, unit, values) for law, unit in zip(laws, units, strict=True)], units, values)
+        filters = (nonlinear_filters if kind == 2 else linear_filters)(plant, sensor, channel, n, own)
+        world = hg.erasure(channel, chance(values)) if erased else channel
+        result[f"node{number}"] = hg.Node(sensor, world, filters)
+    return hg.Network(plant, result, fused(result, "linear" if kind < 2 else "cubature"))
+
+
+def chance(values: np.random.Generator) -> float:
+    """A probability, sometimes 0 or 1."""
+    return float(values.choice([0.0, 1.0, values.uniform(0.1, 0.9)], p=[0.1, 0.1, 0.8]))
+
+
+def variance(values: np.random.Generator, scale: Any = 1.0) -> Any:
+    """Variances beside a scale, some of them zero."""
+    shape = np.shape(scale)
+    found = 10.0 ** values.uniform(-3, 0.5, size=shape) * np.square(scale)
+    return np.where(values.random(shape) < SINGULAR, 0.0, found)
+
+
+def covariance(values: np.random.Generator, scale: np.ndarray) -> np.ndarray:
+    """A covariance in these units, sometimes singular."""
+    n = len(scale)
+    root = values.normal(size=(n, n)) * np.sqrt(variance(values, np.ones(n)))
+    return np.asarray(np.outer(scale, scale) * (root @ root.T))
+
+
+def linear_plant(n: int, values: np.random.Generator) -> hg.LinearPlant:
+    """Gaussian noises, states in units of their own, sometimes far from zero, sometimes growing."""
+    units = 10.0 ** values.uniform(-6, 6, size=n)
+    a = values.normal(size=(n, n))
+    a *= values.uniform(0.2, 1.3) / max(np.abs(np.linalg.eigvals(a)).max(), 1e-9)
+    mean = units * values.normal(size=n) * values.choice([0.0, 1.0, 1e3])
+    noise, start = covariance(values, units), covariance(values, units)
+    return hg.LinearPlant(units[:, None] * a / units, noise, mean, start)
+
+
+def skewed_plant(n: int, values: np.random.Generator) -> hg.LinearPlant:
+    """Noise of finitely many values in one direction, small enough for filters that use it."""
+    base = linear_plant(n, values)
+    atoms = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
+    direction = np.sqrt(np.diag(np.asarray(base.initial_covariance)))[:, None] * values.normal(size=(n, 1))
+    law = hg.random_affine.Shaped(direction, atoms)
+    return hg.LinearPlant(base.matrix, law, base.initial_mean, base.initial_covariance)
+
+
+def turning(x: Any, u: Any) -> Any:
+    """A bounded nonlinear step."""
+    return 0.8 * x + 0.3 * jnp.sin(jnp.roll(x, 1))
+
+
+def bent(x: Any) -> Any:
+    """The output of a nonlinear sensor."""
+    return (x[0] + 0.2 * x[0] ** 2)[None]
+
+
+def bent_pair(x: Any) -> Any:
+    """Two outputs of a nonlinear sensor."""
+    return jnp.stack([x[0] + 0.2 * x[-1] ** 2, jnp.sin(x[-1])])
+
+
+def nonlinear_plant(n: int, values: np.random.Generator) -> hg.Plant:
+    """A smooth plant with sometimes singular noise."""
+    return hg.Plant(turning, covariance(values, np.ones(n)), values.normal(size=n), covariance(values, np.ones(n)))
+
+
+def linear_sensor(plant: hg.LinearPlant, units: np.ndarray, values: np.random.Generator) -> hg.LinearSensor:
+    """Rows of which some repeat and some are zero, in units of each output's own."""
+    deviation = np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
+    own = np.where(deviation > 0, deviation, np.max(deviation, initial=0.0) + 1e-9)
+    rows = values.normal(size=(len(units), len(own))) / own
+    rows[values.random(len(units)) < 0.1] = 0.0
+    if len(units) > 1 and values.random() < 0.2:
+        rows[1] = rows[0]
+    return hg.LinearSensor(units[:, None] * rows, np.diag(variance(values, units)))
+
+
+def nonlinear_sensor(plant: hg.Plant, units: np.ndarray, values: np.random.Generator) -> hg.Sensor:
+    """One or two bent outputs."""
+    return hg.Sensor([bent, bent_pair][len(units) - 1], np.diag(variance(values, units)))
+
+
+def hop(law: int, unit: float, values: np.random.Generator) -> Any:
+    """A hop with a gain of one of four laws."""
+    noise = float(variance(values, np.array(unit)))
+    gains = np.sort(values.uniform(-0.5, 1.5, size=2))
+    match law:
+        case 0:
+            return hg.hop(float(values.choice([1.0, values.normal()])), noise)
+        case 1:
+            return hg.hop(hg.Discrete(gains, [0.4, 0.6]), noise)
+        case 2:
+            return hg.hop(hg.Discrete(gains, [0.4, 0.6], 0.1), noise)
+        case _:
+            return hg.hop(hg.Rayleigh(float(values.uniform(0.3, 1.5))), noise)
+
+
+def wired(wiring: int, hops: list[Any], units: np.ndarray, values: np.random.Generator) -> Any:
+    """As they are; through a relay; with losses that the receiver is not told of; with a direct link beside."""
+    each = hops
+    if wiring == 1:
+        more = [hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), float(variance(values, np.array(u)))) for u in units]
+        each = [hg.amplify_and_forward([a, b]) for a, b in zip(hops, more, strict=True)]
+    if wiring == 2:
+        each = [hg.dropout(one, chance(values)) for one in hops]
+    whole = hg.parallel(each)
+    if wiring == 3:
+        direct = hg.parallel([hg.hop(1.0, float(variance(values, np.array(u)))) for u in units])
+        whole = hg.with_direct_link(whole, direct)
+    return whole
+
+
+def linear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> dict[str, Any]:
+    """Every filter of a linear model; polynomial ones where the lift is small."""
+    zero_mean = hg.filters.ZeroMean()
+    prior = {"initial_covariance": np.asarray(plant.initial_covariance) * 2} if own else {}
+    filters = {
+        "linear": hg.linear_filter(plant, sensor, channel),
+        "cubature": hg.cubature_filter(plant, sensor, channel, **prior),
+        "extended": hg.extended_filter(plant, sensor, channel),
+        "zero_mean": hg.cubature_filter(plant, sensor, channel, zero_mean),
+        "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
+        "open_loop": hg.open_loop_filter(plant),
+        "first_degree": hg.polynomial_filter(plant, sensor, channel, HORIZON, 1),
+    }
+    if n * channel.outputs <= 2:
+        filters["quadratic"] = hg.polynomial_filter(plant, sensor, channel, HORIZON, 2)
+    return filters
+
+
+def nonlinear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> dict[str, Any]:
+    """Every filter of a nonlinear model."""
+    moments = hg.filters.PolynomialMoments(2)
+    return {
+        "cubature": hg.cubature_filter(plant, sensor, channel),
+        "extended": hg.extended_filter(plant, sensor, channel),
+        "moments": hg.filters.gaussian_filter(plant, sensor, channel, moments),
+        "zero_mean": hg.cubature_filter(plant, sensor, channel, hg.filters.ZeroMean()),
+        "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
+        "open_loop": hg.open_loop_filter(plant),
+    }
+
+
+def fused(nodes: dict[str, hg.Node], name: str) -> dict[str, Any]:
+    """Every rule, and the central filter."""
+    count = len(nodes)
+    if count < 2:
+        return {}
+    rules = {
+        "equal": hg.EqualIntersection(),
+        "smallest": hg.CovarianceIntersection(),
+        "inverse": hg.fusion.InverseCovarianceIntersection(),
+        "fixed": hg.fusion.FixedIntersection(np.arange(1, count + 1) / (count * (count + 1) / 2)),
+        "mean": hg.fusion.WeightedFusion(np.full(count, 1 / count)),
+    }
+    central = hg.filters.sequential_filter([node.filters["extended"] for node in nodes.values()])
+    return {rule: hg.Fusion(name, item) for rule, item in rules.items()} | {"central": central}

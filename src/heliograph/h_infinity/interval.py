@@ -1,0 +1,269 @@
+"""Interval arithmetic with outward rounding on functions written in JAX: what every value in a box is certain to obey.
+
+A function is traced to its list of operations, and each is carried out on intervals [low, high] that hold every value
+that the exact operation can take; every end is moved outward by more than its rounding. An operation that is not known
+here, or a decision that the box leaves open, ends the attempt.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.extend import core
+
+Numbers = np.ndarray
+ULPS = 4  # units in the last place: a library's sine or exponential is off by less than one, the arithmetic by a half
+MOVES = (
+    "reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
+    "dynamic_slice", "gather", "pad", "split", "stack", "stop_gradient",
+)  # fmt: skip
+CALLS = {"pjit": "jaxpr", "jit": "jaxpr", "closed_call": "call_jaxpr", "custom_jvp_call": "call_jaxpr"}
+
+
+class UnknownError(Exception):
+    """An operation outside of what is known here, or a decision that the box leaves open."""
+
+
+class Interval(NamedTuple):
+    """Arrays of lower and upper ends; of truth values, False and True where both are possible."""
+
+    low: Numbers
+    high: Numbers
+
+
+def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous: bool) -> list[Interval]:
+    """The outputs' intervals. `continuous`: refuse a decision that is open, at which the function could jump.
+
+    Raises:
+        UnknownError: an operation or a decision that cannot be followed.
+    """
+    values: dict[Any, Interval] = {}
+
+    def read(atom: Any) -> Interval:
+        return exact(atom.val) if isinstance(atom, core.Literal) else values[atom]
+
+    values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
+    values.update(zip(jaxpr.jaxpr.constvars, map(exact, jaxpr.consts), strict=True))
+    for equation in jaxpr.jaxpr.eqns:
+        inputs = [read(atom) for atom in equation.invars]
+        name = equation.primitive.name
+        if name in CALLS:
+            inner = equation.params[CALLS[name]]
+            results = evaluate(inner, inputs, continuous)
+        elif name == "mul" and equation.invars[0] is equation.invars[1]:
+            results = [_square(inputs[0])]
+        elif name in MOVES or all(part.low.dtype.kind in "iu" for part in inputs):  # whole numbers are not rounded
+            results = _moved(equation, inputs)
+        else:
+            results = [_operation(equation, inputs, continuous)]
+        values.update(zip(equation.outvars, results, strict=True))
+    return [read(atom) for atom in jaxpr.jaxpr.outvars]
+
+
+def exact(value: Any) -> Interval:
+    """The interval that holds one value."""
+    array = np.asarray(value)
+    return Interval(array, array)
+
+
+def outward(low: Any, high: Any, ulps: int = 1) -> Interval:
+    """Ends moved outward; an end that is no number is infinite."""
+    low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
+    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    for _ in range(ulps):
+        low, high = np.nextafter(low, -np.inf), np.nextafter(high, np.inf)
+    return Interval(low, high)
+
+
+def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
+    name, params = equation.primitive.name, equation.params
+    if name in ARITHMETIC:
+        with np.errstate(all="ignore"):
+            return ARITHMETIC[name](*x)
+    match name:
+        case "integer_pow":
+            return _power(x[0], params["y"])
+        case "convert_element_type":
+            kind = np.dtype(params["new_dtype"])
+            if kind.kind not in "fb" and not np.array_equal(x[0].low, x[0].high):
+                raise UnknownError("a number made whole")
+            return Interval(x[0].low.astype(kind), x[0].high.astype(kind))
+        case "reduce_sum":
+            return _sum(x[0], tuple(params["axes"]))
+        case "dot_general":
+            return _dot(x[0], x[1], params["dimension_numbers"])
+        case "iota":
+            return exact(equation.primitive.bind(**params))
+        case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
+            return _decided(_compare(name, *x), continuous)
+        case "sign":
+            found = Interval(np.sign(x[0].low), np.sign(x[0].high))
+            return _decided(found, continuous)
+        case "and" | "or":
+            combine = np.logical_and if name == "and" else np.logical_or
+            return Interval(combine(x[0].low, x[1].low), combine(x[0].high, x[1].high))
+        case "not":
+            return Interval(~x[0].high, ~x[0].low)
+        case "select_n":
+            return _select(x)
+    raise UnknownError(name)
+
+
+def _decided(found: Interval, continuous: bool) -> Interval:
+    if continuous and not np.array_equal(found.low, found.high):
+        raise UnknownError("a decision that depends on where in the region x is")
+    return found
+
+
+def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
+    """Numbers that only change places: those of the low ends, and those of the high ones; places are whole numbers."""
+    if any(part.low.dtype.kind in "iu" and not np.array_equal(part.low, part.high) for part in x):
+        raise UnknownError("a place that depends on x")
+
+    def bind(ends: list[Numbers]) -> list[Numbers]:
+        found = equation.primitive.bind(*map(jax.numpy.asarray, ends), **equation.params)
+        return list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
+
+    pairs = zip(bind([part.low for part in x]), bind([part.high for part in x]), strict=True)
+    return [Interval(*pair) for pair in pairs]
+
+
+def _compare(name: str, a: Interval, b: Interval) -> Interval:
+    if name in ("gt", "ge"):
+        return _compare({"gt": "lt", "ge": "le"}[name], b, a)
+    if name == "ne":
+        same = _compare("eq", a, b)
+        return Interval(~same.high, ~same.low)
+    if name == "eq":
+        certain = (a.low == a.high) & (b.low == b.high) & (a.low == b.low)
+        return Interval(certain, (a.low <= b.high) & (b.low <= a.high))
+    if name == "lt":
+        return Interval(a.high < b.low, a.low < b.high)
+    return Interval(a.high <= b.low, a.low <= b.high)
+
+
+def _select(x: list[Interval]) -> Interval:
+    """cases[which], and where that is open all cases from the lowest to the highest."""
+    which, cases = x[0], x[1:]
+    lows, highs = [np.broadcast_arrays(*ends) for ends in ([c.low for c in cases], [c.high for c in cases])]
+    first, last = which.low.astype(int), which.high.astype(int)
+    low, high = np.full(lows[0].shape, np.inf), np.full(lows[0].shape, -np.inf)
+    for i, (a, b) in enumerate(zip(lows, highs, strict=True)):
+        possible = (first <= i) & (i <= last)
+        low, high = np.where(possible, np.minimum(low, a), low), np.where(possible, np.maximum(high, b), high)
+    kind = cases[0].low.dtype
+    return Interval(low.astype(kind), high.astype(kind))
+
+
+def _product(a: Interval, b: Interval) -> tuple[Numbers, Numbers]:
+    ends = [x * y for x in a for y in b]
+    ends = [np.where(np.isnan(end), 0.0, end) for end in ends]  # 0 times an infinite end: the other ends say the rest
+    return np.minimum.reduce(ends), np.maximum.reduce(ends)
+
+
+def _quotient(a: Interval, b: Interval) -> Interval:
+    through = (b.low <= 0) & (b.high >= 0)
+    safe = Interval(np.where(through, 1.0, b.low), np.where(through, 1.0, b.high))
+    ends = [x / y for x in a for y in safe]
+    low, high = np.minimum.reduce(ends), np.maximum.reduce(ends)
+    return outward(np.where(through, -np.inf, low), np.where(through, np.inf, high))
+
+
+def _square(a: Interval) -> Interval:
+    low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
+    found = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
+    return Interval(np.maximum(found.low, 0.0), found.high)
+
+
+def _power(a: Interval, exponent: int) -> Interval:
+    if exponent < 0:
+        return _quotient(exact(np.ones_like(a.low)), _power(a, -exponent))
+    if exponent % 2 == 0:
+        inner = _absolute(a)
+        return outward(inner.low**exponent, inner.high**exponent, ULPS)
+    return outward(a.low**exponent, a.high**exponent, ULPS)
+
+
+def _absolute(a: Interval) -> Interval:
+    ends = np.minimum(np.abs(a.low), np.abs(a.high)), np.maximum(np.abs(a.low), np.abs(a.high))
+    return Interval(np.where((a.low <= 0) & (a.high >= 0), 0.0, ends[0]), ends[1])
+
+
+def _rising(
+    function: Callable[[Numbers], Numbers], low: float = -np.inf, high: float = np.inf
+) -> Callable[..., Interval]:
+    """Of a function that never falls, with the range that its values cannot leave."""
+
+    def call(a: Interval) -> Interval:
+        found = outward(function(a.low), function(a.high), ULPS)
+        return Interval(np.maximum(found.low, low), np.minimum(found.high, high))
+
+    return call
+
+
+def _cosine(a: Interval) -> Interval:
+    """A maximum at every even multiple of pi that is inside, a minimum at every odd one; a hair outside counts too."""
+    ends = np.cos(a.low), np.cos(a.high)
+    found = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
+    first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
+    top = np.floor(last / 2) >= np.ceil(first / 2)
+    bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
+    wild = ~(np.isfinite(a.low) & np.isfinite(a.high))
+    low, high = np.where(bottom | wild, -1.0, found.low), np.where(top | wild, 1.0, found.high)
+    return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
+
+
+def _sine(a: Interval) -> Interval:
+    return _cosine(outward(a.low - np.pi / 2, a.high - np.pi / 2, ULPS))
+
+
+def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
+    count = int(np.prod([a.low.shape[i] for i in axes]))
+    size = np.sum(np.maximum(np.abs(a.low), np.abs(a.high)), axis=axes)
+    room = 2 * (count + 2) * np.finfo(float).eps * size
+    return outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
+
+
+def _dot(a: Interval, b: Interval, dimensions: Any) -> Interval:
+    """Products first, then their sum over what is contracted."""
+    (left, right), (left_batch, right_batch) = dimensions
+
+    def laid(x: Numbers, contracted: Sequence[int], batch: Sequence[int], before: int, after: int) -> Numbers:
+        free = [i for i in range(x.ndim) if i not in contracted and i not in batch]
+        shape = x.shape
+        x = np.transpose(x, [*batch, *free, *contracted])
+        sizes = [shape[i] for i in batch], [shape[i] for i in free], [shape[i] for i in contracted]
+        return x.reshape(*sizes[0], *[1] * before, *sizes[1], *[1] * after, *sizes[2])
+
+    free_a, free_b = (x.low.ndim - len(c) - len(left_batch) for x, c in ((a, left), (b, right)))
+    wide = [Interval(*(laid(end, left, left_batch, 0, free_b) for end in a))]
+    wide.append(Interval(*(laid(end, right, right_batch, free_a, 0) for end in b)))
+    product = outward(*_product(*wide))
+    axes = tuple(range(product.low.ndim - len(left), product.low.ndim))
+    return _sum(product, axes)
+
+
+ARITHMETIC: dict[str, Callable[..., Interval]] = {
+    "add": lambda a, b: outward(a.low + b.low, a.high + b.high),
+    "add_any": lambda a, b: outward(a.low + b.low, a.high + b.high),
+    "sub": lambda a, b: outward(a.low - b.high, a.high - b.low),
+    "mul": lambda a, b: outward(*_product(a, b)),
+    "div": _quotient,
+    "neg": lambda a: Interval(-a.high, -a.low),
+    "max": lambda a, b: Interval(np.maximum(a.low, b.low), np.maximum(a.high, b.high)),
+    "min": lambda a, b: Interval(np.minimum(a.low, b.low), np.minimum(a.high, b.high)),
+    "abs": _absolute,
+    "square": _square,
+    "exp": _rising(np.exp, 0.0),
+    "log": _rising(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
+    "log1p": _rising(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
+    "expm1": _rising(np.expm1, -1.0),
+    "sqrt": _rising(lambda x: np.where(x >= 0, np.sqrt(np.maximum(x, 0.0)), np.nan)),
+    "rsqrt": lambda a: _quotient(exact(np.ones_like(a.low)), ARITHMETIC["sqrt"](a)),
+    "tanh": _rising(np.tanh, -1.0, 1.0),
+    "logistic": _rising(lambda x: 1 / (1 + np.exp(-x)), 0.0, 1.0),
+    "atan": _rising(np.arctan),
+    "sin": _sine,
+    "cos": _cosine,
+}

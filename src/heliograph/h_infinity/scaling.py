@@ -1,0 +1,176 @@
+"""Coordinates in which a design problem is of order one, so that a solver's accuracy and margins mean the same to all.
+
+With x = S1 xs, e = S2 es, a received signal Q times a scaled one and levels in units of `unit`, every inequality is a
+congruence of itself. The sizes are those that the system gives its own signals: standard deviations where disturbances
+are white noises of variance 1, x_0 and e_0 have the covariances of the initial weight, f and h are noises as large as
+their growth allows, and e is the error of the best predictor, near whose gain the design's is searched for. Where no
+growth is a ratio of norms, S1 and S2 are factors of covariances; else they are numbers, powers of 4, so that nothing is
+rounded and steps that differ little are the same problem.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliograph.h_infinity.step import StepMatrices, Unknowns
+from heliograph.h_infinity.system import GrowthSystem
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float
+
+SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
+
+
+class Coordinates(NamedTuple):
+    """S = diag(S1, S2) before every step and after the last; sizes of what is received, of growth forms, of levels."""
+
+    states: Float[np.ndarray, "times w w"]
+    received: Float[np.ndarray, "steps m"]
+    forms: Float[np.ndarray, "steps multipliers"]
+    unit: float
+    plain: bool
+
+    def ratio(self, k: int) -> tuple[float, float]:
+        """Sizes of x and e, the larger one 1, where they are numbers; (1, 1) where S1 and S2 are matrices."""
+        if self.plain:
+            return 1.0, 1.0
+        x, e = float(self.states[k, 0, 0]), float(self.states[k, -1, -1])
+        return x / max(x, e), e / max(x, e)
+
+    def weight(self, scaled: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
+        """The weight P_k in the user's units."""
+        half = np.linalg.solve(self.states[k].T, scaled)
+        return self.unit**2 * _symmetric(np.linalg.solve(self.states[k].T, half.T))
+
+    def scaled_weight(self, weight: Float[np.ndarray, "w w"], k: int) -> Float[np.ndarray, "w w"]:
+        """And back."""
+        return _symmetric(self.states[k].T @ weight @ self.states[k]) / self.unit**2
+
+    def gain(self, scaled: Float[np.ndarray, "n m"], k: int) -> Float[np.ndarray, "n m"]:
+        """The gain of step k in the user's units."""
+        n = len(scaled)
+        return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
+
+    def multipliers(self, found: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
+        """The multipliers of step k in the user's units."""
+        return np.asarray(self.unit**2 * found.multipliers / self.forms[k])
+
+
+def _symmetric(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
+    return np.asarray((a + a.T) / 2)
+
+
+def scale(
+    system: GrowthSystem, steps: list[StepMatrices], gains: Float[np.ndarray, "steps n m"] | None = None
+) -> tuple[list[StepMatrices], Coordinates]:
+    """The steps in coordinates of order one, near the best predictor's gains or the given ones.
+
+    Raises:
+        ValueError: nothing is wanted.
+    """
+    n, plain = system.states, system.growth.absent and system.output_growth.absent
+    initial = np.diag(1 / np.diagonal(system.initial_weight))
+    x, e = initial[:n, :n], initial[n:, n:]
+    sizes, heard, forms, scaled, wanted = [_sizes(x, e, plain)], [], [], [], 0.0
+    for k, step in enumerate(steps):
+        spread = _signals(system, k, step, x, e)
+        wanted = max(wanted, float(np.trace(step.wanted @ spread)))
+        x, e, measured, nominal = _moved(step, spread, None if gains is None else gains[k])
+        sizes.append(_sizes(x, e, plain))
+        heard.append(_kept(np.sqrt(np.diagonal(measured))))
+        unit = _coordinates(system, k, step, sizes[k])
+        form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)  # with growth, T is diagonal
+        forms.append(np.where(form > 0, form, 1.0))
+        scaled.append(_congruent(step, unit, sizes[k + 1], heard[k], forms[k], nominal))
+    if wanted == 0:
+        raise fail("wanted matrix", "one that is not zero", "zero at every step")
+    level = float(_power(np.sqrt(wanted)))
+    scaled = [s._replace(wanted=s.wanted / level**2) for s in scaled]
+    return scaled, Coordinates(np.array(sizes), np.array(heard), np.array(forms), level, plain)
+
+
+def _power(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
+    """The nearest power of 4."""
+    return np.asarray(4.0 ** np.round(np.log(size) / np.log(4.0)))
+
+
+def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"]:
+    """diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
+    if plain:
+        return np.asarray(block_diag(_factor(x), _factor(e)))
+    return np.diag(np.concatenate([_kept(np.full(len(part), np.sqrt(np.trace(part) / len(part)))) for part in (x, e)]))
+
+
+def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """A lower factor, of what is never disturbed with a little of its own."""
+    unit = _kept(np.sqrt(np.diagonal(covariance)))
+    return np.asarray(
+        unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
+    )
+
+
+def _kept(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Components in very different units are all kept: only one without any size borrows the others'."""
+    positive = size[size > 0]
+    return _power(np.where(size > 0, size, positive.min() if positive.size else 1.0))
+
+
+def _signals(system: GrowthSystem, k: int, step: StepMatrices, x: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Covariance of eta = (x, e, f, f~, h, h~, v, rho) with f and h as large as their growth allows."""
+    n, y, q = system.states, system.output.shape[1], len(step.energy)
+    result, at = np.zeros((q, q)), 2 * n
+    result[:n, :n], result[n:at, n:at] = x, e
+    for growth, width in ((system.growth, n), (system.output_growth, y)):
+        if not growth.absent:
+            for constant, part in ((growth.state[k], x), (growth.error[k], e)):
+                result[at : at + width, at : at + width] = constant**2 * np.linalg.eigvalsh(part)[-1] * np.eye(width)
+                at += width
+    result[at:, at:] = np.eye(q - at)
+    return result
+
+
+def _moved(
+    step: StepMatrices, spread: np.ndarray, given: np.ndarray | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Covariances of x+, of e+ with the given or the best gain and of what is received, and that gain."""
+    heard = step.heard @ spread @ step.heard.T + np.einsum("jai,ik,jbk->ab", step.spreads, spread, step.spreads)
+    cross = step.error @ spread @ step.heard.T
+    unit = np.sqrt(np.maximum(np.diagonal(heard), np.finfo(float).tiny))
+    best = cross / unit @ np.linalg.pinv(heard / np.outer(unit, unit), rcond=1e-12, hermitian=True) / unit
+    gain = best if given is None else given
+    before, left = step.error @ spread @ step.error.T, step.error - gain @ step.heard
+    after = left @ spread @ left.T + gain @ (heard - step.heard @ spread @ step.heard.T) @ gain.T
+    floor = SMALLEST**2 * np.diag(np.diagonal(before))
+    return step.state @ spread @ step.state.T, _symmetric(after) + floor, heard, gain
+
+
+def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
+    """T of eta = T times what is of order one."""
+    n, y = system.states, system.output.shape[1]
+    parts = [sizes]
+    for growth, width in ((system.growth, n), (system.output_growth, y)):
+        if not growth.absent:
+            for constant, size in ((growth.state[k], sizes[0, 0]), (growth.error[k], sizes[n, n])):
+                parts.append((constant * size if constant > 0 else size) * np.eye(width))
+    return np.asarray(block_diag(*parts, np.eye(len(step.energy) - sum(map(len, parts)))))
+
+
+def _congruent(
+    step: StepMatrices,
+    unit: np.ndarray,
+    after: np.ndarray,
+    heard: np.ndarray,
+    forms: np.ndarray,
+    nominal: np.ndarray,
+) -> StepMatrices:
+    n = step.state.shape[0]
+    return StepMatrices(
+        np.linalg.solve(after[:n, :n], step.state @ unit),
+        np.linalg.solve(after[n:, n:], (step.error - nominal @ step.heard) @ unit),
+        step.heard @ unit / heard[:, None],
+        step.spreads @ unit / heard[:, None],
+        _symmetric(unit.T @ step.wanted @ unit),
+        _symmetric(unit.T @ step.energy @ unit),
+        step.growth * np.diagonal(unit) ** 2 / forms[:, None],
+        np.linalg.solve(after[n:, n:], nominal * heard),
+    )

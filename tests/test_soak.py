@@ -1,0 +1,85 @@
+"""What the soak looks for it finds; the soak itself is not run here."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from heliograph.simulation.statistics import BATCHES, ErrorStatistics
+
+FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
+pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")
+
+
+@pytest.fixture(scope="module")
+def soak() -> Any:
+    """benchmarks/soak.py, imported as it is when run."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(FOLDER)
+        import soak as module
+
+        yield module
+
+
+def statistics(ratio: float, claim: str = "exact", runs: int = 5000) -> ErrorStatistics:
+    """Gaussian errors whose second component has `ratio` times the claimed variance, at three steps."""
+    covariance = np.array([[1.0, 0.3], [0.3, 1e-12]]) * np.array([[1.0, 1e-6], [1e-6, 1.0]])
+    actual = covariance * np.sqrt(np.array([[1.0, ratio], [ratio, ratio**2]]))
+    errors = np.random.default_rng(0).multivariate_normal(np.zeros(2), actual, size=(runs, 3))
+    deal = (np.arange(runs)[:, None] % BATCHES == np.arange(BATCHES)).astype(float)
+    i, j = np.triu_indices(2)
+    pairs = np.einsum("rb,rtp->btp", deal, errors[..., i] * errors[..., j])
+    claimed = np.broadcast_to(covariance[i, j], (BATCHES, 3, 3))
+    return ErrorStatistics(deal.sum(axis=0), pairs, claimed, np.zeros((BATCHES, 3)), claim)
+
+
+@pytest.mark.parametrize(("ratio", "claim", "found"), [(1.3, "exact", True), (1.3, "upper", True), (0.7, "exact", True),
+                                                        (0.7, "upper", False), (1.0, "exact", False)])  # fmt: skip
+def test_a_broken_claim_stands_out(soak: ModuleType, ratio: float, claim: str, found: bool) -> None:
+    place = soak.worst_place(statistics(ratio, claim), np.random.default_rng(1))
+    z = abs(place.z) if claim == "exact" else place.z
+    assert (z > soak.SUSPECT) == found
+
+
+def test_a_certainty_that_is_wrong_is_hopelessly_far(soak: ModuleType) -> None:
+    sure = statistics(1.0)
+    pairs, claimed = sure.pairs.copy(), np.array(sure.claimed_pairs)
+    pairs[..., 1:], claimed[..., 1:] = 0.0, 0.0
+    certain = ErrorStatistics(sure.count, pairs, claimed, sure.nees, "exact")
+    assert np.isfinite(soak.worst_place(certain, np.random.default_rng(1)).z)
+    pairs[..., 2] = 1e-3
+    assert soak.worst_place(certain, np.random.default_rng(1)).z > 1e6
+
+
+def test_what_is_no_number_and_not_told_is_hidden(soak: ModuleType) -> None:
+    one = statistics(1.0)
+    assert not soak.hidden(one)
+    broken = np.array(one.pairs)
+    broken[0, 1, 0] = np.nan
+    silent = ErrorStatistics(one.count, broken, one.claimed_pairs, one.nees, "exact")
+    told = ErrorStatistics(one.count, broken, one.claimed_pairs, one.nees, "exact", failed=np.ones(3), failed_runs=1)
+    assert soak.hidden(silent) and not soak.hidden(told)
+    indefinite = np.array(one.claimed_pairs)
+    indefinite[..., 2] = -1e-15
+    assert soak.hidden(ErrorStatistics(one.count, one.pairs, indefinite, one.nees, "exact"))
+
+
+def test_the_summary_counts_what_is_wrong(soak: ModuleType) -> None:
+    row = {
+        "index": 0,
+        "comparisons": 1000,
+        "hidden": [],
+        "suspects": [],
+        "flagged": [],
+        "claims": {"exact": 2},
+        "seconds": 1,
+    }
+    suspect = {"at": "a/b", "claim": "upper", "step": 0, "first": 5.0}
+    rows = [row, row | {"index": 1, "suspects": [suspect | {"again": 8.0}, suspect | {"again": -8.0}]},
+            row | {"index": 2, "hidden": ["a/c"], "scaling": "a/b: off"}]  # fmt: skip
+    found = soak.summary(rows, {"seed": 1})
+    assert [s["again"] for s in found["broken claims"]] == [8.0]
+    assert found["unflagged"] == [{"index": 2, "at": ["a/c"]}] and len(found["depend on units"]) == 1
+    assert found["limit in standard errors"] == pytest.approx(5.1, abs=0.2)
