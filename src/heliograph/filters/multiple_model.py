@@ -23,7 +23,7 @@ from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import JointModes, joint_modes
@@ -100,14 +100,15 @@ class MergeByMode(AbstractMerging):
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
 
+@runs_last
 def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
     """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
     law = jnp.sum(weight, axis=0)
     share = jnp.where(law > 0, weight / jnp.where(law > 0, law, 1.0), 1 / len(weight))
-    center = share.T @ mean
+    center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
     apart = mean[:, None] - center
-    spread = jnp.einsum("ij,iab->jab", share, covariance) + jnp.einsum("ij,ija,ijb->jab", share, apart, apart)
-    return Belief(center, symmetrize(spread)), law
+    inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
+    return Belief(center, jnp.sum(share[:, :, None, None] * inside, axis=0)), law
 
 
 class MultipleModelFilter(AbstractFilter):
