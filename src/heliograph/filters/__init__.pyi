@@ -18,6 +18,9 @@ from .h_infinity import (
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
+from .late import (
+    late_filter as late_filter,
+)
 from .polynomial import (
     PolynomialFilter as PolynomialFilter,
     memory_filter as memory_filter,
@@ -32,6 +35,9 @@ from .scheduled import (
 )
 from .sequential import (
     sequential_filter as sequential_filter,
+)
+from .told import (
+    told_filter as told_filter,
 )
 from .transform import (
     AbstractTransform as AbstractTransform,
