@@ -56,6 +56,9 @@ from .model.fading import (
 from .model.estimate import (
     Estimate as Estimate,
 )
+from .linear.arrival import (
+    critical_arrival as critical_arrival,
+)
 from .filters.base import (
     AbstractFilter as AbstractFilter,
 )
@@ -89,6 +92,9 @@ from .simulation.network import (
 from .simulation.simulate import (
     monte_carlo as monte_carlo,
     run as run,
+)
+from .simulation.boundedness import (
+    certify_boundedness as certify_boundedness,
 )
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 import heliograph as hg
-from heliograph.filters.mixture import atoms_of
+from heliograph.filters.combinations import atoms_of
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model
 
@@ -87,3 +87,66 @@ def test_what_has_no_atoms_is_refused():
     moments = hg.random_affine.NoiseMoments([0.0, 1.0, 0.5, 2.0])
     with pytest.raises(ValueError, match="finite support or Gaussian, got NoiseMoments"):
         hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())
+
+
+CHAIN = hg.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
+PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.5, [0.3], 0.5), hg.LinearSensor([[1.0]], TWO)
+MODES = [hg.hop(hg.Discrete([0.5, 1.5], [0.4, 0.6]), 0.2), hg.hop(-0.3, 0.1)]
+
+
+def run(item, data):
+    state, found = item.init(), []
+    for k, z in enumerate(data):
+        state, estimate = item.step(state, [z], (), k)
+        found.append((estimate.mean[0], estimate.covariance[0, 0]))
+    return np.array(found), state
+
+
+def test_modes_are_weighed_with_their_atoms():
+    """Two steps: the modes' probabilities after each are Bayes' rule on the filter's own Gaussian."""
+    item = hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, CHAIN))
+    law, state = np.array([0.75, 0.25]), item.init()
+    for k, z in enumerate((0.7, -1.1)):
+        moved = item.predict(state, (), k)
+        law = law if k == 0 else law @ CHAIN.transition
+        np.testing.assert_allclose(moved.law, law, rtol=1e-12)
+        p = moved.covariance[0, 0]
+        likelihood = np.zeros(2)
+        for i, m in enumerate(MODES):
+            for c in atoms_of(hg.random_affine.Series([hg.hop(1.0, TWO), m])):
+                g = c.gain[0, 0]
+                density = stats.norm.pdf(z, g * moved.mean[0] + c.offset[0], np.sqrt(g * p * g + c.noise[0, 0]))
+                likelihood[i] += c.weight * density
+        state, heard = item.correct(moved, [z], k)
+        np.testing.assert_allclose(heard.log_likelihood, np.log(law @ likelihood), rtol=1e-12)
+        law = law * likelihood / (law @ likelihood)
+        np.testing.assert_allclose(state.law, law, rtol=1e-12)
+
+
+def test_a_chain_that_forgets_is_a_mixture():
+    """Equal rows: the same numbers as one map chosen anew at each step."""
+    law = [0.75, 0.25]
+    data = (0.7, np.nan, -1.1, 2.0)
+    chained, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, [law, law])), data)
+    mixed, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.random_affine.Mixture(MODES, law)), data)
+    np.testing.assert_allclose(chained, mixed, rtol=1e-12)
+
+
+def test_one_mode_is_the_filter_without_modes():
+    data = (0.7, -1.1, 2.0)
+    one, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
+    plain, _ = run(hg.mixture_filter(PLANT, SENSOR, MODES[0]), data)
+    np.testing.assert_array_equal(one, plain)
+
+
+def test_with_gaussian_noise_it_is_gpb1():
+    sensor, links = hg.LinearSensor([[1.0]], 0.1), hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
+    data = (0.7, -1.1, 2.0, 0.1)
+    mixture, _ = run(hg.mixture_filter(PLANT, sensor, links), data)
+    merged, _ = run(hg.filters.gpb1_filter(PLANT, sensor, links), data)
+    np.testing.assert_allclose(mixture, merged, rtol=1e-12)
+
+
+def test_a_drift_has_no_atoms():
+    with pytest.raises(ValueError, match="gains of finitely many values, got one that drifts"):
+        hg.mixture_filter(PLANT, SENSOR, hg.autoregressive_fading(1.0, 0.3, 0.9, 0.1))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.arrival import patterns
 from tests.filters.test_modal import BURSTS, PLANT, SENSOR, bursts
 
 told_filter, late_filter = hg.filters.told_filter, hg.filters.late_filter
@@ -120,17 +119,6 @@ def test_two_lossy_links_in_one_shadow_keep_their_own_patterns():
 )
 def test_they_keep_the_contract_of_filters(item):
     hg.testing.check_filter(item)
-
-
-def test_patterns_of_arrival():
-    """Each once, with its probability; what is lost before a hop is lost behind it."""
-    one = hg.erasure(hg.hop(1.0, 0.1), 0.9)
-    route = hg.amplify_and_forward([one, hg.erasure(hg.hop(0.5, 0.1), 0.5)])
-    found = {p.present: p.chance for p in patterns(hg.with_direct_link(route, one))}
-    expected = {(True, True): 0.405, (True, False): 0.045, (False, True): 0.495, (False, False): 0.055}
-    assert found == pytest.approx(expected)
-    with pytest.raises(ValueError, match=r"^losses before another hop: expected of all components together"):
-        patterns(hg.random_affine.Series([hg.with_direct_link(one, one), hg.hop(1.0, 0.1, dimension=2)]))
 
 
 BAD_INPUT = {

@@ -1,6 +1,6 @@
 import numpy as np
 
-from heliograph.report.curves import Panel, curves_over_time
+from heliograph.report.curves import Panel, curves_over, curves_over_time
 from heliograph.report.figures import BLUE, INK, Curve, svg
 
 
@@ -14,3 +14,15 @@ def test_each_panel_has_its_curves_and_names_them():
     assert [text.get_text() for text in figure.axes[1].texts] == ["x", "g"]
     assert figure.axes[1].get_xlabel() == "step" and figure.axes[0].get_ylabel() == "a"
     assert svg(figure).startswith(b"<?xml")
+
+
+def test_marks_stand_where_they_are_named_and_gaps_stay_open():
+    where = np.linspace(0.0, 1.0, 11)
+    values = np.where(where < 0.35, np.nan, 1 / np.maximum(where, 0.1))
+    figure = curves_over(where, Panel("error", [Curve("bound", BLUE, values)]), "arrival", {"0.36": 0.36})
+    (axes,) = figure.axes
+    curve, mark = axes.lines
+    np.testing.assert_array_equal(curve.get_ydata(), values)
+    assert list(mark.get_xdata()) == [0.36, 0.36]
+    assert [text.get_text() for text in axes.texts] == ["0.36", "bound"]
+    assert axes.get_yscale() == "log" and axes.get_xlabel() == "arrival"

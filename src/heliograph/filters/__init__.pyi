@@ -21,6 +21,14 @@ from .innovation import (
 from .late import (
     late_filter as late_filter,
 )
+from .multiple_model import (
+    gpb1_filter as gpb1_filter,
+    gpb2_filter as gpb2_filter,
+    imm_filter as imm_filter,
+)
+from .particle import (
+    particle_filter as particle_filter,
+)
 from .polynomial import (
     PolynomialFilter as PolynomialFilter,
     memory_filter as memory_filter,

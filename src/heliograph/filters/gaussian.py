@@ -17,8 +17,8 @@ from heliograph.model.channel import Channel, check_link, mean_gain
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
@@ -68,25 +68,13 @@ class GaussianFilter(AbstractFilter):
     @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        if isinstance(plant, LinearPlant):
-            moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
-        else:
-            moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
-        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
-        sensor, channel = at(self.sensor, k), at(self.channel, k)
-        if isinstance(sensor, LinearSensor):
-            measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
-        else:
-            measured = self.transform.apply(sensor.measure, *state)
-        mean = measured.mean + sensor.noise.mean
-        spread = measured.covariance + sensor.noise.covariance
-        signal = Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
-        return corrected(state, signal, channel, self.update, jnp.asarray(z))
+        signal = signal_of(at(self.sensor, k), self.transform, state)
+        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z))
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
@@ -96,6 +84,26 @@ class GaussianFilter(AbstractFilter):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
+
+
+def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Belief:
+    """Mean and covariance of f(x, u) + w."""
+    if isinstance(plant, LinearPlant):
+        moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
+    else:
+        moved = transform.apply(lambda x: plant.transition(x, u), *state)
+    return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+
+
+def signal_of(sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
+    """What the sensor is expected to send."""
+    if isinstance(sensor, LinearSensor):
+        measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
+    else:
+        measured = transform.apply(sensor.measure, *state)
+    mean = measured.mean + sensor.noise.mean
+    spread = measured.covariance + sensor.noise.covariance
+    return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
 
 
 def corrected(

@@ -47,6 +47,20 @@ def _innovation_covariance(signal: Signal, channel: SecondOrder) -> jax.Array:
     return congruence(channel.mean_gain, signal.covariance) + channel.nominal(second, everything)
 
 
+def mixed_innovation(
+    weight: Float[Array, " parts"],
+    value: Float[Array, "parts m"],
+    total: Float[Array, "parts m m"],
+    density: Float[Array, ""],
+) -> Innovation:
+    """Mean and covariance of the innovation over the prior weights: those of the parts, and what is between them."""
+    mean = weight @ value
+    apart = value - mean
+    covariance = jnp.einsum("a,aij->ij", weight, total) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
+    nothing = jnp.all(jnp.isnan(mean))  # then the density is 1, to rounding
+    return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
+
+
 @runs_last
 def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
     """log N(value; 0, covariance) of the components that are not NaN, 0 if none is.

@@ -1,88 +1,101 @@
 """A filter that knows the full finite-support laws: every combination of gains and noises, then one Gaussian again."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.linalg import block_diag
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief
+from heliograph.filters.combinations import COMPONENT_LIMIT, atoms_of
+from heliograph.filters.innovation import mixed_innovation
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.combine import Mixture, Series, Stack
-from heliograph.random_affine.law import AbstractLaw, Constant, Discrete
-from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Gaussian, Independent, Shaped
-
-COMPONENT_LIMIT = 4096  # combinations of atoms held for one step
-
-
-class Component(NamedTuple):
-    """One combination of atoms: with `weight`, z = gain x + offset + N(0, noise)."""
-
-    weight: float
-    gain: np.ndarray
-    offset: np.ndarray
-    noise: np.ndarray
+from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.chain import Autoregression
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import JointModes, joint_modes
 
 
 class Components(eqx.Module):
-    """All combinations of one step. Shapes: weight (a,), gain (a, m, n), offset (a, m), noise (a, m, m)."""
+    """All combinations of one step: in their `mode` of the links they have the probability `weight`.
+
+    transition: of the modes from the step before; one mode where nothing remembers.
+
+    Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m), transition (M, M).
+    """
 
     weight: np.ndarray
     gain: np.ndarray
     offset: np.ndarray
     noise: np.ndarray
+    mode: np.ndarray
+    transition: np.ndarray
+
+
+class MixtureBelief(NamedTuple):
+    """One Gaussian for the state, and the modes' probabilities; `moved` once the chain was used.
+
+    Shapes: mean (n,), covariance (n, n), law (M,).
+    """
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    law: Float[jax.Array, " M"]
+    moved: Bool[jax.Array, ""]
 
 
 class MixtureFilter(AbstractFilter):
     """One Gaussian for the state; at each step every combination of the measurement's atoms, then moments matched.
 
     With z = G_a x + c_a + N(0, R_a) and probability p_a, the posterior is a mixture of as many Gaussians with weights
-    p_a N(z; G_a m + c_a, G_a P G_a' + R_a); its mean and covariance are kept (GPB1). Nominal: after the first step the
-    prior is not Gaussian, and process noise enters by its covariance only. The log-likelihood is that of the mixture,
-    log sum_a p_a N(z; ...); the innovation's covariance is the mixture's too.
+    p_a N(z; G_a m + c_a, G_a P G_a' + R_a); its mean and covariance are kept (GPB1). Behind links that remember p_a is
+    the mode's probability times that of the combination in it; the modes' probabilities are carried along, but not what
+    the state owes to the mode. Nominal: after the first step the prior is not Gaussian, and process noise enters by its
+    covariance only. The log-likelihood is that of the mixture, log sum_a p_a N(z; ...); the innovation's covariance is
+    the mixture's too.
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970), with random gains as modes.
     """
 
     plant: AnyPlant
     components: Components | OverTime
+    initial: Float[Array, " M"]
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
 
     @in_float64
-    def init(self) -> Belief:
-        """The prior."""
+    def init(self) -> MixtureBelief:
+        """The prior, and the law of the modes at the first use."""
         start = at(self.plant, 0)
-        return Belief(jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance))
+        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+        return MixtureBelief(mean, spread, jnp.asarray(self.initial), jnp.asarray(False))
 
     @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
-        """A m + B u + E w and A P A' + Q."""
+    def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
+        """A m + B u + E w and A P A' + Q; the modes move from their second use on."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
-        return Belief(plant.transition(state.mean, u) + plant.noise_mean(), spread)
+        law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
+        return MixtureBelief(plant.transition(state.mean, u) + plant.noise_mean(), spread, law, jnp.asarray(True))
 
     @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+    def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
         """Weigh the combinations by what arrived of z."""
-        c, z, (mean, spread) = at(self.components, k), jnp.asarray(z), state
+        c, z, (mean, spread, law, _) = at(self.components, k), jnp.asarray(z), state
+        prior = law[c.mode] * jnp.asarray(c.weight)
         present = ~jnp.isnan(z)
         both = present[:, None] & present
 
@@ -96,27 +109,20 @@ class MixtureFilter(AbstractFilter):
             return likelihood, cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
 
         likelihood, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
-        weighed = likelihood + jnp.log(c.weight)
+        weighed = likelihood + jnp.log(prior)
         weight = jax.nn.softmax(weighed)
         shift = weight @ moved
         apart = moved - shift
         after = spread - jnp.einsum("a,aij->ij", weight, known) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
         density = jax.nn.logsumexp(weighed) - jnp.sum(present) * np.log(2 * np.pi) / 2
-        heard = _mixed(jnp.asarray(c.weight), value, jnp.where(both, total, jnp.nan), density)
-        return Belief(mean + shift, symmetrize(after)), heard
+        heard = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), density)
+        modes = jnp.zeros(len(law)).at[c.mode].add(weight)
+        return MixtureBelief(mean + shift, symmetrize(after), modes, state.moved), heard
 
     @in_float64
-    def estimate(self, state: Belief) -> Estimate:
+    def estimate(self, state: MixtureBelief) -> Estimate:
         """The belief."""
         return Estimate(state.mean, state.covariance, self.claim)
-
-
-def _mixed(weight: jax.Array, value: jax.Array, total: jax.Array, density: jax.Array) -> Innovation:
-    """Mean and covariance of the innovation over the prior weights: those of the parts, and what is between them."""
-    mean = weight @ value
-    apart = value - mean
-    covariance = jnp.einsum("a,aij->ij", weight, total) + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
-    return Innovation(mean, covariance, density)
 
 
 def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
@@ -126,28 +132,34 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     standard deviation added to z: needed where some combination of atoms leaves z without any randomness, as a link
     that is off does.
 
-    Claim: "nominal". Of a channel that remembers it assumes no memory.
+    Behind links that remember it carries the modes' probabilities, in one Gaussian for all; `imm_filter` and
+    `gpb2_filter` keep one for each mode. Behind slow fading its claim is too small.
+
+    Claim: "nominal".
 
     Raises:
-        ValueError: a plant or sensor that is not linear, parts that do not fit, a law with no atoms, more than
-            COMPONENT_LIMIT combinations, or a combination whose z is certain and no resolution.
+        ValueError: a plant or sensor that is not linear, a gain that drifts, parts that do not fit, a law with no
+            atoms, more than COMPONENT_LIMIT combinations, or a combination whose z is certain and no resolution.
     Source: Ackerson and Fu (1970), first-order generalised pseudo-Bayes.
     """
     if not is_linear(plant, sensor):
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    channel = without_memory(channel)
     floor, start = float(scalar("resolution", resolution, 0.0)) ** 2, first(plant)
-    if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
-        components: Components | OverTime = _components(sensor, channel, floor)
+    if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
+        modes = [_modes(channel)]
+        components: Components | OverTime = _components(sensor, modes[0], modes[0], floor)
     else:
         steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
         sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
-        components = over_time([_components(s, c, floor) for s, c in zip(sensors, channels, strict=True)])
+        modes = [_modes(c) for c in channels if isinstance(c, AbstractRandomAffine)]
+        each = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
+        components = over_time([_components(s, now, before, floor) for s, now, before in each])
     return MixtureFilter(
         plant=plant,
         components=components,
+        initial=modes[0].initial,
         claim="nominal",
         states=start.states,
         inputs=start.inputs,
@@ -155,102 +167,23 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
     )
 
 
-def _components(sensor: AnySensor, channel: AbstractRandomAffine, floor: float) -> Components:
+def _modes(channel: AbstractRandomAffine) -> JointModes:
+    if any(isinstance(memory, Autoregression) for memory in memories(channel).values()):
+        raise fail("mixture filter", "gains of finitely many values", "one that drifts")
+    return joint_modes(channel)
+
+
+def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> Components:
     assert isinstance(sensor, LinearSensor)  # checked before
-    route = Series([GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise), channel])
-    found = [c for c in atoms_of(route) if c.weight > 0]
-    weight, gain, offset, noise = (np.array(column) for column in zip(*found, strict=True))
+    heard = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
+    parts = [(c, i) for i, m in enumerate(now.maps) for c in atoms_of(Series([heard, m])) if c.weight > 0]
+    if len(parts) > COMPONENT_LIMIT:
+        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")
+    mode = np.array([i for _, i in parts])
+    weight, gain, offset, noise = (np.array(column) for column in zip(*(c for c, _ in parts), strict=True))
     noise = noise + floor * np.eye(noise.shape[-1])
     for g, r in zip(gain, noise, strict=True):
         if np.linalg.matrix_rank(g @ g.T + r) < len(r):  # a positive definite P is all that would be left
             expected = "measurements that are random for every combination of atoms, or a resolution above 0"
             raise fail("mixture filter", expected, f"gain {g.tolist()} without Gaussian noise")
-    return Components(weight, gain, offset, noise)
-
-
-def atoms_of(item: AbstractRandomAffine) -> list[Component]:
-    """All combinations of the atoms of a map's gains and noises.
-
-    Raises:
-        ValueError: a gain that is not discrete, a noise that is neither finite nor Gaussian, or a map of unknown kind;
-            more than COMPONENT_LIMIT combinations.
-    """
-    match item:
-        case GainAndNoise():
-            gains, noises = _gain_atoms(item.law), _noise_atoms(item.noise)
-            result = [Component(p * q, g * np.asarray(item.matrix), c, r) for p, g in gains for q, c, r in noises]
-        case Series():
-            result = atoms_of(item.maps[0])
-            for part in item.maps[1:]:
-                result = _combine(result, atoms_of(part), _after)
-        case Stack():
-            result = atoms_of(item.maps[0])
-            for part in item.maps[1:]:
-                result = _combine(result, atoms_of(part), _beside)
-        case Mixture():
-            weighted = zip(item.choice.probabilities, item.maps, strict=True)
-            result = [c._replace(weight=p * c.weight) for p, part in weighted for c in atoms_of(part)]
-        case _:
-            raise fail("mixture filter", "maps made of hops, series, stacks and mixtures", type(item).__name__)
-    return result
-
-
-def _combine(
-    a: list[Component], b: list[Component], join: Callable[[Component, Component], Component]
-) -> list[Component]:
-    if len(a) * len(b) > COMPONENT_LIMIT:
-        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(a) * len(b):,}")
-    return [join(x, y) for x in a for y in b]
-
-
-def _after(x: Component, y: Component) -> Component:
-    """y hears x: G_y (G_x s + c_x + n_x) + c_y + n_y."""
-    noise = y.gain @ x.noise @ y.gain.T + y.noise
-    return Component(x.weight * y.weight, y.gain @ x.gain, y.gain @ x.offset + y.offset, noise)
-
-
-def _beside(x: Component, y: Component) -> Component:
-    """Both heard, one above the other."""
-    gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
-    return Component(x.weight * y.weight, gain, offset, np.asarray(block_diag(x.noise, y.noise)))
-
-
-def _gain_atoms(law: AbstractLaw) -> list[tuple[float, float]]:
-    match law:
-        case Constant():
-            return [(1.0, float(law.value))]
-        case Discrete():
-            return [(float(p), float(v)) for p, v in zip(law.probabilities, law.values, strict=True)]
-        case _:
-            raise fail("mixture filter", "gains of finitely many values", type(law).__name__)
-
-
-NoiseAtom = tuple[float, np.ndarray, np.ndarray]  # probability, value, Gaussian covariance
-
-
-def _joint(a: NoiseAtom, b: NoiseAtom) -> NoiseAtom:
-    return a[0] * b[0], np.concatenate([a[1], b[1]]), np.asarray(block_diag(a[2], b[2]))
-
-
-def _noise_atoms(noise: AbstractNoise) -> list[NoiseAtom]:
-    """All combinations of the atoms of a noise's parts."""
-    match noise:
-        case Gaussian():
-            return [(1.0, np.asarray(noise.mean), np.asarray(noise.covariance))]
-        case FiniteSupport():
-            none = np.zeros((noise.dimension, noise.dimension))
-            return [(float(p), v, none) for p, v in zip(noise.probabilities, noise.atoms, strict=True)]
-        case Shaped():
-            b = np.asarray(noise.matrix)
-            return [(p, b @ c, b @ r @ b.T) for p, c, r in _noise_atoms(noise.source)]
-        case Independent():
-            result = [(1.0, np.zeros(0), np.zeros((0, 0)))]
-            for part in noise.parts:
-                more = _noise_atoms(part)
-                if len(result) * len(more) > COMPONENT_LIMIT:
-                    got = f"{len(result) * len(more):,}"
-                    raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", got)
-                result = [_joint(a, b) for a in result for b in more]
-            return result
-        case _:
-            raise fail("mixture filter", "noises of finite support or Gaussian", type(noise).__name__)
+    return Components(weight, gain, offset, noise, mode, np.asarray(before.transition))

@@ -1,6 +1,5 @@
 """Filters that are told something of the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
-from itertools import product
 from typing import NamedTuple
 
 import equinox as eqx
@@ -22,9 +21,9 @@ from heliograph.numerics.check import array, fail, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.arrival import Pattern, patterns
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.second_moments import nominal_spread
+from heliograph.random_affine.second_moments import symmetric_product
+from heliograph.random_affine.told import outcomes, second_moments
 
 
 class Told(eqx.Module):
@@ -229,14 +228,18 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
 
 
 def _told(now: JointModes, before: JointModes, flags: Float[np.ndarray, "M F"]) -> Told:
-    each = [patterns(m) for m in now.maps]
-    kinds = sorted({p.present for parts in each for p in parts}, key=lambda kind: (sum(kind), kind))
+    each = [outcomes(m) for m in now.maps]
+    kinds = sorted({tuple(o.arrived) for parts in each for o in parts}, key=lambda kind: (sum(kind), kind))
     m, p = now.maps[0].outputs, now.maps[0].inputs + 1
     shape = (len(each), len(kinds))
-    chance, mean, spread = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
-    for (j, parts), (a, kind) in product(enumerate(each), enumerate(kinds)):
-        same: list[Pattern] = [part for part in parts if part.present == kind]
-        if same:
-            chance[j, a], mapped = same[0].chance, same[0].channel
-            mean[j, a], spread[j, a] = mapped.moments(1).mean[:-1], nominal_spread(mapped).center
+    chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
+    for j, parts in enumerate(each):
+        for part in parts:
+            a, (first_order, second_order) = kinds.index(tuple(part.arrived)), second_moments(part.map)
+            chance[j, a] += part.probability
+            mean[j, a] += part.probability * first_order
+            second[j, a] += part.probability * second_order
+    divisor = np.where(chance > 0, chance, 1.0)
+    mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
+    spread = second - np.array([[symmetric_product(one, one) for one in row] for row in mean])
     return Told(before.transition, np.array(kinds).reshape(len(kinds), m), chance, mean, spread, flags)

@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .arrival import (
+    CriticalArrival as CriticalArrival,
+)
 from .comparison import (
     GainOverLinear as GainOverLinear,
     gain_over_linear as gain_over_linear,

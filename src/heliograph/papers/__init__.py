@@ -5,4 +5,5 @@ METHODS: dict[str, str] = {  # the module whose `reproduce(out, runs, seed)` it 
     "successive-relays": "heliograph.papers.successive_relays.run",
     "quadratic-bias": "heliograph.papers.quadratic_bias.run",
     "h-infinity-fusion": "heliograph.papers.h_infinity_fusion.run",
+    "intermittent-observations": "heliograph.papers.intermittent_observations.run",
 }

@@ -1,13 +1,13 @@
-"""Curves over time in stacked panels, each named at its right edge."""
+"""Curves over time in stacked panels, or over anything else with marks on it, each named at its right edge."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.report.figures import STYLE, WIDTH, Curve, label_right
+from heliograph.report.figures import INK, STYLE, WIDTH, Curve, label_right
 
 
 @dataclass(frozen=True)
@@ -33,4 +33,25 @@ def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "st
         tail = max(len(time) // 10, 1)
         label_right(axes, {c.name: (float(np.nanmean(c.values[-tail:])), c.colour) for c in panel.curves})
     grid[-1].set_xlabel(label)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def curves_over(
+    where: np.ndarray, panel: Panel, label: str, marks: Mapping[str, float] | None = None, logarithmic: bool = True
+) -> Figure:
+    """One panel of curves over the values `where` of what `label` says; `marks` are named places on that axis.
+
+    Shapes: where (points,), values of each curve (points,); NaN leaves a gap.
+    """
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for curve in panel.curves:
+        axes.plot(where, curve.values, color=curve.colour, linewidth=1.6)
+    axes.set(xlabel=label, ylabel=panel.label, xlim=(where[0], where[-1]), yscale="log" if logarithmic else "linear")
+    for name, place in (marks or {}).items():
+        axes.axvline(place, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+        axes.text(place, 1.01, name, transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=9)
+    ends = {c.name: (float(c.values[np.isfinite(c.values)][-1]), c.colour) for c in panel.curves}
+    label_right(axes, ends)
     return figure

@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .boundedness import (
+    Boundedness as Boundedness,
+)
 from .compilation_cache import (
     keep_compilations as keep_compilations,
 )

@@ -1,0 +1,281 @@
+"""Filters that weigh the modes of links that remember: a Gaussian for each mode, or one for all, mixed at each step.
+
+Each knows the chain, hears through each mode's map with a Gaussian update, and weighs modes by how likely what came is.
+They differ in when Gaussians are merged; all keep only two moments of a mixture, so that they claim nothing exact.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.correction import Signal
+from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
+from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.transform import AbstractTransform, Cubature
+from heliograph.filters.update import Polytope
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, nominal_spread
+
+NODES = 3  # modes that stand for a gain that drifts
+
+
+class ModalChannel(eqx.Module):
+    """A channel at one step as its filters read it: how the modes moved there, and each mode's second moments.
+
+    Shapes: transition (M, M), from the step before; every array of `maps` has a leading axis of modes.
+    """
+
+    transition: Float[Array, "M M"]
+    maps: SecondOrder
+
+
+class ModalBeliefs(NamedTuple):
+    """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
+
+    Shapes: mean (M, n), covariance (M, n, n), weight (M, M); `moved` once the chain was used.
+    """
+
+    mean: Float[jax.Array, "M n"]
+    covariance: Float[jax.Array, "M n n"]
+    weight: Float[jax.Array, "M M"]
+    moved: Bool[jax.Array, ""]
+
+
+class AbstractMerging(eqx.Module):
+    """When Gaussians are merged."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Components and weights after the chain has moved, before the plant does."""
+        raise NotImplementedError
+
+    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Components and modes to hear with: all that may have a weight."""
+        each = np.arange(modes)
+        return each, each
+
+
+class MergeAll(AbstractMerging):
+    """One Gaussian for all modes (GPB1)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Every component is the whole mixture."""
+        law = jnp.sum(state.weight @ rows, axis=0)
+        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+        every = [jnp.repeat(part, len(rows), axis=0) for part in whole]
+        return state._replace(mean=every[0], covariance=every[1], weight=jnp.diag(law))
+
+
+class MergeByNextMode(AbstractMerging):
+    """A Gaussian for each mode, mixed by where the chain comes from (IMM)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Component j is the mixture of all that lead to mode j."""
+        (mean, covariance), law = merged(state.mean, state.covariance, state.weight @ rows)
+        return state._replace(mean=mean, covariance=covariance, weight=jnp.diag(law))
+
+
+class MergeByMode(AbstractMerging):
+    """A Gaussian for each mode, each heard with in every next mode (GPB2)."""
+
+    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
+        """Components stay with the mode they were heard in."""
+        (mean, covariance), law = merged(state.mean, state.covariance, state.weight)
+        return state._replace(mean=mean, covariance=covariance, weight=law[:, None] * rows)
+
+    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
+        """Every component with every mode."""
+        return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
+
+
+def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
+    """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
+    law = jnp.sum(weight, axis=0)
+    share = jnp.where(law > 0, weight / jnp.where(law > 0, law, 1.0), 1 / len(weight))
+    center = share.T @ mean
+    apart = mean[:, None] - center
+    spread = jnp.einsum("ij,iab->jab", share, covariance) + jnp.einsum("ij,ija,ijb->jab", share, apart, apart)
+    return Belief(center, symmetrize(spread)), law
+
+
+class MultipleModelFilter(AbstractFilter):
+    """A filter of the state and of the mode of links that remember; built by `imm_filter` and its kin.
+
+    Nominal: mixtures are cut down to two moments. The innovation is that of the mixture, its log-likelihood too.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: ModalChannel | OverTime
+    initial: Float[Array, " M"]
+    merging: AbstractMerging
+    transform: AbstractTransform
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ModalBeliefs:
+        """The prior in every component; the modes of the first use."""
+        start, modes = at(self.plant, 0), len(self.initial)
+        mean = jnp.tile(jnp.asarray(start.initial_mean), (modes, 1))
+        spread = jnp.tile(jnp.asarray(start.initial_covariance), (modes, 1, 1))
+        return ModalBeliefs(mean, spread, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
+        """The chain moves, then the plant, component by component; at the first use the chain has its initial law."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
+        state = self.merging.moved(state, rows)
+        mean, spread = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
+        """Hear z with each component in each mode, and weigh them by it."""
+        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        i, j = self.merging.pairs(len(self.initial))
+        signals = jax.vmap(lambda *own: signal_of(sensor, self.transform, Belief(*own)))(*state[:2])
+
+        def hear(belief: Belief, signal: Signal, link: SecondOrder) -> tuple[Belief, Innovation]:
+            return corrected(belief, signal, link, Polytope(), z)
+
+        belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
+        links = jax.tree.map(lambda leaf: jnp.asarray(leaf)[j], channel.maps)
+        after, heard = jax.vmap(hear)(belief, signal, links)
+        prior = state.weight[i, j]
+        weight = jnp.log(prior) + heard.log_likelihood
+        posterior = jax.nn.softmax(weight)[:, None] * (j[:, None] == np.arange(len(self.initial)))
+        (mean, spread), law = merged(after.mean, after.covariance, posterior)
+        mixed = mixed_innovation(prior, heard.value, heard.covariance, jax.nn.logsumexp(weight))
+        return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
+
+    @in_float64
+    def estimate(self, state: ModalBeliefs) -> Estimate:
+        """Mean and covariance of the whole mixture."""
+        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+        return Estimate(whole.mean[0], whole.covariance[0], self.claim)
+
+
+def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], ModalChannel | OverTime]:
+    """The law of the modes at the first use, and the channel for each step where it varies.
+
+    Raises:
+        ValueError: too many modes; later, maps whose moments are not known.
+    """
+    steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    parts = [_modal_channel(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
+
+
+def _modal_channel(now: JointModes, before: JointModes) -> ModalChannel:
+    maps = [_nominal(m) for m in now.maps]
+    return ModalChannel(before.transition, jax.tree.map(lambda *same: np.stack(same), *maps))
+
+
+def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
+    mean, spread = np.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
+    none = QuadraticMap(*(np.zeros_like(part) for part in (spread.center, spread.radius)))
+    return SecondOrder(mean[:, :-1], mean[:, -1], spread, none, none, spread, False)
+
+
+def _build(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    merging: AbstractMerging,
+    transform: AbstractTransform | None,
+    nodes: int,
+) -> MultipleModelFilter:
+    start = first(plant)
+    check_link(first(sensor), first(channel), len(start.states))
+    initial, described = describe_modes(channel, nodes)
+    return MultipleModelFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        initial=initial,
+        merging=merging,
+        transform=Cubature() if transform is None else transform,
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def imm_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The interacting multiple model filter of a plant behind links that remember: one Gaussian for each mode.
+
+    Before each step they are mixed by where the next mode may come from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
+    modes are weighed by the likelihood of z. A gain that is random within a mode is known by its second moments, and a
+    drift by `nodes` modes of its own. `transform` is `Cubature()` unless given, and not used for linear parts.
+
+    Claim: "nominal". It tends to claim too little where modes are hard to tell for many steps.
+
+    Raises:
+        ValueError: parts that do not fit, more modes than can be listed, losses inside the channel.
+    Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
+    """
+    return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)
+
+
+def gpb1_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The filter with one Gaussian for all modes of links that remember, and the modes' probabilities beside it.
+
+    Arguments as for `imm_filter`; M updates a step, and none of the memory that couples the state with the mode.
+
+    Claim: "nominal", and too small where fading is slow: what the state owes to the mode is forgotten at each step.
+
+    Raises:
+        ValueError: as for `imm_filter`.
+    Source: Ackerson and Fu, On state estimation in switching environments (1970).
+    """
+    return _build(plant, sensor, channel, MergeAll(), transform, nodes)
+
+
+def gpb2_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The filter with a Gaussian for each mode, each heard with in every next mode before they are merged: M^2 updates.
+
+    Arguments as for `imm_filter`.
+
+    Claim: "nominal". With few modes that the data tells apart it is close to all that can be known; behind slow fading
+    of many modes it claims too little, as the others do.
+
+    Raises:
+        ValueError: as for `imm_filter`.
+    Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
+    """
+    return _build(plant, sensor, channel, MergeByMode(), transform, nodes)
