@@ -99,6 +99,9 @@ from .simulation.boundedness import (
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,
 )
+from .simulation.whiteness import (
+    memory_test as memory_test,
+)
 from .simulation.stream import (
     Stream as Stream,
 )

@@ -64,7 +64,7 @@ def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
     right = hg.MarkovChain(BURSTS)
     wrong = kind(BURSTS)
     check_random_affine(Modes(right, [GOOD, BAD]))
-    with pytest.raises(AssertionError, match="^two draws in a row: a moment differs"):
+    with pytest.raises(AssertionError, match=r"^two draws in a row: a moment differs"):
         check_random_affine(Modes(wrong, [GOOD, BAD]))
 
 

@@ -18,6 +18,9 @@ from .h_infinity import (
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
+from .late import (
+    late_filter as late_filter,
+)
 from .multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,
@@ -41,6 +44,9 @@ from .scheduled import (
 from .sequential import (
     sequential_filter as sequential_filter,
 )
+from .told import (
+    told_filter as told_filter,
+)
 from .transform import (
     AbstractTransform as AbstractTransform,
     Cubature as Cubature,
@@ -52,4 +58,7 @@ from .update import (
     Interval as Interval,
     Polytope as Polytope,
     ZeroMean as ZeroMean,
+)
+from .truth import (
+    true_error as true_error,
 )

@@ -15,6 +15,7 @@ from heliograph.filters.transform import AbstractTransform, Cubature, Linearizat
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.channel import Channel, check_link, mean_gain
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
@@ -149,6 +150,8 @@ def _build(
     spread = start.initial_covariance
     if initial_covariance is not None:
         spread = covariance("filter's initial covariance", initial_covariance, n)
+    trusted = trusted and not memory_matters(channel)
+    channel = without_memory(channel)
     described = describe(channel, update)
     pairs = zip(_each(channel), _each(described), strict=True)
     linear = is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
@@ -186,7 +189,8 @@ def gaussian_filter(
     """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
     Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter). `update` is `Polytope()` unless given; the initial mean and covariance are the
+    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
+    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
     plant's unless given.
 
     Raises:
@@ -208,7 +212,8 @@ def cubature_filter(
     """Cubature Kalman filter that knows its channel's moments.
 
     Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
-    (then it is the Kalman filter). `update` is `Polytope()` unless given; the initial mean and covariance are the
+    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
+    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
     plant's unless given.
 
     Raises:
@@ -252,5 +257,5 @@ def mean_gain_filter(
         ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
     Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
     """
-    believed = mean_gain(channel)
+    believed = mean_gain(without_memory(channel))
     return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)

@@ -19,12 +19,11 @@ from heliograph.filters.plan import plan
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import nominal_spread
 
@@ -78,7 +77,7 @@ class ModalFilter(AbstractFilter):
         """The prior, independent of the mode: Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x x~_0 x~_0'."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
-        spread, square = _padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
+        spread, square = padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
         covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
         moments = law[:, None, None] * (spread + square)
         return ModalBelief(jnp.kron(law, mean), covariance, moments, jnp.asarray(False))
@@ -89,16 +88,15 @@ class ModalFilter(AbstractFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        plant, channel, u = at(self.plant, k), at(self.channel, k), jnp.asarray(u)
-        shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), _padded(plant.noise_covariance(u))
-        move = _padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+        channel = at(self.channel, k)
+        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         carried = move @ state.moments @ move.T
         added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
         moments = jnp.einsum("ij,iab->jab", rows, carried) + added
         chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
-        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + _blocks(added)
+        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
         step = jnp.kron(rows.T, move)
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
         return ModalBelief(step @ state.mean, covariance, moments, jnp.asarray(True))
@@ -110,8 +108,7 @@ class ModalFilter(AbstractFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        mean, noise = jnp.asarray(channel.mean), _padded(jnp.asarray(sensor.noise.covariance))
-        measure = _padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+        mean, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
         heard = jnp.concatenate(list(mean @ measure), axis=1)
         law, present = state.moments[:, -1, -1], ~jnp.isnan(z)
         both = present[:, None] & present
@@ -141,12 +138,25 @@ class ModalFilter(AbstractFilter):
         return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
 
 
-def _padded(a: jax.Array) -> jax.Array:
+def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
+    shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+    move = padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+    return move, padded(plant.noise_covariance(u))
+
+
+def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
+    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
+    measure = padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, padded(jnp.asarray(sensor.noise.covariance))
+
+
+def padded(a: jax.Array) -> jax.Array:
     """[[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 
-def _blocks(parts: jax.Array) -> jax.Array:
+def blocks(parts: jax.Array) -> jax.Array:
     """(M, s, s) on the diagonal of (M s, M s)."""
     modes, size, _ = parts.shape
     placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
@@ -155,19 +165,27 @@ def _blocks(parts: jax.Array) -> jax.Array:
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
-    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
-    described = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    start = first(plant)
+    start, (initial, described) = first(plant), heard_over(channel)
     return ModalFilter(
         plant=plant,
         sensor=sensor,
-        channel=over_time(described) if isinstance(channel, OverTime) else described[0],
-        initial=steps[0].initial,
-        claim=claim_of_modes(steps),
+        channel=described,
+        initial=initial,
+        claim=claim_of_modes(channel),
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,
     )
+
+
+def heard_over(channel: Channel) -> tuple[Float[Array, " M"], Heard | OverTime]:
+    """Law of the modes at the first step, and what is heard at each; a channel that forgets has one mode."""
+    if not isinstance(channel, OverTime):
+        modes = joint_modes(channel)
+        return modes.initial, heard(modes, modes)
+    steps = [joint_modes(c) for c in unstack(channel)]
+    each = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(each)
 
 
 def heard(now: JointModes, before: JointModes) -> Heard:
@@ -177,7 +195,7 @@ def heard(now: JointModes, before: JointModes) -> Heard:
     return Heard(before.transition, mean, spread)
 
 
-def claim_of_modes(steps: list[JointModes]) -> Claim:
-    """ "exact" if every mode's law is known, "nominal" if some probability in it is uncertain."""
-    maps: list[AbstractRandomAffine] = [m for one in steps for m in one.maps]
-    return "exact" if all(m.corner_count() == 1 for m in maps) else "nominal"
+def claim_of_modes(channel: Channel) -> Claim:
+    """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
+    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
+    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"

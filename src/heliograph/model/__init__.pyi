@@ -7,6 +7,11 @@ from .channel import (
 from .estimate import (
     Innovation as Innovation,
 )
+from .fading import (
+    memory_matters as memory_matters,
+    with_flag as with_flag,
+    without_memory as without_memory,
+)
 from .over_time import (
     OverTime as OverTime,
 )

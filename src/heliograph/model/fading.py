@@ -6,13 +6,18 @@ from typing import cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from heliograph.model.channel import hop
+from heliograph.model.channel import Channel, hop
+from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, scalar
 from heliograph.numerics.traced import library
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
-from heliograph.random_affine.modes import Faded, Modes
-from heliograph.random_affine.noise import AbstractNoise, as_noise, components
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import Faded, Modes, OneStepLate, joint_modes
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, as_noise, components
 
 
 def gilbert_elliott(
@@ -80,3 +85,62 @@ def autoregressive_fading(
     """
     count = components(noise) or check_count("dimension of a hop", dimension)
     return Faded(Autoregression(correlation, name), mean, deviation, np.eye(count), as_noise("hop noise", noise, count))
+
+
+def with_flag(
+    channel: AbstractRandomAffine,
+    probabilities: ArrayLike | None = None,
+    chain: MarkovChain | None = None,
+    late: bool = False,
+) -> Stack:
+    """The channel with a flag beside it, (z, flag): the number 0, 1, ... of a class that tells of a chain's mode.
+
+    `probabilities` are P(flag | mode): a received strength, a modem's quality class. Unless given, the flag is the mode
+    itself. `chain` is the one that the channel holds, if it holds one. `late`: each step hears the flag of the step
+    before, and none at the first. The flag is told, never lost with z.
+
+    Shapes: probabilities (modes, flags).
+
+    Raises:
+        ValueError: rows that are no probabilities, a channel that holds several chains or none and `chain` not given.
+    """
+    held = [m for m in memories(channel).values() if isinstance(m, MarkovChain)]
+    if chain is None and len(held) != 1:
+        raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
+    told = held[0] if chain is None else chain
+    rows = np.eye(told.modes) if probabilities is None else array("flags", probabilities, (told.modes, None))
+    nothing, values = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
+    each = [GainAndNoise(Constant(1.0), nothing, FiniteSupport(values, row)) for row in rows]
+    flag = Modes(told, each)
+    return Stack([channel, OneStepLate(flag) if late else flag])
+
+
+def without_memory(channel: Channel) -> Channel:
+    """The channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
+
+    Each step's draws have the law that they have in the channel (of one that does not vary: in the long run); no two
+    steps depend on each other. A channel that forgets is itself.
+
+    Raises:
+        ValueError: a channel that remembers in a way of its own.
+    """
+    if not first(channel).remembers:
+        return channel
+    if not isinstance(channel, OverTime):
+        return forgetful(channel)
+    steps = [joint_modes(one, order=2) for one in unstack(channel)]
+    return over_time([mixed(one, law) for one, law in zip(steps, laws(steps), strict=True)])
+
+
+def memory_matters(channel: Channel) -> bool:
+    """Whether mean gains are correlated over time, so that a linear filter that assumes no memory claims too much.
+
+    Memory in the variance of noise alone does not matter to it, nor in gains of mean zero in every mode.
+
+    Raises:
+        ValueError: a channel that remembers in a way of its own.
+    """
+    if not first(channel).remembers:
+        return False
+    steps = [joint_modes(one) for one in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    return not harmless(steps, not isinstance(channel, OverTime))

@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, scalar, shown
@@ -103,6 +103,42 @@ class _Chosen(AbstractRandomAffine):
 
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
+
+
+class OneStepLate(AbstractRandomAffine):
+    """A map of which a step hears what was drawn at the step before; nothing (NaN) at the first."""
+
+    base: AbstractRandomAffine
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map."""
+        return self.base.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the map."""
+        return self.base.inputs
+
+    @property
+    def erases(self) -> bool:
+        """It does, at the first step."""
+        return True
+
+    @property
+    def remembers(self) -> bool:
+        """It does."""
+        return True
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map, and nothing drawn yet."""
+        return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw for the next step."""
+        inner, before = state
+        inner, h = self.base.draw(inner, key)
+        return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
 
 
 class Faded(AbstractModal):

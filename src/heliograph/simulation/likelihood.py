@@ -23,18 +23,18 @@ def log_likelihood(filter: AbstractFilter, measurements: ArrayLike, inputs: Arra
         ValueError: measurements or inputs of the wrong shape, infinite values, more steps than the filter covers.
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
-    z = _rows("measurements", measurements, None, filter.received, missing=True)
+    z = rows("measurements", measurements, None, filter.received, missing=True)
     steps = len(z)
     if not len(filter.inputs) and inputs is None:
         inputs = np.zeros((steps, 0))
-    u = _rows("inputs", inputs, steps, len(filter.inputs), missing=False)
+    u = rows("inputs", inputs, steps, len(filter.inputs), missing=False)
     if filter.horizon is not None and steps > filter.horizon:
         raise fail("measurements", f"at most {filter.horizon} steps, which the filter covers", steps)
     total = _sum(filter, z, u)
     return total if isinstance(total, jax.core.Tracer) else float(total)
 
 
-def _rows(name: str, value: ArrayLike | None, steps: int | None, length: int, missing: bool) -> Float[Array, "steps n"]:
+def rows(name: str, value: ArrayLike | None, steps: int | None, length: int, missing: bool) -> Float[Array, "steps n"]:
     """An array of `length` numbers a step; NaN where `missing` is allowed."""
     if isinstance(value, jax.core.Tracer):
         return value

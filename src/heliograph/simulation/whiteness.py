@@ -1,0 +1,119 @@
+"""Whether a filter's innovations remember: what a link with memory leaves behind in a filter that assumes none."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+from scipy.linalg import toeplitz
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.simulation.likelihood import rows
+
+
+@dataclass(frozen=True)
+class MemoryTest:
+    """Correlation of innovations at lags 1, 2, ..., its standard error, and what the data say of memory and its cost.
+
+    p_value: of lag 1 if there were none. predictable: what it costs, the share of the innovations' variance that those
+    before them foretell; 0 for the best linear filter. power: mean square of the innovations over what the filter
+    claims, 1 where the claim holds (NaN where no covariance is known), with its standard error.
+
+    Shapes: correlation (lags,), standard_error (lags,).
+    """
+
+    correlation: Float[np.ndarray, " lags"]
+    standard_error: Float[np.ndarray, " lags"]
+    p_value: float
+    predictable: float
+    power: float
+    power_error: float
+
+    @property
+    def found(self) -> bool:
+        """Whether innovations one step apart are correlated, at 1 %."""
+        return self.p_value < 0.01
+
+
+def memory_test(
+    data: ArrayLike, filter: AbstractFilter | None = None, inputs: ArrayLike | None = None, lags: int = 10
+) -> MemoryTest:
+    """Tell from data whether links remember what a filter assumes they forget.
+
+    `data` are the measurements that the filter hears, or without a filter innovations; NaN did not arrive. The best
+    linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the modes.
+    Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
+
+    Shapes: data (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance, too few steps for the lags.
+    Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
+    """
+    check_count("lags", lags)
+    white = _standardised(data) if filter is None else _of_filter(filter, data, inputs)
+    if len(white) < 10 * lags:
+        raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
+    size, size_error = _mean(_by_step(white**2))
+    parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+    correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
+    p_value = float(2 * stats.norm.sf(abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
+    share = float(correlation @ np.linalg.lstsq(toeplitz([1.0, *correlation[:-1]]), correlation)[0])
+    power = (size, size_error) if filter is not None else (np.nan, np.nan)
+    return MemoryTest(correlation, error, p_value, share, *power)
+
+
+def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
+    """Innovations of unknown covariance, each component in units of its deviation."""
+    found = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
+    value = found[:, None] if found.ndim == 1 else found
+    deviation = np.sqrt(np.nanmean(value**2, axis=0))
+    return np.asarray(value / np.where(deviation > 0, deviation, 1.0))
+
+
+def _of_filter(item: AbstractFilter, data: ArrayLike, inputs: ArrayLike | None) -> Float[np.ndarray, "steps m"]:
+    """Innovations of a recording in units of what the filter claims."""
+    if item.claim == "none":
+        raise fail("filter", "one that claims a covariance", "one that claims none")
+    z = rows("measurements", data, None, item.received, missing=True)
+    given = np.zeros((len(z), 0)) if inputs is None else inputs
+    return np.asarray(_whitened(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False)))
+
+
+def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
+    """Mean over the components that are there; NaN where none is."""
+    there = np.sum(~np.isnan(parts), axis=1)
+    return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
+
+
+def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Mean of what is not NaN, and its standard error by Bartlett's weights over the cube root of the length."""
+    there = ~np.isnan(values)
+    count = max(int(there.sum()), 1)
+    mean = float(values[there].sum() / count)
+    apart = np.where(there, values - mean, 0.0)
+    width = int(np.ceil(len(values) ** (1 / 3)))
+    terms = [apart @ apart, *(2 * (1 - t / (width + 1)) * (apart[:-t] @ apart[t:]) for t in range(1, width + 1))]
+    return mean, float(np.sqrt(max(sum(terms), 0.0)) / count)
+
+
+@compiled
+def _whitened(item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
+    """L^-1 (z - E z) with L L' the innovation's covariance, component by component; NaN where it did not arrive."""
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+        k, z_k, u_k = row
+        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
+        there = ~jnp.isnan(heard.value)
+        covariance = jnp.where(there[:, None] & there, heard.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
+        root = jnp.linalg.cholesky(covariance)
+        white = jax.scipy.linalg.solve_triangular(root, jnp.where(there, heard.value, 0.0), lower=True)
+        return after, jnp.where(there, white, jnp.nan)
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    result: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return result

@@ -1,0 +1,62 @@
+"""Innovations tell whether a link remembers what a filter assumes it forgets."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from tests.filters.test_modal import PLANT, SENSOR, bursts
+
+STEPS = 20_000
+
+
+@pytest.fixture(scope="module")
+def heard():
+    channel = bursts()
+    filters = {
+        "memoryless": hg.linear_filter(PLANT, SENSOR, hg.model.without_memory(channel)),
+        "exact": hg.linear_filter(PLANT, SENSOR, channel),
+    }
+    record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, channel, filters)}), STEPS, 1, 5)
+    return record.measurements["node"][0], filters
+
+
+def test_memory_is_found_where_a_filter_assumes_none(heard):
+    """Lag 1 is .30 and lag 2 .20; within four standard errors."""
+    z, filters = heard
+    found = hg.memory_test(z, filters["memoryless"])
+    assert found.found and found.p_value < 1e-6
+    assert np.all(np.abs(found.correlation[:2] - [0.30, 0.20]) < 4 * found.standard_error[:2])
+    assert 0.05 < found.predictable < 0.2
+
+
+def test_the_exact_filter_leaves_nothing_behind(heard):
+    z, filters = heard
+    found = hg.memory_test(z, filters["exact"])
+    assert not found.found and found.predictable < 0.02
+    assert abs(found.power - 1) < 4 * found.power_error
+
+
+def test_innovations_alone_and_gaps():
+    generator = np.random.default_rng(0)
+    white = generator.normal(size=(5000, 2)) * [1.0, 30.0]
+    white[generator.random(5000) < 0.2] = np.nan
+    assert not hg.memory_test(white).found and np.isnan(hg.memory_test(white).power)
+    moved = white[1:] + 0.4 * white[:-1]  # a moving average: lag 1 is .4 / 1.16
+    assert hg.memory_test(moved).correlation[0] == pytest.approx(0.4 / 1.16, abs=0.05)
+    assert hg.memory_test(moved[:, 0]).found
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loud_bursts_alone_are_no_memory(seed):
+    """Variance that comes in bursts widens the standard error, and finds nothing."""
+    generator = np.random.default_rng(seed)
+    loud = np.repeat(generator.choice([0.2, 3.0], 500), 20)
+    found = hg.memory_test(loud * generator.normal(size=10_000))
+    assert found.p_value > 0.001 and found.standard_error[0] > 1 / np.sqrt(10_000)
+
+
+def test_bad_input():
+    with pytest.raises(ValueError, match=r"^data: expected at least 100 steps for 10 lags, got 50"):
+        hg.memory_test(np.zeros(50))
+    with pytest.raises(ValueError, match=r"^measurements"):
+        hg.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))
