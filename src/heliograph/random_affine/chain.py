@@ -55,6 +55,17 @@ class AbstractMemory(eqx.Module):
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
         raise NotImplementedError
 
+    def read(self, number: jax.Array) -> jax.Array:
+        """The state that a number tells of."""
+        raise NotImplementedError
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """States and weights that stand for the law of the next state given this one (None: of that at the first use).
+
+        Exact for polynomials of twice the `degree` in the state.
+        """
+        raise NotImplementedError
+
     def labelled(self, label: str) -> "AbstractMemory":
         """A twin that no link holds yet: told from others by `label` alone."""
         twin = copy(self)  # a construction would check numbers that may be stacked over time
@@ -115,6 +126,15 @@ class MarkovChain(AbstractMemory):
         """The modes."""
         return Nodes(np.arange(self.modes), self.initial, self.transition)
 
+    def read(self, number: jax.Array) -> jax.Array:
+        """The nearest mode from below."""
+        return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """The modes with their probabilities."""
+        law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
+        return jnp.arange(self.modes), law
+
 
 class Autoregression(AbstractMemory):
     """A standard Gaussian that drifts, c+ = rho c + sqrt(1 - rho^2) e, stationary from the first use on.
@@ -150,6 +170,16 @@ class Autoregression(AbstractMemory):
         x, w, hermite = _hermite(check_count("degree", degree, 0) + 1)
         powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
         return Nodes(x, w, (hermite * powers) @ hermite.T * w)
+
+    def read(self, number: jax.Array) -> jax.Array:
+        """The number."""
+        return number
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
+        x, w, _ = _hermite(degree + 1)
+        rho = jnp.asarray(self.correlation)
+        return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
 
     def chain(self, modes: int) -> Nodes:
         """A chain with the same mean, variance and correlation: binomial nodes, E[c+ | c] = rho c, no negative entry.
