@@ -61,5 +61,6 @@ from .update import (
     ZeroMean as ZeroMean,
 )
 from .truth import (
+    TrueError as TrueError,
     true_error as true_error,
 )

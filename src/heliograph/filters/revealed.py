@@ -16,6 +16,7 @@ from heliograph.filters.told import with_flag
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -197,7 +198,7 @@ def _revealed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) 
         sensor=sensor,
         channel=channel,
         late=late,
-        claim=claim_of_modes(channel),
+        claim="nominal" if late and uncertain_chain(channel) else claim_of_modes(channel),
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs + len(memories(channel)),

@@ -140,12 +140,19 @@ def without_memory(channel: Channel) -> Channel:
 def memory_matters(channel: Channel) -> bool:
     """Whether mean gains are correlated over time, so that a linear filter that assumes no memory claims too much.
 
-    Memory in the variance of noise alone does not matter to it, nor in gains of mean zero in every mode.
+    Memory in the variance of noise alone does not matter to it. A chain that is known only roughly always may.
 
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
     if not first(channel).remembers:
         return False
+    if uncertain_chain(channel):
+        return True
     steps = [joint_modes(one) for one in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     return not harmless(steps, not isinstance(channel, OverTime))
+
+
+def uncertain_chain(channel: Channel) -> bool:
+    """Whether a chain in the channel is known only within a radius."""
+    return any(np.any(m.radius > 0) for m in memories(channel).values() if isinstance(m, MarkovChain))

@@ -31,6 +31,7 @@ class Nodes(NamedTuple):
     states: jax.Array | np.ndarray
     initial: Law
     transition: Rows
+    radius: Rows | float = 0.0
 
 
 class AbstractMemory(eqx.Module):
@@ -124,7 +125,7 @@ class MarkovChain(AbstractMemory):
 
     def nodes(self, degree: int) -> Nodes:
         """The modes."""
-        return Nodes(np.arange(self.modes), self.initial, self.transition)
+        return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
 
     def read(self, number: jax.Array) -> jax.Array:
         """The nearest mode from below."""

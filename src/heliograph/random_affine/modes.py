@@ -213,11 +213,14 @@ class JointModes(eqx.Module):
     Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
     `transition` need not be probabilities. A map that forgets has one mode.
 
-    Shapes: initial (modes,), transition (modes, modes).
+    radius: each transition may be off by this much, differently at each step.
+
+    Shapes: initial (modes,), transition and radius (modes, modes).
     """
 
     initial: Law
     transition: Rows
+    radius: Rows
     maps: tuple[AbstractRandomAffine, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
@@ -247,7 +250,8 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(one.states for one in each)))
     for m in maps:
         check_forgets("channel of a filter", m)
-    return JointModes(initial, transition, maps)
+    most = reduce(xp.kron, [one.transition + one.radius for one in each], np.ones((1, 1)))
+    return JointModes(initial, transition, most - transition, maps)
 
 
 def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
