@@ -8,7 +8,8 @@ import pytest
 import heliograph as hg
 from tests.filters.test_modal import BURSTS, PLANT, SENSOR, bursts
 
-told_filter, late_filter = hg.filters.told_filter, hg.filters.late_filter
+told_filter, late_filter = hg.filters.told_filter, hg.filters.mode_late_filter
+known_filter = hg.filters.mode_known_filter
 ARRIVAL = [0.5, 0.95]
 LOSSY = hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in zip((0.2, 1.0), ARRIVAL, strict=True)], BURSTS)
 CLASSES = np.array([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6]])  # P(flag | mode)
@@ -42,7 +43,22 @@ def test_flags_that_reveal_the_mode_make_it_the_kalman_filter_given_the_modes():
     modes = np.array([0, 0, 1, 1, 0, 1, 1, 0])
     given = hg.over_time([hg.hop((0.2, 1.0)[i], 0.05) for i in modes])
     found = claims(told_filter(PLANT, SENSOR, bursts(), np.eye(2)), np.column_stack([Z, modes]))
-    np.testing.assert_allclose(found, claims(hg.linear_filter(PLANT, SENSOR, given), Z), rtol=1e-11)
+    expected = claims(hg.linear_filter(PLANT, SENSOR, given), Z)
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    known = claims(known_filter(PLANT, SENSOR, bursts()), np.column_stack([Z, modes]))
+    np.testing.assert_allclose(known, expected, rtol=1e-12)
+
+
+DRIFTS = hg.amplify_and_forward([hg.autoregressive_fading(m, 0.4, r, 0.05) for m, r in ((1.0, 0.95), (0.8, 0.9))])
+
+
+def test_a_drift_that_is_known():
+    """Given (c_1, c_2) at each step it is the filter of the known gains."""
+    told = np.random.default_rng(3).normal(size=(8, 2))
+    hops = [[hg.hop(m + 0.4 * c, 0.05) for m, c in zip((1.0, 0.8), row, strict=True)] for row in told]
+    given = hg.over_time([hg.amplify_and_forward(row) for row in hops])
+    found = claims(known_filter(PLANT, SENSOR, DRIFTS), np.column_stack([Z, told]))
+    np.testing.assert_allclose(found, claims(hg.linear_filter(PLANT, SENSOR, given), Z), rtol=1e-12)
 
 
 def gains_by_hand(item, flags):
@@ -81,8 +97,10 @@ def test_its_covariance_is_its_error_over_all_paths_given_the_flags(flags):
         (hg.model.with_flag(bursts()), told_filter(PLANT, SENSOR, bursts(), np.eye(2)), 0.0935),
         (hg.model.with_flag(bursts(), CLASSES), told_filter(PLANT, SENSOR, bursts(), CLASSES), None),
         (hg.model.with_flag(bursts(), late=True), late_filter(PLANT, SENSOR, bursts()), 0.0987),
+        (hg.model.with_flag(bursts()), known_filter(PLANT, SENSOR, bursts()), 0.0935),
+        (hg.model.with_flag(DRIFTS, late=True), late_filter(PLANT, SENSOR, DRIFTS), None),
     ],
-    ids=["losses", "mode now", "flags", "mode one step late"],
+    ids=["losses", "mode by flag", "flags", "mode one step late", "mode now", "drifts one step late"],
 )
 def test_claims_hold_in_simulation(world, item, known):
     """Mean claim and mean square error over steps 60-99 agree within four standard errors over runs."""
@@ -114,8 +132,9 @@ def test_two_lossy_links_in_one_shadow_keep_their_own_patterns():
         told_filter(PLANT, SENSOR, bursts(), CLASSES),
         hg.linear_filter(PLANT, SENSOR, LOSSY),
         late_filter(PLANT, SENSOR, bursts()),
+        known_filter(PLANT, SENSOR, DRIFTS),
     ],
-    ids=["flags", "losses", "late"],
+    ids=["flags", "losses", "late", "known"],
 )
 def test_they_keep_the_contract_of_filters(item):
     hg.testing.check_filter(item)

@@ -18,9 +18,6 @@ from .h_infinity import (
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
-from .late import (
-    late_filter as late_filter,
-)
 from .multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,
@@ -36,6 +33,10 @@ from .polynomial import (
 )
 from .prediction import (
     prediction_of as prediction_of,
+)
+from .revealed import (
+    mode_known_filter as mode_known_filter,
+    mode_late_filter as mode_late_filter,
 )
 from .scheduled import (
     LinearSystemFilter as LinearSystemFilter,
@@ -60,5 +61,6 @@ from .update import (
     ZeroMean as ZeroMean,
 )
 from .truth import (
+    TrueError as TrueError,
     true_error as true_error,
 )

@@ -15,9 +15,11 @@ from heliograph.filters.modal import ModalFilter, modal_filter
 from heliograph.filters.plan import plan
 from heliograph.filters.told import ToldFilter, told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
+from heliograph.filters.uncertain import UncertainModalFilter, uncertain_modal_filter
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
@@ -139,7 +141,7 @@ def used(
 
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter | ModalFilter | ToldFilter:
+) -> LinearFilter | ModalFilter | UncertainModalFilter | ToldFilter:
     """The best linear filter for a linear plant and sensor behind any channel.
 
     Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
@@ -159,6 +161,8 @@ def linear_filter(
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if first(channel).erases:
             return told_filter(plant, sensor, channel)
+        if uncertain_chain(channel):
+            return uncertain_modal_filter(plant, sensor, channel)
         return modal_filter(plant, sensor, channel)
     rule = Polytope() if update is None else update
     described = describe(channel, rule)

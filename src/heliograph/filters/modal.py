@@ -31,12 +31,13 @@ from heliograph.random_affine.second_moments import nominal_spread
 class Heard(eqx.Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
 
-    transition: of the modes from the step before to this one.
+    transition: of the modes from the step before to this one; radius: how far each may be off.
 
-    Shapes: transition (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
     """
 
     transition: Float[Array, "M M"]
+    radius: Float[Array, "M M"]
     mean: Float[Array, "M m p1"]
     spread: Float[Array, "M m m p1 p1"]
 
@@ -192,7 +193,7 @@ def heard(now: JointModes, before: JointModes) -> Heard:
     """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
     parts = [(m.moments(1).mean[:-1], nominal_spread(m).center) for m in now.maps]
     mean, spread = (np.stack([np.asarray(part[i]) for part in parts]) for i in range(2))
-    return Heard(before.transition, mean, spread)
+    return Heard(before.transition, before.radius, mean, spread)
 
 
 def claim_of_modes(channel: Channel) -> Claim:

@@ -14,6 +14,7 @@ from heliograph.filters.modal import blocks, measure_matrix, move_matrix, padded
 from heliograph.filters.scheduled import pseudo_solve
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
@@ -196,7 +197,7 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     mode), the modes as in `joint_modes`; the filter then hears (z, flag), as `with_flag` delivers it. Flags that reveal
     the mode make it the Kalman filter given the modes.
 
-    Claim: "exact"; "nominal" where probabilities within a mode are uncertain.
+    Claim: "exact"; "nominal" where probabilities are uncertain.
 
     Shapes: flags (modes, flags).
 
@@ -214,7 +215,7 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     for i, row in enumerate(chances):
         probabilities(f"flags in mode {i}", row)
     described = [by_pattern(one, before, chances) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    known = all(m.corner_count() == 1 for one in steps for m in one.maps)
+    known = all(m.corner_count() == 1 for one in steps for m in one.maps) and not uncertain_chain(channel)
     return ToldFilter(
         plant=plant,
         sensor=sensor,
