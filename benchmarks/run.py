@@ -68,6 +68,11 @@ COMPARISONS = {
             Program("kalman_filterpy", "FilterPy, a loop", "filterpy", target=250),
         ),
     ),
+    "modes": Comparison(
+        problems.modes,
+        Program("modes_heliograph", "heliograph"),
+        (Program("modes_filterpy", "FilterPy, a loop", "filterpy", target=200),),
+    ),
     "cubature": Comparison(
         problems.cubature,
         Program("cubature_heliograph", "heliograph"),

@@ -152,3 +152,32 @@ def test_size_is_refused_with_the_number():
         ValueError, match="boundedness: expected at most 4096 entries of covariances over all modes, got 4840"
     ):
         find_gains(system)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_enclose_the_mean_of_random_systems(seed):
+    """Two states, three modes with outputs and chains at random: E P over all paths, started where the bound stands."""
+    draw = np.random.default_rng(seed)
+    a = draw.normal(size=(2, 2))
+    a *= 1.2 / np.abs(np.linalg.eigvals(a)).max()
+    chain = draw.dirichlet([2.0, 2.0, 1.0], size=3)
+    law = long_run_law(np.ones(3) / 3, chain)
+    outputs = (draw.normal(size=(2, 2)), draw.normal(size=(1, 2)), np.zeros((0, 2)))
+    noises = (np.diag(draw.uniform(0.1, 2.0, 2)), np.eye(1), np.zeros((0, 0)))
+    q = np.diag(draw.uniform(0.1, 2.0, 2))
+    system = ToldSystem(a, q, chain, law, np.arange(3), outputs, noises)
+    gains = find_gains(system)
+    assert certified_radius(system, gains) < 1
+    upper = steady(system, gains, system.source(gains))
+    paths = [(p, i, u / p) for i, (u, p) in enumerate(zip(upper, law, strict=True))]
+    for _ in range(5):
+        paths = [
+            (weight * chain[i, j], j, riccati(a, outputs[i], q, noises[i], p, len(outputs[i]) > 0))
+            for weight, i, p in paths
+            for j in range(3)
+        ]
+    lower = lower_bound(system)
+    for j in range(3):
+        mean = sum(weight * p for weight, i, p in paths if i == j)
+        assert np.linalg.eigvalsh(upper[j] - mean).min() > 0
+        assert np.linalg.eigvalsh(mean - lower[j]).min() > 0

@@ -116,7 +116,7 @@ class ToldFilter(AbstractFilter):
         flag_there, there = ~jnp.isnan(flag), ~jnp.isnan(z)
         number = jnp.clip(jnp.where(flag_there, flag, 0.0).astype(int), 0, told.flags.shape[1] - 1)
         spelled = jnp.where(flag_there, jnp.asarray(told.flags)[:, number], 1.0)
-        kind = _pattern(jnp.asarray(told.present), there)
+        kind = pattern_of(told.present, there)
         weight = jnp.asarray(told.chance)[:, kind] * spelled
         size = len(self.states) + 1
         total = weight @ state.moments[:, size - 1, size - 1]
@@ -175,8 +175,9 @@ def _used(
     return after, value, total
 
 
-def _pattern(present: jax.Array, there: jax.Array) -> jax.Array:
+def pattern_of(patterns: Bool[Array, "A m"], there: Bool[Array, " m"]) -> jax.Array:
     """The smallest pattern in which everything that is there arrives."""
+    present = jnp.asarray(patterns)
     fits = jnp.all(present | ~there, axis=1)
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
@@ -213,7 +214,7 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):
         probabilities(f"flags in mode {i}", row)
-    described = [_told(one, before, chances) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    described = [by_pattern(one, before, chances) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
     known = all(m.corner_count() == 1 for one in steps for m in one.maps) and not uncertain_chain(channel)
     return ToldFilter(
         plant=plant,
@@ -228,7 +229,8 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     )
 
 
-def _told(now: JointModes, before: JointModes, flags: Float[np.ndarray, "M F"]) -> Told:
+def by_pattern(now: JointModes, before: JointModes, flags: Float[np.ndarray, "M F"]) -> Told:
+    """The modes at one step by what arrives, and how they moved there from the step before."""
     each = [outcomes(m) for m in now.maps]
     kinds = sorted({tuple(o.arrived) for parts in each for o in parts}, key=lambda kind: (sum(kind), kind))
     m, p = now.maps[0].outputs, now.maps[0].inputs + 1
