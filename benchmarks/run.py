@@ -34,7 +34,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results.json"
 ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
-ALONE = ("startup", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion")
+ALONE = ("startup", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion", "links_with_memory")
 
 
 class Program(NamedTuple):
