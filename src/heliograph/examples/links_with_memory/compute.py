@@ -19,8 +19,8 @@ from heliograph.examples.links_with_memory.setting import (
     lossy,
 )
 
-RUNS = {"e1": 4000, "e2": 4000}
-PARTICLE_RUNS = 400
+RUNS = {"e1": 2048, "e2": 2048}
+PARTICLE_RUNS = 128
 STEPS = {"e1": (300, 100), "e2": (100, 50)}  # horizon, and the first step that counts
 LAGS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 LONG = 1000  # steps after which nothing changes any more
