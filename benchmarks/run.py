@@ -34,7 +34,9 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results.json"
 ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
-ALONE = ("startup", "stream", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion")
+ALONE = (
+    "startup", "stream", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion", "links_with_memory"
+)  # fmt: skip
 
 
 class Program(NamedTuple):
@@ -67,6 +69,11 @@ COMPARISONS = {
             Program("kalman_numpy", "NumPy, stacked matrices", target=8),
             Program("kalman_filterpy", "FilterPy, a loop", "filterpy", target=250),
         ),
+    ),
+    "modes": Comparison(
+        problems.modes,
+        Program("modes_heliograph", "heliograph"),
+        (Program("modes_filterpy", "FilterPy, a loop", "filterpy", target=200),),
     ),
     "cubature": Comparison(
         problems.cubature,

@@ -81,6 +81,12 @@ def test_a_step_s_least_work_is_that_of_a_scalar_by_hand(bench: ModuleType) -> N
     assert bench.problems.kalman_flops(1, 1) == 21
 
 
+def test_several_modes_cost_as_many_steps_and_their_mixtures(bench: ModuleType) -> None:
+    # One mode: its step, the likelihood (2 + 1 + 2) and three more of the weights, one product, two mixtures of one
+    # Gaussian with one state (2 + 1 + 2 each).
+    assert bench.problems.modes_flops(1, 1, 1) == 21 + 5 + 3 + 1 + 2 * 5
+
+
 def test_the_drawn_problems_fit_their_models(bench: ModuleType) -> None:
     p = bench.problems.cubature(runs=4_000, steps=1).arrays
     x = bench.problems.START

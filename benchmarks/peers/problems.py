@@ -1,4 +1,4 @@
-"""The two problems that every program solves, drawn with a fixed seed, and the least work that a step of each needs."""
+"""The problems that every program solves, drawn with a fixed seed, and the least work that a step of each needs."""
 
 from typing import Any, NamedTuple
 
@@ -40,6 +40,31 @@ def kalman_flops(n: int, m: int) -> int:
     innovation = m * n + 2 * m * n**2 + m * (m + 1) * n + m  # diag(g) C = H, H P, (H P) H', + R
     gain = m**3 // 3 + 2 * m**2 * n  # factor, and two triangular solves with n right-hand sides
     return prediction + innovation + gain + 4 * m * n + half * m  # z - H m, m + K (...), P - K (H P)
+
+
+def modes(runs: int = 10_000, steps: int = 100) -> Problem:
+    """The Kalman problem's plant behind a link that is good or bad for a while, two gains of one Markov chain."""
+    draw = np.random.default_rng(22)
+    p = kalman(1, 1).arrays
+    gains, chain = np.array([0.2, 1.0]), np.array([[0.95, 0.05], [0.03, 0.97]])
+    n, m = 4, 2
+    z, x = np.empty((runs, steps, m)), draw.normal(size=(runs, n))
+    mode = draw.integers(2, size=runs)
+    for k in range(steps):
+        mode = (draw.random(runs) > chain[mode, 0]).astype(int)
+        x = x @ p["A"].T + np.sqrt(0.1) * draw.normal(size=(runs, n))
+        z[:, k] = gains[mode][:, None] * (x @ p["C"].T) + np.sqrt(0.2) * draw.normal(size=(runs, m))
+    arrays = {name: p[name] for name in ("A", "C", "Q", "R", "mean", "covariance")}
+    arrays |= {"gains": gains, "chain": chain, "law": np.array([0.5, 0.5]), "z": z}
+    title = f"Interacting multiple models, 2 modes, {n} states, {m} measurements"
+    return Problem(title, arrays, modes_flops(n, m, 2), 8 * (m + n))
+
+
+def modes_flops(n: int, m: int, count: int) -> int:
+    """A Kalman step for each mode, its likelihood, and the moments of `count` mixtures of `count` Gaussians."""
+    mixture = count * (2 * n + n + n * (n + 1))  # means, what is apart, their squares and covariances
+    likelihood = 2 * m**2 + m + 2
+    return count * (kalman_flops(n, m) + likelihood + 3) + count * count + count * mixture + mixture
 
 
 # The induction machine of the cubature fusion paper, one node, in the strong scenario with known laws of the gains.

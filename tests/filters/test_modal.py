@@ -182,7 +182,7 @@ def test_drifting_gains_need_no_grid(name):
 
 PLANT = hg.LinearPlant([[0.98]], [[0.04]], [0.0], [[0.04 / (1 - 0.98**2)]])
 SENSOR = hg.LinearSensor([[1.0]], 0.05)
-BURSTS = [[0.95, 0.05], [0.03, 0.97]]
+BURSTS = np.array([[0.95, 0.05], [0.03, 0.97]])
 
 
 def bursts(transition=BURSTS):

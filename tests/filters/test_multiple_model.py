@@ -26,10 +26,11 @@ def wide_link(order=(0, 1, 2)):
     return hg.markov_fading([maps[i] for i in order], chain)
 
 
-def exact(plant, sensor, links, data):
+def exact(plant, sensor, links, data, arrival=(1.0, 1.0, 1.0)):
     """Mean, covariance and log-likelihood of x given z_1 ... z_T, by a Kalman filter for every path of modes.
 
-    `links` holds (gains, noise, transition to the step after) for each step, the first with the initial law in front.
+    `links` is the law of the first mode, and (gains, noise, transition to the step after) for each step. A measurement
+    arrives with the probability of its mode; the likelihood is that of all this.
     """
     a, q = plant.matrix, plant.noise.covariance
     c, r = sensor.matrix, sensor.noise.covariance
@@ -40,6 +41,10 @@ def exact(plant, sensor, links, data):
         heard = []
         for weight, i, m, p in paths:
             m, p = a @ m, a @ p @ a.T + q
+            if np.isnan(z):
+                heard.append((weight + np.log(1 - arrival[i]), i, m, p))
+                continue
+            weight = weight + np.log(arrival[i])
             g = gains[i] * c
             s = g @ p @ g.T + gains[i] ** 2 * r + noise
             gain = p @ g.T @ np.linalg.inv(s)
@@ -175,10 +180,61 @@ def test_what_is_merged_early_is_worse_and_claims_too_little():
     np.testing.assert_allclose(true["gpb2_filter"], 0.1249, rtol=0.06)  # 384 runs know it to 2 %
 
 
-def test_losses_inside_are_refused():
-    lossy = hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.5), 0.1, 0.5)
-    with pytest.raises(ValueError, match="one without erasures"):
-        hg.filters.imm_filter(PLANT, SENSOR, lossy)
+@pytest.mark.parametrize(
+    ("build", "data"), [(FILTERS[1], [np.nan]), (FILTERS[2], [0.7, np.nan]), (FILTERS[2], [np.nan, 0.7])]
+)
+def test_losses_say_something_of_the_mode(build, data):
+    """Two modes that lose 0.7 and 0.1: Bayes' rule for what did not arrive too."""
+    arrival = (0.3, 0.9)
+    modes = [hg.erasure(hg.hop(g, 0.05), p) for g, p in zip((0.2, 1.0), arrival, strict=True)]
+    link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(data))
+    mean, spread, _ = exact(PLANT, SENSOR, link, data, arrival)
+    item = build(PLANT, SENSOR, hg.markov_fading(modes, CHAIN))
+    found, _ = stepped(item, data)
+    np.testing.assert_allclose(found.mean, mean, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
+    check_filter(item)
+
+
+def test_a_mode_that_losses_reveal_is_known():
+    """Everything lost in one mode, nothing in the other: the Kalman filter that skips, whatever the chain."""
+    links = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.erasure(hg.hop(0.8, 0.1), 0.0), 0.2, 0.4)
+    data = [0.3, np.nan, np.nan, 0.8, -0.2]
+    expected, total = stepped(hg.linear_filter(PLANT, SENSOR, hg.hop(0.8, 0.1)), data)
+    for build in ALL:
+        found, likelihood = stepped(build(PLANT, SENSOR, links), data)
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
+        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+        np.testing.assert_allclose(likelihood, total, rtol=1e-10)
+
+
+@pytest.mark.parametrize("build", ALL)
+def test_what_varies_in_time_is_followed(build):
+    """Equal maps, a plant and a sensor that vary: the linear filter."""
+    plants = hg.over_time([hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5, -0.7)])
+    sensors = hg.over_time([hg.LinearSensor([[c]], 0.1) for c in (1.0, 2.0, 0.5)])
+    same = hg.markov_fading([hg.hop(0.8, 0.1), hg.hop(0.8, 0.1)], CHAIN)
+    found, _ = stepped(build(plants, sensors, same), DATA[:3])
+    expected, _ = stepped(hg.linear_filter(plants, sensors, hg.hop(0.8, 0.1)), DATA[:3])
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+
+
+def test_they_run_in_single_precision():
+    filters = {build.__name__: build(PLANT, SENSOR, LINK) for build in (FILTERS[1], FILTERS[2])}
+    filters["particles"] = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, filters)})
+    for estimate in hg.monte_carlo(network, 20, 32, 0, precision="float32").estimates["node"].values():
+        assert np.all(np.isfinite(estimate.mean)) and np.all(estimate.covariance > 0)
+
+
+def test_a_certain_output_is_no_density():
+    with pytest.raises(ValueError, match="filter of modes: expected outputs that are random in every mode"):
+        hg.filters.imm_filter(PLANT, SENSOR, hg.gilbert_elliott(hg.perfect(), hg.model.silent(), 0.1, 0.5))
+    hg.filters.imm_filter(PLANT, SENSOR, hg.gilbert_elliott(hg.perfect(), hg.model.silent(noise=0.1), 0.1, 0.5))
+
+
+def test_a_count_of_particles_is_positive():
     with pytest.raises(ValueError, match="particles: expected a positive whole number, got 0"):
         hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=0)
 

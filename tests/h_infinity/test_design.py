@@ -205,3 +205,14 @@ def test_a_missing_solver_names_the_extra(monkeypatch):
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ModuleNotFoundError, match=r'pip install "heliograph\[lmi\]"'):
         hg.h_infinity.recursive_design(node(0), 1.8)
+
+
+def test_links_that_remember_are_refused_with_the_reason():
+    link = hg.gilbert_elliott(hg.hop(1.0, 0.04), hg.hop(0.2, 0.04), 0.1, 0.2)
+    for links in (link, hg.over_time([link] * 5)):
+        with pytest.raises(
+            ValueError, match=r"^channel of an H-infinity design: expected links that forget: its level"
+        ):
+            hg.h_infinity.growth_system(
+                5, np.eye(2), [[0.0, 0.3]], np.eye(2), links, 0.0, transition=0.5 * np.eye(2), output=[[1.0, 0.5]]
+            )

@@ -141,6 +141,19 @@ def test_modes_that_tell_the_same_share_their_gain():
     assert np.mean(found) < bound(system)[0, 0]
 
 
+def test_a_mode_that_is_left_for_good_has_its_gain_too():
+    """It starts where z = x arrives and ends where z = 2 x does: while it is there, a gain of 0 would let P grow."""
+    a, c, q, r = (np.asarray(each) for each in SCALAR)
+    chain = np.array([[0.9, 0.1], [0.0, 1.0]])
+    law = long_run_law(np.array([1.0, 0.0]), chain)
+    np.testing.assert_allclose(law, (0, 1), atol=1e-15)
+    system = ToldSystem(a, q, chain, law, np.array([0, 1]), (c, 2 * c), (r, r))
+    gains = find_gains(system)
+    assert certified_radius(system, gains) < 1
+    always = ToldSystem(a, q, np.ones((1, 1)), np.ones(1), np.array([0]), (2 * c,), (r,))
+    np.testing.assert_allclose(bound(system), bound(always), rtol=1e-9)
+
+
 def test_size_is_refused_with_the_number():
     chain = np.full((40, 40), 1 / 40) + np.eye(40) * 0
     chain[0] = np.eye(40)[0]
@@ -149,6 +162,35 @@ def test_size_is_refused_with_the_number():
         np.eye(n), np.eye(n), chain, chain[1], np.zeros(40, dtype=int), (np.zeros((0, n)),), (np.zeros((0, 0)),) * 40
     )
     with pytest.raises(
-        ValueError, match="boundedness: expected at most 4096 entries of covariances over all modes, got 4840"
+        ValueError, match="boundedness: expected at most 1024 entries of covariances over all modes, got 4840"
     ):
         find_gains(system)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bounds_enclose_the_mean_of_random_systems(seed):
+    """Two states, three modes with outputs and chains at random: E P over all paths, started where the bound stands."""
+    draw = np.random.default_rng(seed)
+    a = draw.normal(size=(2, 2))
+    a *= 1.2 / np.abs(np.linalg.eigvals(a)).max()
+    chain = draw.dirichlet([2.0, 2.0, 1.0], size=3)
+    law = long_run_law(np.ones(3) / 3, chain)
+    outputs = (draw.normal(size=(2, 2)), draw.normal(size=(1, 2)), np.zeros((0, 2)))
+    noises = (np.diag(draw.uniform(0.1, 2.0, 2)), np.eye(1), np.zeros((0, 0)))
+    q = np.diag(draw.uniform(0.1, 2.0, 2))
+    system = ToldSystem(a, q, chain, law, np.arange(3), outputs, noises)
+    gains = find_gains(system)
+    assert certified_radius(system, gains) < 1
+    upper = steady(system, gains, system.source(gains))
+    paths = [(p, i, u / p) for i, (u, p) in enumerate(zip(upper, law, strict=True))]
+    for _ in range(5):
+        paths = [
+            (weight * chain[i, j], j, riccati(a, outputs[i], q, noises[i], p, len(outputs[i]) > 0))
+            for weight, i, p in paths
+            for j in range(3)
+        ]
+    lower = lower_bound(system)
+    for j in range(3):
+        mean = sum(weight * p for weight, i, p in paths if i == j)
+        assert np.linalg.eigvalsh(upper[j] - mean).min() > 0
+        assert np.linalg.eigvalsh(mean - lower[j]).min() > 0

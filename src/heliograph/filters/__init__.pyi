@@ -34,12 +34,19 @@ from .polynomial import (
 from .prediction import (
     prediction_of as prediction_of,
 )
+from .revealed import (
+    mode_known_filter as mode_known_filter,
+    mode_late_filter as mode_late_filter,
+)
 from .scheduled import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
 )
 from .sequential import (
     sequential_filter as sequential_filter,
+)
+from .told import (
+    told_filter as told_filter,
 )
 from .transform import (
     AbstractTransform as AbstractTransform,
@@ -54,5 +61,6 @@ from .update import (
     ZeroMean as ZeroMean,
 )
 from .truth import (
+    TrueError as TrueError,
     true_error as true_error,
 )

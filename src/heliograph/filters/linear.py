@@ -13,10 +13,13 @@ from heliograph.filters.gaussian import Belief, describe
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.modal import ModalFilter, modal_filter
 from heliograph.filters.plan import plan
+from heliograph.filters.told import ToldFilter, told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
+from heliograph.filters.uncertain import UncertainModalFilter, uncertain_modal_filter
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
@@ -67,16 +70,16 @@ class LinearFilter(AbstractFilter):
         """Both moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
-        error, own = (_moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
+        error, own = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
         return LinearBelief(*error, *own)
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Use what arrived of z."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        signal = _signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-        gain, bound = self.update.correct(state.covariance, signal, channel, ~jnp.isnan(z))
-        mean, covariance, expected = _used(
+        y = signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+        gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
+        mean, covariance, expected = used(
             state.mean,
             state.covariance,
             gain,
@@ -87,7 +90,7 @@ class LinearFilter(AbstractFilter):
             channel.offset,
             z,
         )
-        heard = gaussian_innovation(z, expected, innovation_covariance(signal, channel))
+        heard = gaussian_innovation(z, expected, innovation_covariance(y, channel))
         return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), heard
 
     @in_float64
@@ -101,7 +104,7 @@ class LinearFilter(AbstractFilter):
 
 
 @runs_last
-def _moved(
+def moved(
     mean: jax.Array, spread: jax.Array, matrix: jax.Array, shift: jax.Array, noise: jax.Array
 ) -> tuple[jax.Array, jax.Array]:
     """A m + b and A P A' + Q."""
@@ -109,7 +112,7 @@ def _moved(
 
 
 @runs_last
-def _signal(state: LinearBelief, c: jax.Array, noise_mean: jax.Array, noise: jax.Array) -> Signal:
+def signal(state: LinearBelief, c: jax.Array, noise_mean: jax.Array, noise: jax.Array) -> Signal:
     """y = C x + v: its mean before any data, the covariance of what is not known of it, E[y y']."""
     cross = times(state.covariance, transpose(c))
     mean = times_vector(c, state.state_mean) + noise_mean
@@ -118,7 +121,7 @@ def _signal(state: LinearBelief, c: jax.Array, noise_mean: jax.Array, noise: jax
 
 
 @runs_last
-def _used(
+def used(
     mean: jax.Array,
     prior: jax.Array,
     gain: jax.Array,
@@ -138,11 +141,12 @@ def _used(
 
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter | ModalFilter:
+) -> LinearFilter | ModalFilter | UncertainModalFilter | ToldFilter:
     """The best linear filter for a linear plant and sensor behind any channel.
 
     Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
-    too. A sensor noise correlated with its own past is outside.
+    too; if it also loses data, what arrives tells of the modes (`told_filter`). A sensor noise correlated with its own
+    past is outside.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
@@ -155,6 +159,10 @@ def linear_filter(
     if first(channel).remembers:
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
+        if first(channel).erases:
+            return told_filter(plant, sensor, channel)
+        if uncertain_chain(channel):
+            return uncertain_modal_filter(plant, sensor, channel)
         return modal_filter(plant, sensor, channel)
     rule = Polytope() if update is None else update
     described = describe(channel, rule)

@@ -19,8 +19,8 @@ from heliograph.filters.plan import plan
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -31,12 +31,13 @@ from heliograph.random_affine.second_moments import nominal_spread
 class Heard(eqx.Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
 
-    transition: of the modes from the step before to this one.
+    transition: of the modes from the step before to this one; radius: how far each may be off.
 
-    Shapes: transition (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
     """
 
     transition: Float[Array, "M M"]
+    radius: Float[Array, "M M"]
     mean: Float[Array, "M m p1"]
     spread: Float[Array, "M m m p1 p1"]
 
@@ -77,7 +78,7 @@ class ModalFilter(AbstractFilter):
         """The prior, independent of the mode: Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x x~_0 x~_0'."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
         mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
-        spread, square = _padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
+        spread, square = padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
         covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
         moments = law[:, None, None] * (spread + square)
         return ModalBelief(jnp.kron(law, mean), covariance, moments, jnp.asarray(False))
@@ -88,16 +89,15 @@ class ModalFilter(AbstractFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        plant, channel, u = at(self.plant, k), at(self.channel, k), jnp.asarray(u)
-        shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), _padded(plant.noise_covariance(u))
-        move = _padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+        channel = at(self.channel, k)
+        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         carried = move @ state.moments @ move.T
         added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
         moments = jnp.einsum("ij,iab->jab", rows, carried) + added
         chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
-        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + _blocks(added)
+        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
         step = jnp.kron(rows.T, move)
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
         return ModalBelief(step @ state.mean, covariance, moments, jnp.asarray(True))
@@ -109,8 +109,7 @@ class ModalFilter(AbstractFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        mean, noise = jnp.asarray(channel.mean), _padded(jnp.asarray(sensor.noise.covariance))
-        measure = _padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+        mean, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
         heard = jnp.concatenate(list(mean @ measure), axis=1)
         law, present = state.moments[:, -1, -1], ~jnp.isnan(z)
         both = present[:, None] & present
@@ -140,12 +139,25 @@ class ModalFilter(AbstractFilter):
         return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
 
 
-def _padded(a: jax.Array) -> jax.Array:
+def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
+    shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+    move = padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+    return move, padded(plant.noise_covariance(u))
+
+
+def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
+    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
+    measure = padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, padded(jnp.asarray(sensor.noise.covariance))
+
+
+def padded(a: jax.Array) -> jax.Array:
     """[[A, 0], [0, 0]]."""
     return jnp.pad(a, ((0, 1), (0, 1)))
 
 
-def _blocks(parts: jax.Array) -> jax.Array:
+def blocks(parts: jax.Array) -> jax.Array:
     """(M, s, s) on the diagonal of (M s, M s)."""
     modes, size, _ = parts.shape
     placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
@@ -181,7 +193,7 @@ def heard(now: JointModes, before: JointModes) -> Heard:
     """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
     parts = [(m.moments(1).mean[:-1], nominal_spread(m).center) for m in now.maps]
     mean, spread = (np.stack([np.asarray(part[i]) for part in parts]) for i in range(2))
-    return Heard(before.transition, mean, spread)
+    return Heard(before.transition, before.radius, mean, spread)
 
 
 def claim_of_modes(channel: Channel) -> Claim:

@@ -15,6 +15,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
 from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.told import Told, by_pattern, pattern_of
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
@@ -22,24 +23,14 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, nominal_spread
+from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
 
 NODES = 3  # modes that stand for a gain that drifts
-
-
-class ModalChannel(eqx.Module):
-    """A channel at one step as its filters read it: how the modes moved there, and each mode's second moments.
-
-    Shapes: transition (M, M), from the step before; every array of `maps` has a leading axis of modes.
-    """
-
-    transition: Float[Array, "M M"]
-    maps: SecondOrder
 
 
 class ModalBeliefs(NamedTuple):
@@ -100,14 +91,15 @@ class MergeByMode(AbstractMerging):
         return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
 
 
+@runs_last
 def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
     """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
     law = jnp.sum(weight, axis=0)
     share = jnp.where(law > 0, weight / jnp.where(law > 0, law, 1.0), 1 / len(weight))
-    center = share.T @ mean
+    center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
     apart = mean[:, None] - center
-    spread = jnp.einsum("ij,iab->jab", share, covariance) + jnp.einsum("ij,ija,ijb->jab", share, apart, apart)
-    return Belief(center, symmetrize(spread)), law
+    inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
+    return Belief(center, jnp.sum(share[:, :, None, None] * inside, axis=0)), law
 
 
 class MultipleModelFilter(AbstractFilter):
@@ -118,7 +110,7 @@ class MultipleModelFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: ModalChannel | OverTime
+    channel: Told | OverTime
     initial: Float[Array, " M"]
     merging: AbstractMerging
     transform: AbstractTransform
@@ -151,17 +143,10 @@ class MultipleModelFilter(AbstractFilter):
         i, j = self.merging.pairs(len(self.initial))
         signals = jax.vmap(lambda *own: signal_of(sensor, self.transform, Belief(*own)))(*state[:2])
 
-        def hear(belief: Belief, signal: Signal, link: SecondOrder) -> tuple[Belief, Innovation]:
-            return corrected(belief, signal, link, Polytope(), z)
-
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        links = jax.tree.map(lambda leaf: jnp.asarray(leaf)[j], channel.maps)
-        after, heard = jax.vmap(hear)(belief, signal, links)
-        prior = state.weight[i, j]
-        weight = jnp.log(prior) + heard.log_likelihood
-        posterior = jax.nn.softmax(weight)[:, None] * (j[:, None] == np.arange(len(self.initial)))
+        after, weight, mixed = hear(belief, signal, channel, jnp.asarray(j), state.weight[i, j], z)
+        posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
         (mean, spread), law = merged(after.mean, after.covariance, posterior)
-        mixed = mixed_innovation(prior, heard.value, heard.covariance, jax.nn.logsumexp(weight))
         return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
 
     @in_float64
@@ -171,26 +156,57 @@ class MultipleModelFilter(AbstractFilter):
         return Estimate(whole.mean[0], whole.covariance[0], self.claim)
 
 
-def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], ModalChannel | OverTime]:
-    """The law of the modes at the first use, and the channel for each step where it varies.
+def hear(
+    belief: Belief, signal: Signal, channel: Told, mode: jax.Array, weight: jax.Array, z: jax.Array
+) -> tuple[Belief, jax.Array, Innovation]:
+    """Each belief corrected in its mode, its weight after z and after what arrived of it, and the mixture's innovation.
+
+    weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
+    """
+    kind = pattern_of(channel.present, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
+    mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
+    chance = weight * jnp.asarray(channel.chance)[mode, kind]
+    prior = chance / jnp.sum(chance)
+
+    def one(own: Belief, sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Belief, Innovation]:
+        law = QuadraticMap(spread, jnp.zeros_like(spread))
+        none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
+        link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
+        return corrected(own, sent, link, Polytope(), z)
+
+    found, heard = jax.vmap(one)(belief, signal, mean, spread)
+    possible = prior > 0  # a mode in which this cannot arrive has no map for it
+    after = Belief(
+        jnp.where(possible[:, None], found.mean, belief.mean),
+        jnp.where(possible[:, None, None], found.covariance, belief.covariance),
+    )
+    weighed = jnp.where(possible, jnp.log(prior) + heard.log_likelihood, -jnp.inf)
+    mixed = mixed_innovation(prior, heard.value, heard.covariance, jax.nn.logsumexp(weighed))
+    return after, jax.nn.softmax(weighed), mixed
+
+
+def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], Told | OverTime]:
+    """The law of the modes at the first use, and the channel by mode and by what arrives, at each step if it varies.
 
     Raises:
-        ValueError: too many modes; later, maps whose moments are not known.
+        ValueError: too many modes, maps whose moments are not known, a mode whose output is certain beside others: a
+            probability cannot be weighed against densities.
     """
     steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
-    parts = [_modal_channel(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    no_flags = np.ones((len(steps[0].initial), 1))
+    parts = [by_pattern(one, before, no_flags) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    for part in parts if len(no_flags) > 1 else []:
+        _check_random(part)
     return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
 
 
-def _modal_channel(now: JointModes, before: JointModes) -> ModalChannel:
-    maps = [_nominal(m) for m in now.maps]
-    return ModalChannel(before.transition, jax.tree.map(lambda *same: np.stack(same), *maps))
-
-
-def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
-    mean, spread = np.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
-    none = QuadraticMap(*(np.zeros_like(part) for part in (spread.center, spread.radius)))
-    return SecondOrder(mean[:, :-1], mean[:, -1], spread, none, none, spread, False)
+def _check_random(told: Told) -> None:
+    """Every combination of mode and pattern gives z a density, for an x that has one."""
+    for j, a in np.argwhere(np.asarray(told.chance) > 0):
+        rows, gain = np.flatnonzero(told.present[a]), np.asarray(told.mean[j, a])[:, :-1]
+        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(told.spread[j, a])))[np.ix_(rows, rows)]
+        if np.linalg.matrix_rank(random) < len(rows):
+            raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 
 
 def _build(
@@ -229,12 +245,13 @@ def imm_filter(
 
     Before each step they are mixed by where the next mode may come from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
     modes are weighed by the likelihood of z. A gain that is random within a mode is known by its second moments, and a
-    drift by `nodes` modes of its own. `transform` is `Cubature()` unless given, and not used for linear parts.
+    drift by `nodes` modes of its own; losses inside the channel, told, say something of the mode too. `transform` is
+    `Cubature()` unless given, and not used for linear parts.
 
     Claim: "nominal". It tends to claim too little where modes are hard to tell for many steps.
 
     Raises:
-        ValueError: parts that do not fit, more modes than can be listed, losses inside the channel.
+        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain beside others.
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
     return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)

@@ -7,12 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
-from heliograph.filters.innovation import mixed_innovation
-from heliograph.filters.multiple_model import ModalChannel, describe_modes, merged
+from heliograph.filters.gaussian import Belief, predicted, signal_of
+from heliograph.filters.multiple_model import describe_modes, hear, merged
+from heliograph.filters.told import Told
 from heliograph.filters.transform import AbstractTransform, Cubature
-from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
@@ -21,7 +19,6 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
-from heliograph.random_affine.second_moments import SecondOrder
 
 NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 
@@ -49,7 +46,7 @@ class ParticleFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: ModalChannel | OverTime
+    channel: Told | OverTime
     initial: Float[Array, " M"]
     transform: AbstractTransform
     particles: int = eqx.field(static=True)
@@ -86,14 +83,8 @@ class ParticleFilter(AbstractFilter):
         belief = Belief(state.mean, state.covariance)
         signals = jax.vmap(lambda *own: signal_of(sensor, self.transform, Belief(*own)))(*belief)
 
-        def hear(own: Belief, signal: Signal, link: SecondOrder) -> tuple[Belief, Innovation]:
-            return corrected(own, signal, link, Polytope(), z)
-
-        links = jax.tree.map(lambda leaf: jnp.asarray(leaf)[state.mode], channel.maps)
-        after, heard = jax.vmap(hear)(belief, signals, links)
-        weighed = jnp.log(state.weight) + heard.log_likelihood
-        weight, key = jax.nn.softmax(weighed), _folded(state.key, z)
-        mixed = mixed_innovation(state.weight, heard.value, heard.covariance, jax.nn.logsumexp(weighed))
+        after, weight, mixed = hear(belief, signals, channel, state.mode, state.weight, z)
+        key = _folded(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
         which = jnp.where(poor, chosen, jnp.arange(self.particles))

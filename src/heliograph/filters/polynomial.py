@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.centre import Centre, centre_of, without_mean
 from heliograph.filters.innovation import log_density
+from heliograph.filters.modal import claim_of_modes
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.memory import memory_system
@@ -16,6 +17,7 @@ from heliograph.linear.recursion import lmmse
 from heliograph.linear.system import LinearSystem
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
@@ -243,5 +245,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
 
 def claim_of(channel: Channel) -> Claim:
     """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
+    if first(channel).remembers:
+        return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
     each: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
     return "exact" if all(c.corner_count() == 1 for c in each) else "nominal"

@@ -168,7 +168,7 @@ class LinearSystemFilter(AbstractFilter):
         present = ~jnp.isnan(z)
         expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
-        gain = _solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
+        gain = pseudo_solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
         after = Belief(
             mean + gain @ jnp.where(present, z - expected, 0.0),
             symmetrize(with_rounding(spread, len(z)) - gain @ cross),
@@ -186,7 +186,7 @@ class LinearSystemFilter(AbstractFilter):
         return plan(self, inputs, self.want)
 
 
-def _solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:
+def pseudo_solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:
     """O^+ C as in heliograph.linear.recursion; rows of zeros (absent components) are skipped."""
     deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(innovation), 0.0))
     scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)

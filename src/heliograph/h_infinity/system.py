@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.channel import Channel
-from heliograph.model.over_time import OverTime, unstack
+from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
@@ -114,6 +114,11 @@ def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) 
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+    if first(channel).remembers:
+        expected = (
+            "links that forget: its level is proved step by step, with gains that are independent of the steps before"
+        )
+        raise fail("channel of an H-infinity design", expected, "one that remembers")
     if not isinstance(channel, OverTime):
         return (disturbed_gain(channel),) * steps
     if channel.steps < steps:

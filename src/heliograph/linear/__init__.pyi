@@ -10,6 +10,9 @@ from .comparison import (
 from .lift import (
     lifted_system as lifted_system,
 )
+from .modal import (
+    modal_system as modal_system,
+)
 from .recursion import (
     lmmse as lmmse,
     true_covariance as true_covariance,

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple, TypeVar
 import equinox as eqx
 import numpy as np
 
+from heliograph.linear.modal_lift import lifted_modes
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
@@ -18,6 +19,7 @@ from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
 from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
@@ -42,6 +44,8 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     mean zero given the state's whole past, so the best linear filter of this system is the best filter of x that is
     a polynomial of this degree in each z_k. Degree 1 is the best linear filter, 2 the quadratic one.
 
+    Behind links that remember the monomials are kept for each of their modes (`lifted_modes`).
+
     x is read off as the monomials of degree 1. Every monomial appears once (the half-vectorised square).
 
     Raises:
@@ -53,8 +57,14 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     start = first(plant)
     n, m = len(start.states), int(first(channel).outputs)
     refuse_lift(degree, n, m, horizon)
-    routes = model_routes(plant, sensor, channel, 2 * degree, horizon)
-    moments, parts, lost = initial_moments(start, 2 * degree), [], []
+    routes, moments = model_routes(plant, sensor, channel, 2 * degree, horizon), initial_moments(start, 2 * degree)
+    if first(channel).remembers:
+        want = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
+        distinct = {id(r.measurement): r.measurement for r in routes}
+        modes = {place: joint_modes(item, order=degree) for place, item in distinct.items()}
+        each = [modes[id(r.measurement)] for r in routes]
+        return lifted_modes([r.plant for r in routes], each, degree, moments, want)
+    parts, lost = [], []
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]

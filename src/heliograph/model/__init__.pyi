@@ -9,6 +9,7 @@ from .estimate import (
 )
 from .fading import (
     memory_matters as memory_matters,
+    with_flag as with_flag,
     without_memory as without_memory,
 )
 from .over_time import (

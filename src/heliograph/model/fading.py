@@ -10,11 +10,14 @@ from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, scalar
 from heliograph.numerics.traced import library
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
+from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
-from heliograph.random_affine.modes import Faded, Modes, joint_modes
-from heliograph.random_affine.noise import AbstractNoise, as_noise, components
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed, joint_modes
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, as_noise, components
 
 
 def gilbert_elliott(
@@ -84,6 +87,39 @@ def autoregressive_fading(
     return Faded(Autoregression(correlation, name), mean, deviation, np.eye(count), as_noise("hop noise", noise, count))
 
 
+def with_flag(
+    channel: AbstractRandomAffine,
+    probabilities: ArrayLike | None = None,
+    chain: MarkovChain | None = None,
+    late: bool = False,
+) -> Stack:
+    """The channel with a flag beside it, (z, flag): the number 0, 1, ... of a class that tells of a chain's mode.
+
+    `probabilities` are P(flag | mode): a received strength, a modem's quality class; `chain` is the one that it tells
+    of, that of the channel if it holds one. Without both the states of all memories are told after z: the number of a
+    mode, the value of what drifts. `late`: each step hears the flag of the step before, and none at the first. The flag
+    is told, never lost with z.
+
+    Shapes: probabilities (modes, flags).
+
+    Raises:
+        ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
+    """
+    held = list(memories(channel).values())
+    if chain is None and (not held or (probabilities is not None and len(held) > 1)):
+        raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
+    if probabilities is None:
+        told = [Revealed(m, channel.inputs) for m in (held if chain is None else [chain])]
+        return Stack([channel, *(OneStepLate(flag) if late else flag for flag in told)])
+    memory = held[0] if chain is None else chain
+    if not isinstance(memory, MarkovChain):
+        raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
+    rows = array("flags", probabilities, (memory.modes, None))
+    nothing, values = np.zeros((1, channel.inputs)), np.arange(rows.shape[1])[:, None]
+    classes = Modes(memory, [GainAndNoise(Constant(1.0), nothing, FiniteSupport(values, row)) for row in rows])
+    return Stack([channel, OneStepLate(classes) if late else classes])
+
+
 def without_memory(channel: Channel) -> Channel:
     """The channel whose modes are drawn anew at each step: what a filter believes that assumes no memory.
 
@@ -104,12 +140,19 @@ def without_memory(channel: Channel) -> Channel:
 def memory_matters(channel: Channel) -> bool:
     """Whether mean gains are correlated over time, so that a linear filter that assumes no memory claims too much.
 
-    Memory in the variance of noise alone does not matter to it, nor in gains of mean zero in every mode.
+    Memory in the variance of noise alone does not matter to it. A chain that is known only roughly always may.
 
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
     if not first(channel).remembers:
         return False
+    if uncertain_chain(channel):
+        return True
     steps = [joint_modes(one) for one in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     return not harmless(steps, not isinstance(channel, OverTime))
+
+
+def uncertain_chain(channel: Channel) -> bool:
+    """Whether a chain in the channel is known only within a radius."""
+    return any(np.any(m.radius > 0) for m in memories(channel).values() if isinstance(m, MarkovChain))

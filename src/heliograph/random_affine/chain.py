@@ -31,6 +31,7 @@ class Nodes(NamedTuple):
     states: jax.Array | np.ndarray
     initial: Law
     transition: Rows
+    radius: Rows | float = 0.0
 
 
 class AbstractMemory(eqx.Module):
@@ -53,6 +54,17 @@ class AbstractMemory(eqx.Module):
 
     def nodes(self, degree: int) -> Nodes:
         """The memory as finitely many states, exact for laws whose mean is a polynomial of `degree` in the state."""
+        raise NotImplementedError
+
+    def read(self, number: jax.Array) -> jax.Array:
+        """The state that a number tells of."""
+        raise NotImplementedError
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """States and weights that stand for the law of the next state given this one (None: of that at the first use).
+
+        Exact for polynomials of twice the `degree` in the state.
+        """
         raise NotImplementedError
 
     def labelled(self, label: str) -> "AbstractMemory":
@@ -113,7 +125,16 @@ class MarkovChain(AbstractMemory):
 
     def nodes(self, degree: int) -> Nodes:
         """The modes."""
-        return Nodes(np.arange(self.modes), self.initial, self.transition)
+        return Nodes(np.arange(self.modes), self.initial, self.transition, self.radius)
+
+    def read(self, number: jax.Array) -> jax.Array:
+        """The nearest mode from below."""
+        return jnp.clip(jnp.asarray(number).astype(int), 0, self.modes - 1)
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """The modes with their probabilities."""
+        law = jnp.asarray(self.initial) if state is None else jnp.asarray(self.transition)[state]
+        return jnp.arange(self.modes), law
 
 
 class Autoregression(AbstractMemory):
@@ -150,6 +171,16 @@ class Autoregression(AbstractMemory):
         x, w, hermite = _hermite(check_count("degree", degree, 0) + 1)
         powers = library(self.correlation).asarray(self.correlation) ** np.arange(len(x))
         return Nodes(x, w, (hermite * powers) @ hermite.T * w)
+
+    def read(self, number: jax.Array) -> jax.Array:
+        """The number."""
+        return number
+
+    def following(self, state: jax.Array | None, degree: int) -> tuple[jax.Array | np.ndarray, Law]:
+        """rho c + sqrt(1 - rho^2) x at Gauss-Hermite nodes x; x itself at the first use."""
+        x, w, _ = _hermite(degree + 1)
+        rho = jnp.asarray(self.correlation)
+        return (jnp.asarray(x) if state is None else rho * state + jnp.sqrt(1 - rho**2) * x), w
 
     def chain(self, modes: int) -> Nodes:
         """A chain with the same mean, variance and correlation: binomial nodes, E[c+ | c] = rho c, no negative entry.

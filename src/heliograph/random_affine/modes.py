@@ -9,12 +9,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, scalar, shown
 from heliograph.numerics.traced import library, stacked
-from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import (
     AbstractModal,
     AbstractRandomAffine,
@@ -105,6 +105,63 @@ class _Chosen(AbstractRandomAffine):
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
 
 
+class Revealed(AbstractModal):
+    """z = the state of a memory, told as a number; what is sent is not heard."""
+
+    memory: AbstractMemory
+    sent: int = eqx.field(static=True)
+
+    @property
+    def outputs(self) -> int:
+        """One."""
+        return 1
+
+    @property
+    def inputs(self) -> int:
+        """Length of what is sent."""
+        return self.sent
+
+    def given(self, state: int | float | jax.Array | np.ndarray) -> GainAndNoise:
+        """The number alone."""
+        return known(np.zeros((1, self.sent)), library(state).stack([state]))
+
+
+class OneStepLate(AbstractRandomAffine):
+    """A map of which a step hears what was drawn at the step before; nothing (NaN) at the first."""
+
+    base: AbstractRandomAffine
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map."""
+        return self.base.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the map."""
+        return self.base.inputs
+
+    @property
+    def erases(self) -> bool:
+        """It does, at the first step."""
+        return True
+
+    @property
+    def remembers(self) -> bool:
+        """It does."""
+        return True
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map, and nothing drawn yet."""
+        return self.base.init(key), jnp.full((self.outputs, self.inputs + 1), jnp.nan)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw for the next step."""
+        inner, before = state
+        inner, h = self.base.draw(inner, key)
+        return (inner, h[:-1]), jnp.concatenate([before, h[-1:]])
+
+
 class Faded(AbstractModal):
     """z = (mean + deviation c) A y + n, with c a standard Gaussian that drifts (`Autoregression`).
 
@@ -156,11 +213,14 @@ class JointModes(eqx.Module):
     Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and
     `transition` need not be probabilities. A map that forgets has one mode.
 
-    Shapes: initial (modes,), transition (modes, modes).
+    radius: each transition may be off by this much, differently at each step.
+
+    Shapes: initial (modes,), transition and radius (modes, modes).
     """
 
     initial: Law
     transition: Rows
+    radius: Rows
     maps: tuple[AbstractRandomAffine, ...]
 
     def moments(self, order: int) -> Float[jax.Array | np.ndarray, "modes rows columns"]:
@@ -180,7 +240,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
         ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
     """
     held = memories(channel)
-    each = [_nodes(m, order * _degree(channel, identity), nodes) for identity, m in held.items()]
+    each = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
     total = prod(len(one.initial) for one in each)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
@@ -190,7 +250,8 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(one.states for one in each)))
     for m in maps:
         check_forgets("channel of a filter", m)
-    return JointModes(initial, transition, maps)
+    most = reduce(xp.kron, [one.transition + one.radius for one in each], np.ones((1, 1)))
+    return JointModes(initial, transition, most - transition, maps)
 
 
 def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
@@ -199,16 +260,16 @@ def _nodes(memory: AbstractMemory, degree: int, nodes: int | None) -> Nodes:
     return memory.nodes(degree)
 
 
-def _degree(channel: AbstractRandomAffine, identity: str) -> int:
+def degree_in(channel: AbstractRandomAffine, identity: str) -> int:
     """Degree of H, as a polynomial in the state of a memory: one for each map in series that it fades."""
     match channel:
         case AbstractModal():
             return int(channel.memory.identity == identity)
         case Stack() | Mixture():
-            return max(_degree(part, identity) for part in channel.maps)
+            return max(degree_in(part, identity) for part in channel.maps)
         case Lift():
-            return channel.degree * _degree(channel.base, identity)
+            return channel.degree * degree_in(channel.base, identity)
     parts = jax.tree.leaves(
         channel, is_leaf=lambda item: item is not channel and isinstance(item, AbstractRandomAffine)
     )
-    return sum(_degree(part, identity) for part in parts if isinstance(part, AbstractRandomAffine))
+    return sum(degree_in(part, identity) for part in parts if isinstance(part, AbstractRandomAffine))

@@ -21,3 +21,6 @@ from .statistics import (
 from .sums import (
     error_statistics as error_statistics,
 )
+from .whiteness import (
+    MemoryTest as MemoryTest,
+)

@@ -1,0 +1,198 @@
+"""An upper bound behind chains whose transition probabilities are known only roughly, differently at each step.
+
+With Pi + Delta_k for Pi, |Delta| <= radius, rows that sum to 0: the error before z is F e + (Delta x A~) zeta + w, so
+Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta_i' x A~ Xi A~' for every such chain.
+What depends on the law p of the modes is bounded over the interval in which p can be.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.correction import absent, gain_and_bound
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.modal import Heard, claim_of_modes, heard_over, measure_matrix, move_matrix, padded
+from heliograph.filters.plan import plan
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+
+
+class UncertainBelief(NamedTuple):
+    """Estimate of zeta, a bound on its error's covariance, E[x~ x~'], and between what the modes' probabilities are.
+
+    Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), law, low and high (M,).
+    """
+
+    mean: Float[jax.Array, " N"]
+    covariance: Float[jax.Array, "N N"]
+    second: Float[jax.Array, "n1 n1"]
+    law: Float[jax.Array, " M"]
+    low: Float[jax.Array, " M"]
+    high: Float[jax.Array, " M"]
+    moved: Bool[jax.Array, ""]
+
+
+class UncertainModalFilter(AbstractFilter):
+    """A linear filter whose covariance dominates its error's for every chain within the radius of the given one.
+
+    Source: the filter of Costa (1994) with Young's inequality for what the chain is not known to be.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: Heard | OverTime
+    initial: Float[Array, " M"]
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> UncertainBelief:
+        """The prior, independent of the mode, whose initial law is known."""
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
+        spread, square = padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
+        covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
+        return UncertainBelief(jnp.kron(law, mean), covariance, spread + square, law, law, law, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
+        """Sigma- from above; at the first use the mode has its initial law."""
+        channel = at(self.channel, k)
+        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
+        modes = len(state.law)
+        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
+        radius = jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
+        carried = move @ state.second @ move.T
+        chosen, wandering = _each_row(rows, radius)
+        middle, reach = _middle(state.low, state.high)
+        step = jnp.kron(rows.T, move)
+        known = step @ state.covariance @ step.T
+        apart = jnp.kron(_worst(wandering, middle, reach), carried)
+        low, high = _bounds(rows, radius, state.low, state.high)
+        fresh = jnp.kron(_worst(chosen, middle, reach), carried) + jnp.kron(_worst_diagonal(low, high), noise)
+        young = jnp.sqrt(_ratio(jnp.trace(apart), jnp.trace(known)))
+        extra = jnp.where(young > 0, apart + apart / jnp.where(young > 0, young, 1.0), 0.0)
+        covariance = symmetrize((1 + young) * known + extra + fresh)
+        after = carried + noise
+        return UncertainBelief(step @ state.mean, covariance, after, state.law @ rows, low, high, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
+        """Use what arrived of z; the covariance of z given zeta is bounded over the laws of the modes."""
+        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        mean, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
+        heard, present = jnp.concatenate(list(mean @ measure), axis=1), ~jnp.isnan(z)
+        second = measure @ state.second @ measure.T + noise
+        each = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + mean @ noise @ mean.swapaxes(1, 2)
+        cross, expected = heard @ state.covariance, heard @ state.mean
+        total = cross @ heard.T + _worst(each, *_middle(state.low, state.high))
+        both = present[:, None] & present
+        gain, covariance = gain_and_bound(
+            state.covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
+        )
+        after = state.mean + gain @ jnp.where(present, z - expected, 0.0)
+        return state._replace(mean=after, covariance=covariance), gaussian_innovation(z, expected, total)
+
+    @in_float64
+    def estimate(self, state: UncertainBelief) -> Estimate:
+        """x = sum_j zeta^j."""
+        want = self._want()
+        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs, np.asarray(self._want()))
+
+    def _want(self) -> Float[Array, "n N"]:
+        n = len(self.states)
+        return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
+
+
+def _ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
+    return jnp.where(whole > 0, part / jnp.where(whole > 0, whole, 1.0), 0.0)
+
+
+def _each_row(rows: jax.Array, radius: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """For each mode i, above Cov(1{next} | i) and above Delta_i Delta_i', for every Delta_i.
+
+    Cov = sum_j (pi_j + Delta_j)(e_j - pi)(e_j - pi)' - Delta Delta'; and Delta Delta' <= P diag(r_j sum r) P, with P
+    what is left without the mean, since Delta = P Delta and |Delta_j Delta_l| <= r_j r_l.
+    """
+    modes = len(rows)
+    apart = jnp.eye(modes)[None] - rows[:, None, :]  # [i, j] = e_j - pi_i
+    chosen = jnp.einsum("ij,ija,ijb->iab", rows + radius, apart, apart)
+    centred = jnp.eye(modes) - 1 / modes
+    sizes = radius * jnp.sum(radius, axis=1, keepdims=True)
+    return chosen, jnp.einsum("aj,ij,jb->iab", centred, sizes, centred)
+
+
+def _middle(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A law between the ends (its sum is 1), and how far from it a law there can be."""
+    middle = (low + high) / 2
+    middle = middle + (1 - jnp.sum(middle)) / len(low)
+    return middle, jnp.maximum(high - middle, middle - low)
+
+
+def _worst(each: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
+    """Above sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
+    values, vectors = jnp.linalg.eigh(each - jnp.mean(each, axis=0))
+    sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
+    return jnp.einsum("i,iab->ab", middle, each) + jnp.einsum("i,iab->ab", reach, sizes)
+
+
+def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
+    """Above diag(p) for all laws p, and little above it in the direction of x, which is that of equal entries.
+
+    delta = p - middle sums to 0, so with u = (1, ..., 1) / root M and P = I - u u':
+    diag(delta) = P diag(delta) P + u d' + d u' with d = delta / root M, and u d' + d u' <= e u u' + d d' / e.
+    P diag(delta) P is 0 for two modes.
+    """
+    modes, (middle, reach) = len(low), _middle(low, high)
+    centred, total = jnp.eye(modes) - 1 / modes, jnp.sum(reach)
+    share = total / modes / 2
+    safe = jnp.where(share > 0, share, 1.0)
+    across = centred @ jnp.diag(reach * total) @ centred / (safe * modes)
+    within = centred @ jnp.diag(reach) @ centred if modes > 2 else jnp.zeros((modes, modes))
+    return jnp.diag(middle) + share / modes * jnp.ones((modes, modes)) + across + within
+
+
+def _bounds(rows: jax.Array, radius: jax.Array, low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Ends of every mode's next probability, over the laws between `low` and `high`."""
+    least, most = jnp.clip(rows - radius, 0.0, 1.0), jnp.clip(rows + radius, 0.0, 1.0)
+    return -jax.vmap(_largest, (1, None, None))(-least, low, high), jax.vmap(_largest, (1, None, None))(most, low, high)
+
+
+def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
+    """max p payoff over low <= p <= high, sum p = 1: what is left goes to the largest payoffs first."""
+    order = jnp.argsort(-payoff)
+    room = (high - low)[order]
+    before = jnp.cumsum(room) - room
+    given = jnp.clip(1 - jnp.sum(low) - before, 0.0, room)
+    return low @ payoff + given @ payoff[order]
+
+
+def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
+    """A linear filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
+    start, (initial, described) = first(plant), heard_over(channel)
+    return UncertainModalFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        initial=initial,
+        claim="upper" if claim_of_modes(channel) == "exact" else "nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )

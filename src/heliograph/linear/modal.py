@@ -1,0 +1,91 @@
+"""A state that moves and is heard through maps that remember, both by the same modes, as one linear system."""
+
+import numpy as np
+
+from heliograph.linear.lift import each_step
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.numerics.check import array, covariance, fail
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.base import memories
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.modes import joint_modes
+from heliograph.random_affine.second_moments import symmetric_product
+from heliograph.random_affine.told import second_moments
+
+Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
+
+
+def modal_system(
+    move: Channel,
+    measure: Channel,
+    initial_mean: ArrayLike,
+    initial_covariance: ArrayLike,
+    horizon: int,
+    want: ArrayLike | None = None,
+) -> LinearSystem:
+    """The system of y 1{mode} for a state y+ = `move`(y), heard as z = `measure`(y+), both random affine maps.
+
+    A plant that depends on a mode is a `move` with modes; a relay that filters what it hears in a shadow is a `move` of
+    (x, its estimate), and the receiver in the same shadow a `measure` that holds the same chain. With H_j the move in
+    mode j, F[j, i] = Pi[i, j] E H_j and Cov(w)[j, l] = sum_i Pi_ij (delta_jl - Pi_il) E H_j E_i E H_l' + delta_jl
+    sum_i Pi_ij Spread_j(E_i), E_i = E[y~ y~' 1{i}]. The two maps of a step are independent given its modes. `want`
+    reads what is to be known off y, all of it unless given. `LinearSystemFilter` filters it, exactly.
+
+    Shapes: initial_mean (n,), initial_covariance (n, n), want (q, n).
+
+    Raises:
+        ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
+            closed), fewer steps than the horizon.
+    """
+    n = first(move).inputs
+    sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
+    for name, size in sizes.items():
+        if size != n:
+            raise fail(name, f"{n}, the move's inputs", size)
+    if not all(isinstance(m, MarkovChain) for m in memories(move).values()):
+        raise fail("move", "chains as its memories", "a gain that drifts")
+    mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
+    spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
+    read = np.eye(n) if want is None else array("what is to be known", want, (None, n))
+    pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
+    steps = [joint_modes(Stack(pair)) for pair in pairs]
+    law, rows = np.asarray(steps[0].initial), np.eye(len(steps[0].initial))
+    moments = law[:, None, None] * (np.outer(mean, mean) + spread)
+    start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
+    parts = []
+    for one in steps:
+        maps = [m.maps for m in one.maps if isinstance(m, Stack)]
+        moved, heard = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+        transition, process, moments = _moved(moved, rows, moments)
+        noise = np.einsum("jabcd,jcd->ab", heard[1], moments)
+        output = np.concatenate(list(heard[0]), axis=1)
+        parts.append((transition, np.zeros(len(transition)), process, output, np.zeros(len(output)), noise))
+        rows = np.asarray(one.transition)
+    whole = np.tile(np.pad(read, ((0, 0), (0, 1))), (1, len(law)))
+    return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), np.kron(law, mean), start, whole)
+
+
+def _by_mode(each: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
+    mean = np.array([first_order for first_order, _ in each])
+    second = np.array([second_order for _, second_order in each])
+    return mean, second - np.array([symmetric_product(m, m) for m in mean])
+
+
+def _moved(
+    moved: Moments, rows: np.ndarray, moments: np.ndarray
+) -> tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"], Float[np.ndarray, "M n1 n1"]]:
+    """F, Cov(w) and E[y~+ y~+' 1{j}]."""
+    mean, spread = moved
+    modes, size = len(moments), moments.shape[-1]
+    whole = np.concatenate([mean, np.tile(np.eye(1, size, size - 1), (modes, 1, 1))], axis=1)
+    before = np.einsum("ij,iab->jab", rows, moments)
+    added = np.pad(np.einsum("jabcd,jcd->jab", spread, before), ((0, 0), (0, 1), (0, 1)))
+    chosen = rows[:, :, None] * (np.eye(modes)[None] - rows[:, None, :])
+    apart = np.einsum("ijl,jac,icd,lbd->jalb", chosen, whole, moments, whole)
+    apart[np.arange(modes), :, np.arange(modes), :] += added
+    transition = np.einsum("ij,jab->jaib", rows, whole).reshape(modes * size, modes * size)
+    after = whole @ before @ whole.swapaxes(1, 2) + added
+    return transition, apart.reshape(modes * size, modes * size), after

@@ -1,0 +1,159 @@
+"""Filters that are told something of the modes: limits, all paths of the modes, and simulation."""
+
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from tests.filters.test_modal import BURSTS, PLANT, SENSOR, bursts
+
+told_filter, late_filter = hg.filters.told_filter, hg.filters.mode_late_filter
+known_filter = hg.filters.mode_known_filter
+ARRIVAL = [0.5, 0.95]
+LOSSY = hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in zip((0.2, 1.0), ARRIVAL, strict=True)], BURSTS)
+CLASSES = np.array([[0.7, 0.2, 0.1], [0.1, 0.3, 0.6]])  # P(flag | mode)
+Z = np.random.default_rng(1).normal(size=(8, 1))
+
+
+def claims(item, data):
+    state, found = item.init(), []
+    for k, z in enumerate(data):
+        state = item.predict(state, (), k)
+        state, _ = item.correct(state, z, k)
+        estimate = item.estimate(state)
+        found.append([estimate.mean[0], estimate.covariance[0, 0]])
+    return np.array(found)
+
+
+def test_arrival_that_is_certain_tells_nothing():
+    certain = hg.markov_fading([hg.erasure(hg.hop(g, 0.05), 1.0) for g in (0.2, 1.0)], BURSTS)
+    expected = claims(hg.linear_filter(PLANT, SENSOR, bursts()), Z)
+    for channel in (certain, bursts()):
+        np.testing.assert_allclose(claims(told_filter(PLANT, SENSOR, channel), Z), expected, rtol=1e-11)
+
+
+def test_flags_that_tell_nothing_change_nothing():
+    data = np.column_stack([Z, np.arange(8) % 3])
+    found = claims(told_filter(PLANT, SENSOR, bursts(), [CLASSES[0]] * 2), data)
+    np.testing.assert_allclose(found, claims(hg.linear_filter(PLANT, SENSOR, bursts()), Z), rtol=1e-11)
+
+
+def test_flags_that_reveal_the_mode_make_it_the_kalman_filter_given_the_modes():
+    modes = np.array([0, 0, 1, 1, 0, 1, 1, 0])
+    given = hg.over_time([hg.hop((0.2, 1.0)[i], 0.05) for i in modes])
+    found = claims(told_filter(PLANT, SENSOR, bursts(), np.eye(2)), np.column_stack([Z, modes]))
+    expected = claims(hg.linear_filter(PLANT, SENSOR, given), Z)
+    np.testing.assert_allclose(found, expected, rtol=1e-11)
+    known = claims(known_filter(PLANT, SENSOR, bursts()), np.column_stack([Z, modes]))
+    np.testing.assert_allclose(known, expected, rtol=1e-12)
+
+
+DRIFTS = hg.amplify_and_forward([hg.autoregressive_fading(m, 0.4, r, 0.05) for m, r in ((1.0, 0.95), (0.8, 0.9))])
+
+
+def test_a_drift_that_is_known():
+    """Given (c_1, c_2) at each step it is the filter of the known gains."""
+    told = np.random.default_rng(3).normal(size=(8, 2))
+    hops = [[hg.hop(m + 0.4 * c, 0.05) for m, c in zip((1.0, 0.8), row, strict=True)] for row in told]
+    given = hg.over_time([hg.amplify_and_forward(row) for row in hops])
+    found = claims(known_filter(PLANT, SENSOR, DRIFTS), np.column_stack([Z, told]))
+    np.testing.assert_allclose(found, claims(hg.linear_filter(PLANT, SENSOR, given), Z), rtol=1e-12)
+
+
+def gains_by_hand(item, flags):
+    """Gains and predictions of a filter for one pattern of flags, read off at unit measurements."""
+    base = claims(item, np.column_stack([np.zeros(len(flags)), flags]))[:, 0]
+    return base, [claims(item, np.column_stack([unit, flags]))[:, 0] - base for unit in np.eye(len(flags))]
+
+
+@pytest.mark.parametrize("flags", [[0, 2, 1, 0], [2, 2, 0, 1]])
+def test_its_covariance_is_its_error_over_all_paths_given_the_flags(flags):
+    """E[(x_k - xhat_k)^2 | flags] of the gains that it uses, from all 16 paths weighed by the flags' probabilities."""
+    steps, a, q, noise = len(flags), 0.98, 0.04, 0.05
+    item = told_filter(PLANT, SENSOR, bursts(), CLASSES)
+    base, columns = gains_by_hand(item, flags)
+    claimed = claims(item, np.column_stack([np.zeros(steps), flags]))[:, 1]
+    cov = np.array([[a ** abs(i - j) for j in range(steps)] for i in range(steps)]) * q / (1 - a**2)
+    law = np.array([0.375, 0.625])
+    for k in range(steps):  # given the flags up to step k
+        weight, zz, xz = 0.0, 0.0, 0.0
+        for path in product(range(2), repeat=k + 1):
+            p = law[path[0]] * np.prod([BURSTS[i][j] for i, j in pairwise(path)])
+            p *= np.prod([CLASSES[i, flags[m]] for m, i in enumerate(path)])
+            g = np.array([(0.2, 1.0)[i] for i in path])
+            second = np.outer(g, g) * (cov[: k + 1, : k + 1] + 0.05 * np.eye(k + 1)) + noise * np.eye(k + 1)
+            weight, zz, xz = weight + p, zz + p * second, xz + p * g * cov[k, : k + 1]
+        gain = np.array([columns[m][k] for m in range(k + 1)])
+        error = cov[k, k] + (gain @ zz @ gain - 2 * gain @ xz) / weight
+        assert base[k] == pytest.approx(0, abs=1e-12)
+        assert claimed[k] == pytest.approx(error, rel=1e-10)
+
+
+@pytest.mark.parametrize(
+    ("world", "item", "known"),
+    [
+        (LOSSY, hg.linear_filter(PLANT, SENSOR, LOSSY), 0.1646),
+        (hg.model.with_flag(bursts()), told_filter(PLANT, SENSOR, bursts(), np.eye(2)), 0.0935),
+        (hg.model.with_flag(bursts(), CLASSES), told_filter(PLANT, SENSOR, bursts(), CLASSES), None),
+        (hg.model.with_flag(bursts(), late=True), late_filter(PLANT, SENSOR, bursts()), 0.0987),
+        (hg.model.with_flag(bursts()), known_filter(PLANT, SENSOR, bursts()), 0.0935),
+        (hg.model.with_flag(DRIFTS, late=True), late_filter(PLANT, SENSOR, DRIFTS), None),
+    ],
+    ids=["losses", "mode by flag", "flags", "mode one step late", "mode now", "drifts one step late"],
+)
+def test_claims_hold_in_simulation(world, item, known):
+    """Mean claim and mean square error over steps 60-99 agree within four standard errors over runs."""
+    record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, world, {"f": item})}), 100, 600, 2)
+    squares = record.errors("node", "f")[:, 60:, 0] ** 2
+    claimed = record.estimates["node"]["f"].covariance[:, 60:, 0, 0]
+    apart = (squares - claimed).mean(axis=1)
+    assert item.claim == "exact"
+    assert abs(apart.mean()) < 4 * apart.std() / np.sqrt(600)
+    assert known is None or claimed.mean() == pytest.approx(known, abs=5 * claimed.mean(axis=1).std() / np.sqrt(600))
+
+
+def test_two_lossy_links_in_one_shadow_keep_their_own_patterns():
+    chain = hg.MarkovChain(BURSTS)
+    links = [
+        hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in ((0.2, 0.4), (1.0, p))], chain) for p in (0.9, 0.8)
+    ]
+    both = hg.parallel(links)
+    two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
+    item = hg.linear_filter(PLANT, two, both)
+    record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(two, both, {"f": item})}), 60, 600, 4)
+    apart = record.errors("node", "f")[:, 30:, 0] ** 2 - record.estimates["node"]["f"].covariance[:, 30:, 0, 0]
+    assert abs(apart.mean()) < 4 * apart.mean(axis=1).std() / np.sqrt(600)
+
+
+@pytest.mark.parametrize(
+    "item",
+    [
+        told_filter(PLANT, SENSOR, bursts(), CLASSES),
+        hg.linear_filter(PLANT, SENSOR, LOSSY),
+        late_filter(PLANT, SENSOR, bursts()),
+        known_filter(PLANT, SENSOR, DRIFTS),
+    ],
+    ids=["flags", "losses", "late", "known"],
+)
+def test_they_keep_the_contract_of_filters(item):
+    hg.testing.check_filter(item)
+
+
+BAD_INPUT = {
+    "flags of a mode": (
+        lambda: told_filter(PLANT, SENSOR, bursts(), [[0.5, 0.4], [0, 1]]), "flags in mode 0: expected"
+    ),
+    "too few modes": (lambda: told_filter(PLANT, SENSOR, bursts(), [[1.0]]), "flags: expected shape"),
+    "no chain": (lambda: hg.model.with_flag(hg.hop(1.0, 0.1)), "chain: expected one that the flag tells of"),
+    "update": (
+        lambda: hg.linear_filter(PLANT, SENSOR, bursts(), hg.filters.Polytope()), "update: expected none behind"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD_INPUT)
+def test_bad_input_gets_one_clear_line(name):
+    make, words = BAD_INPUT[name]
+    with pytest.raises(ValueError, match=f"^{words}"):
+        make()
