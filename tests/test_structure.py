@@ -17,7 +17,7 @@ ORDER = [
     ["numerics"],
     ["random_affine"],
     ["model"],
-    ["filters.base", "filters.transform", "filters.correction", "filters.update"],
+    ["filters.base", "filters.transform", "filters.scalars", "filters.correction", "filters.update"],
     ["linear", "relays", "h_infinity"],
     ["filters"],
     ["fusion"],
