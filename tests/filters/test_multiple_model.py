@@ -208,6 +208,32 @@ def test_a_mode_that_losses_reveal_is_known():
         np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
+@pytest.mark.parametrize("build", ALL)
+def test_what_varies_in_time_is_followed(build):
+    """Equal maps, a plant and a sensor that vary: the linear filter."""
+    plants = hg.over_time([hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5, -0.7)])
+    sensors = hg.over_time([hg.LinearSensor([[c]], 0.1) for c in (1.0, 2.0, 0.5)])
+    same = hg.markov_fading([hg.hop(0.8, 0.1), hg.hop(0.8, 0.1)], CHAIN)
+    found, _ = stepped(build(plants, sensors, same), DATA[:3])
+    expected, _ = stepped(hg.linear_filter(plants, sensors, hg.hop(0.8, 0.1)), DATA[:3])
+    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
+    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+
+
+def test_they_run_in_single_precision():
+    filters = {build.__name__: build(PLANT, SENSOR, LINK) for build in (FILTERS[1], FILTERS[2])}
+    filters["particles"] = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, filters)})
+    for estimate in hg.monte_carlo(network, 20, 32, 0, precision="float32").estimates["node"].values():
+        assert np.all(np.isfinite(estimate.mean)) and np.all(estimate.covariance > 0)
+
+
+def test_a_certain_output_is_no_density():
+    with pytest.raises(ValueError, match="filter of modes: expected outputs that are random in every mode"):
+        hg.filters.imm_filter(PLANT, SENSOR, hg.gilbert_elliott(hg.perfect(), hg.model.silent(), 0.1, 0.5))
+    hg.filters.imm_filter(PLANT, SENSOR, hg.gilbert_elliott(hg.perfect(), hg.model.silent(noise=0.1), 0.1, 0.5))
+
+
 def test_a_count_of_particles_is_positive():
     with pytest.raises(ValueError, match="particles: expected a positive whole number, got 0"):
         hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=0)

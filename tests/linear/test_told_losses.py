@@ -141,6 +141,19 @@ def test_modes_that_tell_the_same_share_their_gain():
     assert np.mean(found) < bound(system)[0, 0]
 
 
+def test_a_mode_that_is_left_for_good_has_its_gain_too():
+    """It starts where z = x arrives and ends where z = 2 x does: while it is there, a gain of 0 would let P grow."""
+    a, c, q, r = (np.asarray(each) for each in SCALAR)
+    chain = np.array([[0.9, 0.1], [0.0, 1.0]])
+    law = long_run_law(np.array([1.0, 0.0]), chain)
+    np.testing.assert_allclose(law, (0, 1), atol=1e-15)
+    system = ToldSystem(a, q, chain, law, np.array([0, 1]), (c, 2 * c), (r, r))
+    gains = find_gains(system)
+    assert certified_radius(system, gains) < 1
+    always = ToldSystem(a, q, np.ones((1, 1)), np.ones(1), np.array([0]), (2 * c,), (r,))
+    np.testing.assert_allclose(bound(system), bound(always), rtol=1e-9)
+
+
 def test_size_is_refused_with_the_number():
     chain = np.full((40, 40), 1 / 40) + np.eye(40) * 0
     chain[0] = np.eye(40)[0]
@@ -149,7 +162,7 @@ def test_size_is_refused_with_the_number():
         np.eye(n), np.eye(n), chain, chain[1], np.zeros(40, dtype=int), (np.zeros((0, n)),), (np.zeros((0, 0)),) * 40
     )
     with pytest.raises(
-        ValueError, match="boundedness: expected at most 4096 entries of covariances over all modes, got 4840"
+        ValueError, match="boundedness: expected at most 1024 entries of covariances over all modes, got 4840"
     ):
         find_gains(system)
 

@@ -23,6 +23,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -188,12 +189,24 @@ def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], To
     """The law of the modes at the first use, and the channel by mode and by what arrives, at each step if it varies.
 
     Raises:
-        ValueError: too many modes, maps whose moments are not known.
+        ValueError: too many modes, maps whose moments are not known, a mode whose output is certain beside others: a
+            probability cannot be weighed against densities.
     """
     steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     no_flags = np.ones((len(steps[0].initial), 1))
     parts = [by_pattern(one, before, no_flags) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    for part in parts if len(no_flags) > 1 else []:
+        _check_random(part)
     return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
+
+
+def _check_random(told: Told) -> None:
+    """Every combination of mode and pattern gives z a density, for an x that has one."""
+    for j, a in np.argwhere(np.asarray(told.chance) > 0):
+        rows, gain = np.flatnonzero(told.present[a]), np.asarray(told.mean[j, a])[:, :-1]
+        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(told.spread[j, a])))[np.ix_(rows, rows)]
+        if np.linalg.matrix_rank(random) < len(rows):
+            raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 
 
 def _build(
@@ -238,7 +251,7 @@ def imm_filter(
     Claim: "nominal". It tends to claim too little where modes are hard to tell for many steps.
 
     Raises:
-        ValueError: parts that do not fit, more modes than can be listed.
+        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain beside others.
     Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
     """
     return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)

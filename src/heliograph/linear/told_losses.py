@@ -15,7 +15,8 @@ ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did
 SETTLED = 1e-13  # relative change of the gains from step to step
 ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
 NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
-SIZE_LIMIT = 4096  # rows of the operator that acts on all entries of all covariances
+SEEN = 1e-6  # share that a mode counts with in the search for gains, if it is left for good sooner or later
+SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
 
 KindGains = tuple[Float[np.ndarray, "n _"], ...]
 Parts = Float[np.ndarray, "modes n n"]
@@ -129,6 +130,7 @@ def find_gains(system: ToldSystem) -> KindGains:
 
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
+    system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
     parts = system.law[:, None, None] * (system.process + np.eye(len(system.transition)) * np.trace(system.process))
     noise, gains = 1.0, _improved(system, parts, 1.0)
     for _ in range(ITERATIONS):

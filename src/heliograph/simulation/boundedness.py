@@ -38,8 +38,9 @@ class Boundedness(NamedTuple):
 
     "certified": bounded, since `radius` < 1, the spectral radius of E[e e'] -> E[e+ e+'] under fixed `gains`
     {what arrived: K (n, received)} of xhat+ = A xhat + K (z - what is expected), one for each set of losses.
-    "impossible": without bound for every filter, since `growth` >= 1: an eigenvector of the plant grows by that, in
-    the mean of its square over one step, while the links do not show it. "undecided": neither.
+    "impossible": without bound for every filter that is linear in what arrives, since `growth` >= 1: an eigenvector of
+    the plant grows by that, in the mean of its square over one step, while the links do not show it. "undecided":
+    neither.
 
     `bound` (n, n): E P is at most this after long; None where it is not certified or no such matrix is at hand.
     """
@@ -69,7 +70,8 @@ def certify_boundedness(network: Network) -> Boundedness:
     Certified: rho of U_j -> sum_i chain[i, j] (A - K_i C_i) U_i (A - K_i C_i)' is below 1 for some gains, which are
     searched and then judged as if they were anybody's. Only rows of certain gain are used: a gain that is random and
     not told makes noise that grows with the state, so an unstable mode seen through such gains alone is impossible.
-    Impossible: rho(chain within the modes that do not show an eigenvector) |eigenvalue|^2 >= 1.
+    Impossible: rho(chain within the modes that do not show an eigenvector) |eigenvalue|^2 >= 1. Where losses alone are
+    random, and noises Gaussian, that is true of every filter; a filter that is not linear may learn a hidden mode.
 
     Raises:
         ValueError: a plant, sensor or channel that varies or is not linear, relays that filter, too many sets of
