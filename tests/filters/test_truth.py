@@ -104,6 +104,16 @@ def test_claims_of_filters_that_assume_no_memory():
     assert hg.linear_filter(PLANT, SENSOR, bursts()).claim == "exact"
 
 
+def test_of_a_channel_that_varies_each_step_keeps_its_law():
+    """Without memory the modes have at step k the law that they have there with it: the first step is the same."""
+    with_it = hg.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)])
+    item = memoryless(PLANT, SENSOR, with_it)
+    found, alone = (true_error(item, PLANT, SENSOR, c, 4) for c in (with_it, without_memory(with_it)))
+    np.testing.assert_allclose(alone.true, alone.claimed, rtol=1e-12)
+    np.testing.assert_allclose(found.true[0], found.claimed[0], rtol=1e-12)
+    assert found.true[-1, 0, 0] > 1.01 * found.claimed[-1, 0, 0]
+
+
 def test_a_start_that_is_not_stationary_is_no_claim_of_the_long_run():
     late = Modes(hg.MarkovChain(BURSTS, [1.0, 0.0]), [hg.hop(1.0, 0.05), hg.hop(1.0, 0.5)])
     assert memory_matters(late) and hg.cubature_filter(PLANT, SENSOR, late).claim == "nominal"
