@@ -24,7 +24,7 @@ def filters() -> dict[str, hg.AbstractFilter]:
     sensor = hg.LinearSensor([[1.0, 0.0, 0.5, 0.0]], 0.05)
     channel = hg.gilbert_elliott(hg.hop(1.0, 0.05), hg.hop(0.2, 0.05), fail=0.03, recover=0.05)
     items = {
-        "no memory": hg.linear_filter(plant, sensor, hg.model.without_memory(channel)),
+        "no memory": hg.filters.memoryless_filter(plant, sensor, channel),
         "two modes": hg.linear_filter(plant, sensor, channel),
     }
     return {name: item.planned(np.zeros((STEPS, 0))) for name, item in items.items()}

@@ -148,6 +148,11 @@ DRIFTING = {  # gains' correlations, channel, the channel for c
         lambda f: hg.with_direct_link(hg.amplify_and_forward([f(0), f(1)]), RELAY),
         lambda g, c: Stack([Series([g(c[0]), g(c[1])]), RELAY]),
     ),
+    "three hops": (
+        [0.9, 0.5, 0.7],
+        lambda f: hg.amplify_and_forward([f(0), f(1), f(2)]),
+        lambda g, c: Series([g(c[0]), g(c[1]), g(c[2])]),
+    ),
     "two hops that drift together": (
         [0.8],
         lambda f: hg.amplify_and_forward([f(0), RELAY, f(0)]),

@@ -13,7 +13,7 @@ HOPS = [hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95)
 
 
 def memoryless(plant, sensor, channel):
-    return hg.linear_filter(plant, sensor, without_memory(channel))
+    return hg.filters.memoryless_filter(plant, sensor, channel)
 
 
 def test_the_filter_without_memory_claims_less_than_half_of_its_error():
@@ -81,9 +81,18 @@ ONE_MEAN = Modes(hg.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(hg.Discrete(
 def test_a_claim_is_lowered_where_memory_matters_and_only_there(channel, matters):
     """Cov(Hbar_k, Hbar_(k+t)) = 0 for all t: noise may be louder in bursts, and the claim is the truth still."""
     assert memory_matters(channel) == matters
+    assert memoryless(PLANT, SENSOR, channel).claim == ("nominal" if matters else "exact")
     if not isinstance(channel, hg.model.OverTime):
         found = true_error(memoryless(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 30)
         assert np.allclose(found.claimed, found.true, rtol=1e-12) != matters
+
+
+def test_in_a_world_without_memory_the_claim_is_the_truth():
+    world = without_memory(bursts())
+    item = hg.linear_filter(PLANT, SENSOR, world)
+    found = true_error(item, PLANT, SENSOR, world, 30)
+    assert item.claim == "exact"
+    np.testing.assert_allclose(found.claimed, found.true, rtol=1e-12)
 
 
 def test_claims_of_filters_that_assume_no_memory():
@@ -93,6 +102,16 @@ def test_claims_of_filters_that_assume_no_memory():
     assert hg.mean_gain_filter(PLANT, SENSOR, bursts()).claim == "nominal"
     assert hg.cubature_filter(PLANT, SENSOR, NOISE_ONLY).claim == "exact"
     assert hg.linear_filter(PLANT, SENSOR, bursts()).claim == "exact"
+
+
+def test_of_a_channel_that_varies_each_step_keeps_its_law():
+    """Without memory the modes have at step k the law that they have there with it: the first step is the same."""
+    with_it = hg.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)])
+    item = memoryless(PLANT, SENSOR, with_it)
+    found, alone = (true_error(item, PLANT, SENSOR, c, 4) for c in (with_it, without_memory(with_it)))
+    np.testing.assert_allclose(alone.true, alone.claimed, rtol=1e-12)
+    np.testing.assert_allclose(found.true[0], found.claimed[0], rtol=1e-12)
+    assert found.true[-1, 0, 0] > 1.01 * found.claimed[-1, 0, 0]
 
 
 def test_a_start_that_is_not_stationary_is_no_claim_of_the_long_run():

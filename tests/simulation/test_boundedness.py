@@ -167,6 +167,9 @@ def test_what_nothing_disturbs_may_stay_at_rest():
     still = hg.LinearPlant([[1.2]], 0.0, [1.0], 0.0)
     found = judged(still, (hg.LinearSensor([[1.0]], 1.0), lossy(0.1)))
     assert found.verdict == "undecided" and "may stay zero" in found.reason
+    seen = judged(still, (hg.LinearSensor([[1.0]], 1.0), lossy(0.9)))
+    assert seen.verdict == "certified"
+    np.testing.assert_allclose(seen.gains[True,], 1.2 - 1 / 1.2, atol=0.05)  # that of no losses leaves 1 / a
     begun = hg.LinearPlant([[1.2]], 0.0, [1.0], 1.0)
     assert judged(begun, (hg.LinearSensor([[1.0]], 1.0), lossy(0.1))).verdict == "impossible"
 

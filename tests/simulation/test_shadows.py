@@ -50,6 +50,15 @@ def test_hops_of_one_channel_share_with_another_node():
     np.testing.assert_allclose(heard["two hops"], heard["one"] ** 2, rtol=1e-12)
 
 
+def test_hops_of_relays_share_too_in_every_slot():
+    """A named chain moves on at every step, and draws the same as anywhere else."""
+    plant = hg.LinearPlant([[1.0]], [[0.0]], [1.0], [[0.0]])
+    slots = [{"receiver": {"sensor": link(name="road")}}, {"receiver": {"sensor": link(name="road")}}]
+    relays = hg.model.RelayNetwork(plant, SENSOR, (), slots)
+    record = hg.monte_carlo(hg.Network.of_relays(relays, {}, {}), 30, 64, 7)
+    np.testing.assert_allclose(record.measurements["receiver"][..., 0], gains({"a": link(name="road")})["a"])
+
+
 def test_a_chain_that_varies_moves_by_the_step():
     """It switches surely at odd steps and stays at even ones."""
     stay, switch = np.eye(2), np.eye(2)[::-1]

@@ -18,6 +18,9 @@ from .h_infinity import (
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
+from .linear import (
+    memoryless_filter as memoryless_filter,
+)
 from .multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,

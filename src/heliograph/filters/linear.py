@@ -1,5 +1,6 @@
 """The best linear filter behind a random channel, and the filter that hears nothing."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from heliograph.filters.uncertain import UncertainModalFilter, uncertain_modal_f
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.fading import uncertain_chain
+from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, is_linear
@@ -178,6 +179,23 @@ def linear_filter(
         inputs=start.inputs,
         received=first(channel).outputs,
     )
+
+
+def memoryless_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
+) -> LinearFilter:
+    """The best linear filter for links that draw anew at each step, behind links that may remember.
+
+    Claim: as `linear_filter` of links that forget, lowered to "nominal" where memory matters (`memory_matters`);
+    `true_error` says before any data by how much it is wrong then.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, parts that do not fit, losses.
+    Source: De Koning (1984), for multiplicative noise that is independent over time.
+    """
+    item = linear_filter(plant, sensor, without_memory(channel), update)
+    assert isinstance(item, LinearFilter)  # what does not remember has no other
+    return replace(item, claim="nominal") if memory_matters(channel) else item
 
 
 class OpenLoop(AbstractFilter):

@@ -131,13 +131,14 @@ def find_gains(system: ToldSystem) -> KindGains:
     Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
     """
     system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
-    parts = system.law[:, None, None] * (system.process + np.eye(len(system.transition)) * np.trace(system.process))
+    size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
+    parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
     noise, gains = 1.0, _improved(system, parts, 1.0)
     for _ in range(ITERATIONS):
         parts = system.moved(gains, parts, noise * system.source(gains))
-        size = np.trace(parts.sum(axis=0))
-        if size > NEGLIGIBLE * max(np.trace(system.process), 1e-300):
-            parts, noise = parts / size, noise / size
+        grown = np.trace(parts.sum(axis=0)) / size
+        if grown > NEGLIGIBLE:
+            parts, noise = parts / grown, noise / grown
         before, gains = gains, _improved(system, parts, noise)
         if _change(before, gains) < SETTLED:
             break

@@ -81,7 +81,7 @@ def _scores(
     """Every filter of one example."""
     own = (plant, sensor, channel)
     linear = {
-        "memoryless": hg.linear_filter(plant, sensor, hg.model.without_memory(channel)),
+        "memoryless": hg.filters.memoryless_filter(plant, sensor, channel),
         "exact": hg.linear_filter(*own),
     }
     weighing = {
@@ -145,7 +145,7 @@ def _told(seed: int) -> dict[str, Score]:
 
 
 def _memoryless_truth(channel: hg.AbstractRandomAffine) -> hg.filters.TrueError:
-    item = hg.linear_filter(PLANT, SENSOR, hg.model.without_memory(channel))
+    item = hg.filters.memoryless_filter(PLANT, SENSOR, channel)
     return hg.filters.true_error(item, PLANT, SENSOR, channel, LONG)
 
 
@@ -166,6 +166,6 @@ def _shadow() -> dict[str, float]:
 
 def _found(seed: int) -> hg.simulation.MemoryTest:
     """What one recording of 10,000 steps tells the filter without memory."""
-    item = hg.linear_filter(PLANT, SENSOR, hg.model.without_memory(bursts()))
+    item = hg.filters.memoryless_filter(PLANT, SENSOR, bursts())
     record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, bursts(), {"it": item})}), 10_000, 1, seed)
     return hg.memory_test(record.measurements["node"][0], item)
