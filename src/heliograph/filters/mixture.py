@@ -136,7 +136,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    floor, start = float(scalar("resolution", resolution, 0.0)) ** 2, first(plant)
+    floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if not isinstance(sensor, OverTime) and not isinstance(channel, OverTime):
         components: Components | OverTime = _components(sensor, channel, floor)
     else:
