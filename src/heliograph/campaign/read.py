@@ -9,7 +9,7 @@ from itertools import product
 from pathlib import Path
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
-from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.check import check_count, check_seed, fail, file_path
 from heliograph.simulation.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
@@ -34,7 +34,7 @@ def load_campaign(path: str | Path) -> Campaign:
         ValueError: no such file, no TOML, an unknown or missing key, a value that is none, settings that the
             network's function does not take.
     """
-    path = Path(path)
+    path = file_path("campaign", path)
     if not path.is_file():
         raise fail(f"campaign {path}", "a TOML file", "a folder" if path.is_dir() else "nothing of that name")
     try:

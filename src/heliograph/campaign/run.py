@@ -25,7 +25,7 @@ from heliograph.campaign.work import Job, Reply
 from heliograph.files.holding import only_here
 from heliograph.files.output_folder import check_replaceable, clear_left
 from heliograph.files.table import check_output_folder
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, fail, file_path, instance
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]
@@ -66,7 +66,8 @@ def run_campaign(
             the address, or one that dies: what it has done is there.
         ModuleNotFoundError: an extra, `sweep` or `cluster`, is not installed.
     """
-    out, tell = Path(out), tell or (lambda what, done, total: None)
+    instance("campaign", campaign, Campaign, "one from load_campaign")
+    out, tell = file_path("results folder", out), tell or (lambda what, done, total: None)
     check_output_folder(out)
     with only_here(out) as alone:
         if not alone:

@@ -12,7 +12,7 @@ from heliograph.campaign.plan import Campaign
 from heliograph.campaign.store import CLAIM, STORE, done_chunks, stored_labels
 from heliograph.files.durable import naming, replace
 from heliograph.files.quoting import from_cell, in_cell
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:
     import xarray
@@ -34,7 +34,7 @@ def open_results(out: str | Path) -> "xarray.Dataset":
     """
     import xarray
 
-    path = Path(out) / STORE
+    path = file_path("results folder", out) / STORE
     if not path.is_dir():
         raise fail(f"results folder {out}", f"a folder with {STORE}", "none")
     results: xarray.Dataset = xarray.open_zarr(path)

@@ -11,7 +11,7 @@ import numpy as np
 
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
@@ -139,8 +139,14 @@ def step_number(item: AbstractFilter, k: Step) -> Step:
     """
     if isinstance(k, jax.core.Tracer):
         return k
+    if (
+        not isinstance(k, int | np.integer | np.ndarray | jax.Array)
+        or np.shape(k)
+        or np.asarray(k).dtype.kind not in "iu"
+    ):
+        raise fail("step", "a whole number from 0", shown(k))
     found = np.asarray(k)
-    if found.shape or found.dtype.kind not in "iu" or found < 0:
+    if found < 0:
         raise fail("step", "a whole number from 0", k)
     if item.horizon is not None and found >= item.horizon:
         raise fail("step", f"one of the {item.horizon} that the filter covers, counted from 0", k)

@@ -17,9 +17,9 @@ from heliograph.model.channel import Channel, check_link, mean_gain
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
-from heliograph.numerics.check import array, covariance
+from heliograph.numerics.check import array, covariance, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -143,7 +143,8 @@ def _build(
     initial_covariance: ArrayLike | None,
     trusted: bool,
 ) -> GaussianFilter:
-    start = first(plant)
+    start = check_plant(plant)
+    instance("update", update, AbstractUpdate, "one such as Polytope()")
     n = len(start.states)
     check_link(first(sensor), first(channel), n)
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))

@@ -22,7 +22,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
 from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.float64 import in_float64
@@ -244,7 +244,7 @@ def open_loop_filter(
         ValueError: an initial mean or covariance of the wrong shape.
     Source: the prediction step of any of the filters, alone.
     """
-    start = first(plant)
+    start = check_plant(plant)
     n = len(start.states)
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
     spread = start.initial_covariance

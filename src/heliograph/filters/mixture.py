@@ -161,7 +161,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
-    floor, start = float(scalar("resolution", resolution, 0.0)) ** 2, first(plant)
+    floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
         modes = [_modes(channel)]
         components: Components | OverTime = _components(sensor, modes[0], modes[0], floor)

@@ -21,10 +21,10 @@ from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, steps_covered, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps
 from heliograph.random_affine.monomials import count, monomials, position
 
 
@@ -57,6 +57,8 @@ class PolynomialFilter(AbstractFilter):
     received: int = eqx.field(static=True)
 
     def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
+        instance("inner filter", inner, AbstractFilter, "a filter")
+        check_count("degree of the filter", degree)
         self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
         self.centre = centre
         self.states, self.inputs = inner.states, inner.inputs
@@ -236,6 +238,7 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
         ValueError: what `polynomial_filter` refuses.
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
+    as_maps("channel", [first(channel)])
     claim = claim_of(channel)
     linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
     products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)

@@ -17,7 +17,7 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
-from heliograph.numerics.check import names
+from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.small_matrix import with_rounding
@@ -58,6 +58,7 @@ class ScheduledFilter(AbstractFilter):
     received: int = eqx.field(static=True)
 
     def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
+        instance("schedule", schedule, Schedule, "a Schedule")
         g = schedule.gains
         self.gains = OverTime(_if_expected(g))
         known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
@@ -143,6 +144,7 @@ class LinearSystemFilter(AbstractFilter):
     received: int = eqx.field(static=True)
 
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
+        instance("system", system, LinearSystem, "a LinearSystem")
         self.steps = OverTime(system.steps)
         self.mean, self.covariance, self.want = system.mean, system.covariance, system.want
         self.claim, self.inputs = claim, ()

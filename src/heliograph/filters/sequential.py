@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, GaussianFilter
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, stack
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
 
@@ -81,7 +81,9 @@ def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
         ValueError: no filters, or filters of different state dimensions.
     Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
     """
-    parts = tuple(filters)
+    parts = tuple(items("sequential filter", filters, "filters"))
+    for item in parts:
+        instance("sequential filter", item, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
     sizes = [(len(item.states), len(item.inputs)) for item in parts]
     if len(set(sizes)) != 1:
         raise fail("sequential filter", "filters of as many states and inputs each", sizes)

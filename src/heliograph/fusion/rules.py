@@ -17,7 +17,7 @@ from heliograph.fusion.intersection import (
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
-from heliograph.numerics.check import array, fail, probabilities
+from heliograph.numerics.check import array, fail, instance, items, probabilities
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -51,6 +51,9 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
         ValueError: no estimates, or estimates of different state dimensions.
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
+    instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
+    for item in (estimates := items("fusion", estimates, "estimates")):
+        instance("fusion", item, Estimate, "estimates")
     if not estimates or len({np.shape(e.mean) for e in estimates}) != 1:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
@@ -205,6 +208,10 @@ class Fusion(eqx.Module):
     filter: str = eqx.field(static=True)
     rule: AbstractFusion
     quantizer: Quantizer | Mapping[str, Quantizer] | None = None
+
+    def __check_init__(self) -> None:
+        instance("filter of a fusion", self.filter, str, "its name")
+        instance("fusion rule", self.rule, AbstractFusion, "one such as CovarianceIntersection()")
 
     def check(self, nodes: Sequence[str], n: int) -> None:
         """Raise ValueError unless rule and quantizers fit these nodes and estimates of n components."""

@@ -13,7 +13,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import Float
 from heliograph.random_affine.monomials import exponents
 
@@ -63,6 +63,7 @@ def gain_over_linear(
     Raises:
         ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
     """
+    check_count("horizon", horizon)
     wanted = sorted({1, 2, *degrees})
     if not degrees or min(degrees) < 2:
         raise fail("degrees", "at least one, all of 2 or more", list(degrees))

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Float
 
@@ -57,6 +57,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         ValueError: an unknown claim.
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
+    instance("system", system, LinearSystem, "a LinearSystem")
     spread, want, parts = system.covariance, system.want, []
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
     for k in range(system.horizon):
@@ -98,6 +99,8 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
     Raises:
         ValueError: a system and a schedule of different lengths or measurements.
     """
+    instance("system", system, LinearSystem, "a LinearSystem")
+    instance("schedule", schedule, Schedule, "a Schedule")
     g, m = schedule.gains, system.steps.offset.shape[-1]
     if schedule.horizon != system.horizon or g.gain.shape[-1] != m:
         got = f"{schedule.horizon} steps of {g.gain.shape[-1]} measurements"

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.model.estimate import STRENGTH, Claim
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, file_path, instance, shown
 from heliograph.numerics.types import ArrayLike, Float
 
 
@@ -48,6 +48,7 @@ class Schedule(eqx.Module):
     claim: Claim = eqx.field(static=True)
 
     def __init__(self, gains: Gains, start: ArrayLike, claim: Claim):
+        instance("gains of a schedule", gains, Gains, "Gains")
         self.start = array("start of the schedule", start, (None,))
         time, n, m = np.shape(gains.gain)
         q = np.shape(gains.output_offset)[-1]
@@ -59,8 +60,8 @@ class Schedule(eqx.Module):
         self.gains = Gains(*((_known if f in PERHAPS else array)(f"schedule {f}", v, s) for f, v, s in named))
         if len(self.start) != n:
             raise fail("start of the schedule", f"shape ({n},)", f"shape {self.start.shape}")
-        if claim not in STRENGTH:
-            raise fail("claim", f"one of {list(STRENGTH)}", repr(claim))
+        if not isinstance(claim, str) or claim not in STRENGTH:
+            raise fail("claim", f"one of {list(STRENGTH)}", shown(claim))
         self.claim = claim
 
     @property
@@ -87,12 +88,11 @@ def load_schedule(path: str | Path) -> Schedule:
     Raises:
         ValueError: a file that holds no schedule.
     """
+    path = file_path("schedule", path)
     try:
         with np.load(path, allow_pickle=False) as file:
             stored = {name: file[name] for name in file.files}
     except (ValueError, EOFError, OSError) as error:
-        if isinstance(error, FileNotFoundError):
-            raise
         raise fail(f"schedule {path}", "a file written by Schedule.save", str(error).splitlines()[0]) from None
     missing = sorted({*Gains._fields, "start", "claim"} - set(stored))
     if missing:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import array, covariance
+from heliograph.numerics.check import array, covariance, instance
 from heliograph.numerics.types import ArrayLike, Float
 
 
@@ -55,6 +55,7 @@ class LinearSystem(eqx.Module):
         heard_rounding: ArrayLike | None = None,
         start_rounding: ArrayLike | None = None,
     ):
+        instance("steps of a system", steps, Steps, "Steps")
         time, n = np.shape(steps.drift)
         m = np.shape(steps.offset)[-1]
         one_step: tuple[tuple[int, ...], ...] = ((n, n), (n,), (n, n), (m, n), (m,), (m, m))
@@ -92,6 +93,7 @@ class StateMoments(NamedTuple):
 
 def state_moments(system: LinearSystem) -> StateMoments:
     """Moments of y before any data: X+ = A X A' + Cov(w). No best filter's error exceeds them, P_k <= X_k."""
+    instance("system", system, LinearSystem, "a LinearSystem")
     mean, spread = system.mean, system.covariance
     means, spreads = [mean], [spread]
     for k in range(system.horizon):

@@ -114,8 +114,6 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
     Raises:
         ValueError: no channels.
     """
-    if not channels:
-        raise fail("parallel channels", "at least one", "none")
     channels = as_maps("parallel channels", channels)
     parts, start, total = [], 0, sum(c.inputs for c in channels)
     for c in channels:
@@ -132,6 +130,7 @@ def mean_gain(channel: Channel) -> Channel:
     """
     if isinstance(channel, OverTime):
         return over_time([mean_gain(c) for c in unstack(channel)])
+    as_maps("channel taken at its mean gain", [channel])
     check_forgets("channel taken at its mean gain", channel)
     return channel.mean_gain()
 
@@ -139,5 +138,6 @@ def mean_gain(channel: Channel) -> Channel:
 def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: int) -> None:
     """Raise ValueError unless sensor and channel fit each other and the state."""
     check_sensor(sensor, states)
+    as_maps("channel", [channel])
     if channel.inputs != len(sensor.outputs):
         raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{channel.inputs} inputs")

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.check import items as as_items
 
 T = TypeVar("T")
 
@@ -79,6 +80,7 @@ def over_time(items: Sequence[Any]) -> OverTime:
     Raises:
         ValueError: no items, or items that differ in structure.
     """
+    items = as_items("over_time", items, "objects, one for each step")
     if not items:
         raise fail("over_time", "at least one item", "none")
     return OverTime(stack(items))

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from heliograph.model.over_time import OverTime
-from heliograph.numerics.check import array, covariance, fail, names
+from heliograph.model.over_time import OverTime, first
+from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import library
 from heliograph.random_affine.noise import (
@@ -97,11 +97,11 @@ class Plant(AbstractPlant):
         states: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
     ):
-        self.function = transition
+        self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
         self.states = names("state names", states, n, "x")
-        self.inputs = names("input names", inputs, len(inputs), "u")
+        self.inputs = names("input names", inputs, len(items("input names", inputs, "names")), "u")
         u = np.zeros(len(self.inputs))
         check_shape("transition(x, u)", transition, (self.initial_mean, u), (n,))
         if callable(noise):
@@ -168,6 +168,8 @@ def with_bias(plant: LinearPlant, coupling: ArrayLike, bias: LinearPlant) -> Lin
         ValueError: shapes that do not fit, a bias with inputs, noise that depends on inputs.
     Source: quadratic filtering with dynamical bias, equations (1), (2) and (10).
     """
+    for what, item in (("plant with bias", plant), ("bias", bias)):
+        instance(what, item, LinearPlant, "a LinearPlant")
     n, extra = len(plant.states), len(bias.states)
     coupling = array("coupling of the bias", coupling, (n, extra))
     if bias.inputs:
@@ -202,9 +204,17 @@ def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector
 AnyPlant = AbstractPlant | OverTime  # an OverTime holds one plant per step
 
 
-def check_shape(name: str, function: Callable[..., Any], values: tuple[Any, ...], shape: tuple[int, ...]) -> None:
+def check_shape(name: str, called: Callable[..., Any], values: tuple[Any, ...], shape: tuple[int, ...]) -> None:
     """Raise ValueError unless a user's function returns an array of `shape`."""
-    with jax.enable_x64(True):
-        got = jax.eval_shape(lambda *args: jnp.asarray(function(*args)), *values).shape
+    try:
+        with jax.enable_x64(True):
+            got = jax.eval_shape(lambda *args: jnp.asarray(called(*args)), *values).shape
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail(name, f"a function in operations of jax.numpy, of shape {shape}", shown_error(error)) from error
     if got != shape:
         raise fail(name, f"shape {shape}", f"shape {got}")
+
+
+def check_plant(plant: AnyPlant) -> Any:
+    """Return the plant at its first step."""
+    return instance("plant", first(plant), AbstractPlant, "a plant")

@@ -10,7 +10,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
-from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.check import check_horizon, fail, items, names, table
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import second_moment_tensor
 
@@ -42,8 +42,11 @@ class RelayNetwork(eqx.Module):
     relays: tuple[str, ...] = eqx.field(static=True)
 
     def __init__(self, plant: AnyPlant, sensor: AnySensor, relays: Sequence[str], slots: Sequence[Slot]):
-        self.plant, self.sensor, self.relays = plant, sensor, tuple(relays)
-        self.slots = tuple({listener: dict(links) for listener, links in slot.items() if links} for slot in slots)
+        self.plant, self.sensor = plant, sensor
+        self.relays = names("relays", relays, len(items("relays", relays, "names")), "relay")
+        listed = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
+        each = [{name: table(f"links to {name!r}", links, "links") for name, links in slot.items()} for slot in listed]
+        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in each)
         _check_linear(first(plant), first(sensor))
         if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
             raise fail("relays", f"distinct names other than {SENSOR!r} and {RECEIVER!r}", list(self.relays))

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.numerics.check import array, fail, names
+from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
@@ -46,8 +46,8 @@ class Sensor(AbstractSensor):
         noise: AbstractNoise | ArrayLike,
         outputs: Sequence[str] | None = None,
     ):
-        self.function = measure
-        dimension = (components(noise) or 1) if outputs is None else len(outputs)
+        self.function = function("measure of a sensor", measure, "x")
+        dimension = (components(noise) or 1) if outputs is None else len(items("sensor outputs", outputs, "names"))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
 
@@ -84,11 +84,12 @@ AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
 
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
+    instance("sensor", sensor, AbstractSensor, "a sensor")
     try:
         with jax.enable_x64(True):
             got = jax.eval_shape(sensor.measure, np.zeros(states)).shape
-    except TypeError as error:
-        raise fail("sensor", f"to measure a state of length {states}", str(error).splitlines()[0]) from None
+    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+        raise fail("sensor", f"to measure a state of length {states}", shown_error(error)) from error
     if got != (len(sensor.outputs),):
         raise fail("sensor", f"{len(sensor.outputs)} outputs {list(sensor.outputs)}", f"shape {got}")
 

@@ -1,7 +1,10 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
-from collections.abc import Sequence
-from typing import Any
+import os
+from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from pathlib import Path
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +14,7 @@ from heliograph.numerics.traced import is_traced
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units
+T = TypeVar("T")
 MOST = 2**32 - 1  # of runs and steps, since each has a key of its own in which 32 bits count
 PROBABILITY_TOLERANCE = 1e-9  # sums of decimal fractions such as .1 + .2 + .7
 
@@ -27,6 +31,11 @@ def fail(name: str, expected: str, got: object) -> InputError:
 def shown(value: object) -> str:
     """Anything as a short part of one line."""
     return " ".join(repr(value).split())[:60]
+
+
+def shown_error(error: Exception) -> str:
+    """An error as a short part of one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())[:120]
 
 
 def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: bool = False) -> Any:
@@ -72,6 +81,54 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
     if not is_traced(result) and not low <= result <= high:
         raise fail(name, f"a number from {low:g} to {high:g}", f"{float(result):g}")
     return result
+
+
+def items(name: str, value: object, what: str) -> list[Any]:
+    """Return what a list, a tuple or the like holds; text and tables are none."""
+    try:
+        if isinstance(value, str | bytes | Mapping | AbstractSet):
+            raise TypeError
+        return list(value)  # type: ignore[call-overload, no-any-return]
+    except TypeError:
+        raise fail(name, f"a list of {what}", shown(value)) from None
+
+
+def table(name: str, value: object, what: str) -> dict[str, Any]:
+    """Return a copy of a dictionary whose keys are names."""
+    if not isinstance(value, Mapping) or not all(isinstance(key, str) for key in value):
+        raise fail(name, f"a dictionary of {what} by name", shown(value))
+    return dict(value)
+
+
+def instance(name: str, value: object, kind: type[T], what: str) -> T:
+    """Return an object of a class."""
+    if not isinstance(value, kind):
+        raise fail(name, what, shown(value))
+    return value
+
+
+def function(name: str, value: object, of: str) -> Any:
+    """Return what can be called."""
+    if not callable(value):
+        raise fail(name, f"a function of {of}", shown(value))
+    return value
+
+
+def file_path(name: str, value: object) -> Path:
+    """Return the path of a file or folder."""
+    if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
+        raise fail(name, "a path", shown(value))
+    return Path(value)
+
+
+def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
+    """Return a number for each of `count` steps, from one for all or one each."""
+    try:
+        single = np.ndim(value) == 0
+    except ValueError:  # rows of different lengths
+        single = False
+    found: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
+    return found
 
 
 def check_count(name: str, value: object, least: int = 1) -> int:
@@ -181,9 +238,7 @@ def names(name: str, value: Sequence[str] | None, count: int, prefix: str) -> tu
     """Return `count` distinct names; None gives prefix0, prefix1, ..."""
     if value is None:
         return tuple(f"{prefix}{i}" for i in range(count))
-    if isinstance(value, str):
-        raise fail(name, "a list of names", repr(value))
-    result = tuple(str(v) for v in value)
+    result = tuple(str(v) for v in items(name, value, "names"))
     if len(result) != count or len(set(result)) != count:
         raise fail(name, f"{count} distinct names", list(result))
     return result

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.check import array, fail, items, shown
 from heliograph.numerics.traced import is_traced
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.monomials import exponents, monomials
@@ -236,7 +236,7 @@ def _is_modal(item: object) -> bool:
 
 def as_maps(name: str, maps: Sequence[AbstractRandomAffine]) -> tuple[AbstractRandomAffine, ...]:
     """At least one random affine map."""
-    result = tuple(maps)
+    result = tuple(items(name, maps, "random affine maps"))
     if not result:
         raise fail(name, "at least one map", "none")
     for item in result:

@@ -242,6 +242,7 @@ class Lift(AbstractRandomAffine):
 
     def __init__(self, base: AbstractRandomAffine, degree: int):
         check_count("degree of the lift", degree)
+        (base,) = as_maps("lift", [base])
         if base.erases:
             raise fail("lift", "a channel without erasures", "one that erases")
         self.base, self.degree = base, degree

@@ -95,8 +95,12 @@ def recorded_noise(samples: ArrayLike, order: int) -> FiniteSupport:
     Raises:
         ValueError: fewer than two samples, an order below 1, numbers that are not finite.
     """
-    values = np.asarray(samples, dtype=np.float64)
-    values = array("noise samples", values[:, None] if values.ndim == 1 else values, (None, None))
+    try:
+        single = np.ndim(samples) == 1
+    except ValueError:  # rows of different lengths
+        single = False
+    values = array("noise samples", samples, (None,) if single else (None, None))
+    values = values[:, None] if single else values
     if len(values) < 2:
         raise fail("noise samples", "at least two", len(values))
     check_count("order of the noise moments", order)

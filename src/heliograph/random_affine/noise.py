@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, covariance, fail, probabilities, shown
+from heliograph.numerics.check import array, covariance, fail, instance, items, probabilities, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.random_affine.monomials import Exponents, exponents
@@ -137,7 +137,7 @@ class Independent(AbstractNoise):
     covariance: Square
 
     def __init__(self, parts: Sequence[AbstractNoise]):
-        self.parts = tuple(parts)
+        self.parts = tuple(items("independent noises", parts, "laws"))
         if not self.parts:
             raise fail("independent noises", "at least one", "none")
         for part in self.parts:
@@ -175,6 +175,7 @@ class Shaped(AbstractNoise):
     covariance: Square
 
     def __init__(self, matrix: ArrayLike, source: AbstractNoise):
+        instance("source of a shaped noise", source, AbstractNoise, "a law of a noise vector")
         self.matrix = array("noise matrix", matrix, (None, source.dimension))
         self.source = source
         self.mean = self.matrix @ source.mean
@@ -223,7 +224,10 @@ def components(value: AbstractNoise | ArrayLike) -> int | None:
     """How many components a noise law or a covariance has; None for a number, which says a variance alone."""
     if isinstance(value, AbstractNoise):
         return value.dimension
-    shape = np.shape(value) if not is_traced(value) else jnp.asarray(value).shape
+    try:
+        shape = np.shape(value) if not is_traced(value) else jnp.asarray(value).shape
+    except ValueError:  # rows of different lengths
+        raise fail("noise", "a variance, a covariance or a law", shown(value)) from None
     return shape[0] if shape else None
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from heliograph.numerics.small_matrix import add, contract, diagonal
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.law import Constant
@@ -100,6 +100,7 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     Raises:
         ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
     """
+    as_maps("channel of a filter", [channel])
     check_forgets("channel of a filter", channel)
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]

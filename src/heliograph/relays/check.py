@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.model.over_time import at
 from heliograph.model.relays import SENSOR, RelayNetwork
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import second_moment_tensor
@@ -43,6 +43,7 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     Raises:
         ValueError: a filter without gains.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
     if set(gains) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     (mean, spread), n = network.initial(), len(network.states)

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
@@ -44,6 +44,8 @@ def given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayDesign:
     Raises:
         ValueError: a filter without gains or the reverse, gains of the wrong shape, a horizon that is not covered.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    gains = table("gains", gains, "arrays (steps, n, received)")
     joined = join_gains(network, gains)
     steps = network.steps(len(joined))
     return as_design(network, _propagate(steps, start_moments(network), joined))
@@ -109,6 +111,8 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     Raises:
         ValueError: a design of another network.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    instance("design", design, RelayDesign, "a RelayDesign")
     if set(design.gains) != set(network.filters):
         raise fail("design", f"filters {list(network.filters)}", list(design.gains))
     steps = network.steps(len(design.moments) - 1)

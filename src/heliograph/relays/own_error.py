@@ -1,6 +1,7 @@
 """The greedy design: every relay and the receiver minimise their own next error."""
 
 from heliograph.model.relays import RelayNetwork
+from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import compiled
 from heliograph.relays.design import RelayDesign, as_design, start_moments
 from heliograph.relays.second_moments import propagate_own
@@ -18,4 +19,5 @@ def own_error_design(network: RelayNetwork, horizon: int) -> RelayDesign:
         ValueError: a horizon beyond what varies over time; a singular innovation moment.
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 1 and 2, for any network.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
     return as_design(network, _propagate_own(network.steps(horizon), start_moments(network)))

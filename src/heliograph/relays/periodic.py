@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.model.over_time import steps_covered
 from heliograph.model.relays import RelayNetwork, Steps
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Bool, Float, Int
 from heliograph.relays.design import GainsByFilter, RelayDesign, as_design, join_gains, start_moments
@@ -31,6 +31,7 @@ def periodic_steps(network: RelayNetwork) -> Steps:
     Raises:
         ValueError: parts that vary beyond the slots, or a plant whose mean does not settle.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
     if steps_covered(network) is not None:
         raise fail("steady state", "a network that varies with its slots only", "parts that are OverTime")
     steps = network.steps(len(network.slots))

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.relays.descent import bfgs
@@ -45,6 +45,7 @@ def periodic_receiver_error_design(
         ValueError: what `periodic_steps` refuses, a start of the wrong shape or under which the moments diverge, a
             limit that no gains were found to meet.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
     own = periodic_own_error_design(network)
     gains = join_gains(network, own.gains if start is None else start)
     return periodic_given_design(network, split_gains(network, _tune(network, gains, _receiver_cost, power_limit)))
@@ -60,6 +61,7 @@ def periodic_relays_for_best_receiver(
     Raises:
         ValueError: as for `periodic_receiver_error_design`; no relays.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
     gains = relay_gains(network, periodic_own_error_design(network).gains if start is None else start)
     tuned = split_gains(network, _tune(network, gains, _behind_cost, power_limit))
     return {name: gain for name, gain in tuned.items() if name != RECEIVER}
@@ -78,8 +80,7 @@ def _tune(
     where = np.nonzero(used)
     unit = _units(network, start)[where]
     slots = len(network.slots)
-    limit = np.full(slots, np.inf) if power_limit is None else np.broadcast_to(
-        array("power limit", power_limit, (slots,) if np.ndim(power_limit) else ()), (slots,))  # fmt: skip
+    limit = np.full(slots, np.inf) if power_limit is None else per_step("power limit", power_limit, slots)
     multipliers, x = np.zeros(slots), np.zeros(len(unit))
     if not np.isfinite(cost(x, steps, start, where, unit, np.full(slots, np.inf), multipliers)[0]):
         raise fail("start of the search", "gains under which second moments settle", "some under which they diverge")

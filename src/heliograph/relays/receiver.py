@@ -11,7 +11,7 @@ from heliograph.linear.schedule import Schedule
 from heliograph.linear.system import LinearSystem
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, table
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Float
 from heliograph.relays.design import GainsByFilter, expected_maps, join_gains, start_moments
@@ -29,6 +29,8 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
     known, heard, white = _sides(steps, start_moments(network), joined)

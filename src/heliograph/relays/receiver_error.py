@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.relays import RelayNetwork, Steps
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, check_count, fail, instance, per_step
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Float, Int
@@ -56,6 +56,8 @@ def receiver_error_design(
     Raises:
         ValueError: weights or limits of the wrong shape, negative weights, no sweeps, a limit that was not met.
     """
+    instance("relay network", network, RelayNetwork, "a RelayNetwork")
+    check_count("sweeps", sweeps)
     own = own_error_design(network, horizon)
     weights = 1 / (horizon * own.trace("receiver")[1:]) if weights is None else array("weights", weights, (horizon,))
     if np.any(weights < 0) or sweeps < 1:
@@ -75,9 +77,7 @@ def _limit(steps: Steps, own: RelayDesign, power_limit: ArrayLike | None) -> Pow
     if power_limit is None:
         return None
     horizon, d = len(steps.live), own.moments.shape[-1]
-    value = (
-        np.full(horizon, power_limit) if np.ndim(power_limit) == 0 else array("power limit", power_limit, (horizon,))
-    )
+    value = per_step("power limit", power_limit, horizon)
     mean_signal = np.sum((steps.sensing @ steps.state_mean[..., None]) ** 2, axis=(1, 2))
     fixed = mean_signal * steps.talks[:, 1:].sum(axis=1)  # estimates are unbiased: E s = E x
     low = np.flatnonzero(value < fixed * (1 - POWER_TOLERANCE))

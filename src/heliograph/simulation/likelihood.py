@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree, Scalar
 
@@ -23,6 +23,7 @@ def log_likelihood(filter: AbstractFilter, measurements: ArrayLike, inputs: Arra
         ValueError: measurements or inputs of the wrong shape, infinite values, more steps than the filter covers.
     Source: Schweppe, Evaluation of likelihood functions for Gaussian signals (1965).
     """
+    instance("filter", filter, AbstractFilter, "a filter")
     z = rows("measurements", measurements, None, filter.received, missing=True)
     steps = len(z)
     if not len(filter.inputs) and inputs is None:

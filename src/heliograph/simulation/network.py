@@ -16,7 +16,7 @@ from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.check import check_horizon, fail, shown, table
 from heliograph.random_affine.base import AbstractRandomAffine, anonymous
 
 FUSED = "fused"  # the name under which results of several nodes stand
@@ -35,7 +35,7 @@ class Node(eqx.Module):
     filters: dict[str, AbstractFilter]
 
     def __init__(self, sensor: AnySensor, channel: Channel, filters: Mapping[str, AbstractFilter]):
-        self.sensor, self.channel, self.filters = sensor, channel, dict(filters)
+        self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         _check_type("sensor", first(sensor), AbstractSensor)
         _check_type("channel", first(channel), AbstractRandomAffine)
         _check_filters(self.filters, self.received)
@@ -104,7 +104,9 @@ class Network(eqx.Module):
         fused: Mapping[str, Fusion | AbstractFilter] | None = None,
         relays: RelayNetwork | None = None,
     ):
-        self.plant, self.nodes, self.fused, self.relays = plant, dict(nodes), dict(fused or {}), relays
+        self.plant, self.relays = plant, relays
+        self.nodes = table("nodes", nodes, "nodes")
+        self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
         self.names = tuple(self.nodes)
         _check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
@@ -150,6 +152,8 @@ class Network(eqx.Module):
         Raises:
             ValueError: relays without a schedule, schedules of the wrong shape.
         """
+        _check_type("relays", relays, RelayNetwork)
+        schedules = table("relay schedules", schedules, "schedules")
         if set(schedules) != set(relays.relays):
             raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
         filters: dict[str, dict[str, AbstractFilter]] = {}
@@ -265,4 +269,4 @@ def _check_filters(filters: Mapping[str, object], received: int) -> None:
 
 def _check_type(name: str, value: object, expected: type) -> None:
     if not isinstance(value, expected):
-        raise fail(name, f"a {expected.__name__}", type(value).__name__)
+        raise fail(name, f"a {expected.__name__}", shown(value))

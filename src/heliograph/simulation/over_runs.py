@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.float64 import to_numpy
 
 WIDTH = 256  # runs side by side
@@ -25,9 +25,11 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
     Raises:
         ValueError: no arrays, or arrays with different numbers of runs.
     """
+    if not callable(function):
+        raise fail("function over runs", "a function of one run's arrays", shown(function))
     check_count("width", width)
-    values = [np.asarray(a) for a in arrays]
-    if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not len(a) for a in values):
+    values = [_numbers(a) for a in arrays]
+    if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
     runs, cores = len(values[0]), os.cpu_count() or 1
     width = min(width, runs)
@@ -52,6 +54,16 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
 
         list(pool.map(place, range(len(found))))
     return whole
+
+
+def _numbers(value: Any) -> np.ndarray:
+    try:
+        found = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise fail("arrays over runs", "arrays of numbers", shown(value)) from None
+    if found.dtype.kind not in "biufc":
+        raise fail("arrays over runs", "arrays of numbers", shown(value))
+    return found
 
 
 def _filled(part: np.ndarray, count: int) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, items
 from heliograph.simulation.record import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
@@ -160,7 +160,9 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     Raises:
         ValueError: nothing to pool, or statistics of different runs.
     """
-    parts = list(statistics)
+    parts = items("pooled statistics", statistics, "ErrorStatistics")
+    for one in parts:
+        instance("pooled statistics", one, ErrorStatistics, "ErrorStatistics")
     if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
     return ErrorStatistics(

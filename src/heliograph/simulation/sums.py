@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.small_matrix import squared_distance
 from heliograph.simulation.lanes import BLOCK
@@ -211,8 +211,12 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     Raises:
         ValueError: a record without truth, or without a run axis.
     """
+    instance("record", record, Record, "a Record")
     if record.truth is None or record.truth.ndim != 3:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
+    known = [(each, of) for each, filters in record.estimates.items() for of in filters]
+    if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
+        raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]
     sums = _of_record(record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
     (parts,) = _split(sums, [])
