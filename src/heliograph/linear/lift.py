@@ -27,6 +27,7 @@ from heliograph.random_affine.second_moments import has_known_gain
 
 T = TypeVar("T")
 EPS = float(np.finfo(np.float64).eps)
+KEPT_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 
 
 class Route(NamedTuple):
@@ -71,14 +72,15 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     last: Route | None = None
     for route in routes:
         if last is None or not eqx.tree_equal(route.plant, last.plant):
-            moved = np.asarray(route.plant.moments(degree).matrix)
+            move = Lifted(route.plant, degree, isinstance(plant, OverTime))
         if last is None or not eqx.tree_equal(route.measurement, last.measurement):
-            measured = np.asarray(route.measurement.moments(degree).matrix)
+            varies = isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+            listen = Lifted(route.measurement, degree, varies)
         last = route
-        process, process_lost = conditional_spread(route.plant, degree, moments, moved)
-        moments = np.asarray(push(route.plant, 2 * degree, moments))
-        noise, noise_lost = conditional_spread(route.measurement, degree, moments, measured)
-        parts.append((*affine(moved), process, *affine(measured), noise))
+        process, process_lost = move.conditional_spread(moments)
+        moments = move.push(moments)
+        noise, noise_lost = listen.conditional_spread(moments)
+        parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
         lost.append((process_lost, noise_lost))
     steps = Steps(*map(np.array, zip(*parts, strict=True)))
     process_rounding, heard_rounding = map(np.array, zip(*lost, strict=True))
@@ -86,31 +88,49 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     return LinearSystem(steps, mean, spread, want, process_rounding, heard_rounding, start_lost)
 
 
-def conditional_spread(
-    route: AbstractRandomAffine, degree: int, moments: Float[Array, "M"], matrix: Float[np.ndarray, "m n"]
-) -> tuple[Float[np.ndarray, "m-1 m-1"], Float[np.ndarray, "m-1"]]:
-    """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K' of the monomials Z of z = G y + n, and the rounding of its diagonal.
+class Lifted:
+    """A map z = G y + n on monomials: E[Z | y] = K Y, and how moments of y of twice the degree become those of z.
 
-    With a known G the part of Cov(Z_i, Z_j | y) that has no n in both is none: it is a polynomial of y of degree
-    deg Z_i + deg Z_j - 2. So moments of y of a higher degree, which would only cancel, are left out for that entry:
-    what y is worth, far from zero or growing, costs no digits of the noise.
+    The matrix that does the latter is formed for a map that stays, if it is small; one that varies is used but once.
     """
-    n, m = route.inputs, route.outputs
-    given = degrees(n, 2 * degree)
-    wanted = degrees(m, degree)[:, None] + degrees(m, degree)
-    if not has_known_gain(route):
-        wanted = np.full_like(wanted, 2 * degree + 2)
-    result, lost = np.zeros(wanted.shape), np.zeros(len(wanted))
-    for highest in range(2, int(wanted.max()) + 1):
-        here = wanted == highest
-        if not here.any():
-            continue
-        low = np.where(given <= highest - 2, np.asarray(moments), 0.0)
-        after = np.asarray(second_moments(push(route, 2 * degree, low), m + 1, degree))
-        left = after - matrix @ np.asarray(second_moments(low, n + 1, degree)) @ matrix.T
-        result = np.where(here, left, result)
-        lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
-    return result[:-1, :-1], lost[:-1]
+
+    def __init__(self, route: AbstractRandomAffine, degree: int, varies: bool):
+        self.route, self.degree = route, degree
+        self.matrix = np.asarray(route.moments(degree).matrix)
+        rows, columns = (count(size + 1, 2 * degree) for size in (route.outputs, route.inputs))
+        small = not varies and rows * columns <= KEPT_ENTRIES
+        self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
+        self.given = degrees(route.inputs, 2 * degree)
+        own = degrees(route.outputs, degree)
+        self.highest = own[:, None] + own
+        if not has_known_gain(route):
+            self.highest = np.full_like(self.highest, 2 * degree + 2)
+
+    def push(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
+        """E[mono(z)] from E[mono(y)], both of twice the degree."""
+        if self.whole is not None:
+            return np.asarray(self.whole @ np.asarray(moments))
+        return np.asarray(push(self.route, 2 * self.degree, moments))
+
+    def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
+        """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
+
+        With a known G the part of Cov(Z_i, Z_j | y) that has no n in both is none: it is a polynomial of y of degree
+        deg Z_i + deg Z_j - 2. So moments of y of a higher degree, which would only cancel, are left out for that entry:
+        what y is worth, far from zero or growing, costs no digits of the noise.
+        """
+        n, m = self.route.inputs + 1, self.route.outputs + 1
+        result, lost = np.zeros(self.highest.shape), np.zeros(len(self.highest))
+        for highest in range(2, int(self.highest.max()) + 1):
+            here = self.highest == highest
+            if not here.any():
+                continue
+            low = np.where(self.given <= highest - 2, np.asarray(moments), 0.0)
+            after = np.asarray(second_moments(self.push(low), m, self.degree))
+            left = after - self.matrix @ np.asarray(second_moments(low, n, self.degree)) @ self.matrix.T
+            result = np.where(here, left, result)
+            lost = np.where(np.diagonal(here), EPS * np.abs(np.diagonal(after)), lost)
+        return result[:-1, :-1], lost[:-1]
 
 
 def mean_and_spread(
