@@ -101,6 +101,13 @@ def test_run_writes_what_the_library_computes(folder, capsys):
             assert row["valid"] == 1
 
 
+def test_names_do_not_act_on_the_terminal(folder, capsys):
+    (folder / "net.py").write_text(NETWORK.replace('"aware"', '"\\x1b[31maware"'))
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out and "\\x1b[31maware" in said.out
+
+
 def test_a_lost_covariance_is_said_and_flagged(folder, capsys):
     (folder / "net.py").write_text(NETWORK + LOSING)
     assert cli.main(run_arguments()) == 0

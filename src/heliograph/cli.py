@@ -86,6 +86,7 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.files.quoting import visible
     from heliograph.files.table import check_output
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
@@ -107,13 +108,13 @@ def run(
         advance(f"writing {out}")
         write_estimates(record, out)
     for failure in record.failures():
-        print(f"heliograph: warning: {failure}", file=sys.stderr)
+        print(f"heliograph: warning: {visible(failure)}", file=sys.stderr)
     filters = [
         f"{node}/{name} ({estimate.claim})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    print(f"{out}: {len(record.time)} rows of {', '.join(filters)}")
+    print(visible(f"{out}: {len(record.time)} rows of {', '.join(filters)}"))
 
 
 @app.command

@@ -81,4 +81,4 @@ def print_table(outcome: Outcome, target: Path) -> None:
         table.add_row(*row)
     console = rich.console.Console()
     console.print(table)
-    console.print(f"Report: {target / 'report.html'}", soft_wrap=True, highlight=False)
+    console.print(f"Report: {target / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
