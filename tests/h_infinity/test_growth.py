@@ -103,7 +103,9 @@ def test_a_certificate_says_what_it_rests_on_and_refuses_what_does_not_fit():
     assert alone.certified and len(alone.assumed) == 2 and "assumed: |f(x)| <= a |x| with a = 0.7" in alone.text
     proof = check_growth(lambda x: 0.7 * jnp.sin(x), 0.7, [-5.0], [5.0])
     assert certificate(proof).certified and not certificate(proof).assumed and "proved" in certificate(proof).text
-    assert not proof._replace(bound=np.inf).proved and certificate(proof._replace(bound=np.inf)).assumed
+    assert not proof._replace(bound=None).proved and certificate(proof._replace(bound=None)).assumed
+    smaller = check_growth(lambda x: 0.6 * jnp.sin(x), 0.6, [-5.0], [5.0])
+    assert certificate(smaller).certified and not certificate(smaller).assumed
     other = certificate(check_growth(lambda x: 0.8 * jnp.sin(x), 0.8, [-5.0], [5.0]))
     assert not other.certified and "the constant 0.8, the system has 0.7" in other.text
     false = certificate(check_growth(lambda x: 0.5 * x + 1, 0.7, [-5.0], [5.0]))

@@ -74,13 +74,17 @@ def test_a_link_over_time_is_read_at_the_step():
     np.testing.assert_allclose(gain, [0.1, 0.0, 0.3, 0.0], rtol=1e-15)
 
 
-def test_a_noiseless_network_is_named():
-    silent = LinearSensor([[1.0]], [[0.0]])
-    quiet = LinearPlant([[0.9]], [[0.0]], [0.0], [[0.0]])
-    with pytest.raises(ValueError, match="finite second moments"):
-        own_error_design(
-            network([{"a": {"sensor": hop(1.0, 0.0)}, "receiver": {"a": LINK}}], plant=quiet, sensor=silent), 3
-        )
+def test_a_network_without_noise_has_the_limits_design_and_one_that_diverges_is_named():
+    def designed(noise, growth=0.9, steps=3):
+        sensor, plant = LinearSensor([[1.0]], [[noise]]), LinearPlant([[growth]], [[noise]], [1.0], [[1.0]])
+        relays = [{"a": {"sensor": hop(1.0, noise)}, "receiver": {"a": LINK}}]
+        return own_error_design(network(relays, plant=plant, sensor=sensor), steps)
+
+    exact, near = designed(0.0), designed(1e-10)
+    for name in exact.covariance:
+        np.testing.assert_allclose(exact.covariance[name], near.covariance[name], atol=1e-8)
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="finite second moments"):
+        designed(1.0, 1e200, 4)
 
 
 def test_schedules_are_saved_and_read_back(tmp_path):

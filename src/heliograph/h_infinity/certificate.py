@@ -54,8 +54,8 @@ def certify_level(
     """Check that K (steps, n, m) with weights P_0 ... (steps + 1, 2n, 2n) and multipliers guarantees the level.
 
     Multipliers: (steps, 2) for (f, f~) and (h, h~) together, or (steps, 4) for f, f~, h, h~. `growth`: what
-    `check_growth` found; what rests on a refuted constant, or on a finding about a constant that is none of the
-    system's, is not certified. Constants that no finding proves are `assumed`, and the certificate says so.
+    `check_growth` found; what rests on a refuted constant, or on a finding about a constant above the system's, is not
+    certified. Constants that no finding proves are `assumed`, and the certificate says so.
 
     Raises:
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
@@ -83,7 +83,7 @@ def certify_level(
     for finding in growth:
         if finding.refuted:
             reasons.append(finding.text)
-        elif not any(_same(finding.constant, value) for value, _ in constants):
+        elif not any(_supports(finding, value) for value, _ in constants):
             known = ", ".join(sorted({f"{value:g}" for value, _ in constants})) or "none"
             reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
     count = T if negative.all() else int(np.argmin(negative))
@@ -100,8 +100,9 @@ def certify_level(
     )
 
 
-def _same(a: float, b: float) -> bool:
-    return abs(a - b) <= TOLERANCE * max(a, b)
+def _supports(finding: GrowthFinding, constant: float) -> bool:
+    """Whether what it is about would be enough."""
+    return finding.constant <= constant * (1 + TOLERANCE)
 
 
 def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
@@ -118,7 +119,7 @@ def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]
     """What no finding proves. A bound of the slopes and f(0) = 0 prove both kinds."""
     result = []
     for value, what in constants:
-        about = [finding for finding in growth if _same(finding.constant, value)]
+        about = [finding for finding in growth if _supports(finding, value)]
         if not about or not all(finding.proved for finding in about):
             result.append(f"{what} with a = {value:g}")
     return tuple(result)

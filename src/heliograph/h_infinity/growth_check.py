@@ -27,7 +27,7 @@ class GrowthFinding(NamedTuple):
 
     slope: the largest norm of a Jacobian found there, at `point`: at least this large is every true constant; infinite
     where f is no number. pair and ratio: the points found with the largest |f(x) - f(y)| / |x - y|. at_zero: |f(0)|.
-    bound: no slope in the box is larger, by interval arithmetic on f's own operations; infinite where these cannot be
+    bound: no slope in the box is larger, by interval arithmetic on f's own operations; None where these cannot be
     followed, for the `reason` given. differences: false for a finding about |f(x)| <= constant |x| alone.
 
     `refuted` if anything found breaks the constant, `proved` if the bound keeps it; else it is assumed.
@@ -42,7 +42,7 @@ class GrowthFinding(NamedTuple):
     pair: tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n"]]
     ratio: float
     at_zero: float
-    bound: float
+    bound: float | None
     reason: str
     differences: bool
 
@@ -65,7 +65,7 @@ class GrowthFinding(NamedTuple):
     @property
     def proved(self) -> bool:
         """Whether no slope in the box exceeds the constant, for certain."""
-        return not self.refuted and self.bound <= self.limit
+        return not self.refuted and self.bound is not None and self.bound <= self.limit
 
     @property
     def text(self) -> str:
@@ -74,7 +74,9 @@ class GrowthFinding(NamedTuple):
         if self.proved:
             return f"{self.name}: constant {self.constant:g} is proved {where} (no slope above {self.bound:.6g})"
         if not self.refuted:
-            why = self.reason or f"slopes are proved below {self.bound:.6g} only"
+            why = self.reason or (
+                "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
+            )
             found = f"not refuted {where} (largest slope {self.slope:.6g})"
             return f"{self.name}: constant {self.constant:g} is assumed: {found}; {why}"
         return f"{self.name}: constant {self.constant:g} is false {where}: {self._evidence()}"
@@ -197,12 +199,12 @@ def _finding(
     x, y = np.split(pairs[pair], 2)
     found = GrowthFinding(
         name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair]),
-        tools.at_zero(len(low)), np.inf, "", differences,
+        tools.at_zero(len(low)), None, "", differences,
     )  # fmt: skip
     if found.refuted:
         return found
     bound = slope_bound(tools.function, low, high, found.limit)
-    return found._replace(bound=bound.value, reason=bound.reason)
+    return found._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 
 def _climb(
