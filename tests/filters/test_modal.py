@@ -2,6 +2,8 @@
 
 from itertools import product
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -277,3 +279,19 @@ def test_what_does_not_arrive_is_left_out():
 def test_it_keeps_the_contract_of_filters():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))
+
+
+def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
+    """Against central differences of relative error 1e-7."""
+    z = np.random.default_rng(0).normal(size=(10, 1))
+
+    def likelihood(p):
+        link = hg.gilbert_elliott(hg.hop(p[2], 0.05), hg.hop(0.2, 0.05), p[0], p[1])
+        channel = hg.amplify_and_forward([link, hg.autoregressive_fading(1.0, p[3], p[4], 0.05)])
+        return hg.log_likelihood(hg.linear_filter(PLANT, SENSOR, channel), z)
+
+    at, steps = np.array([0.05, 0.1, 1.0, 0.3, 0.8]), 1e-5 * np.eye(5)
+    with jax.enable_x64(True):
+        slopes = jax.grad(likelihood)(jnp.asarray(at))
+    expected = [(likelihood(at + d) - likelihood(at - d)) / 2e-5 for d in steps]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-6)
