@@ -39,7 +39,7 @@ THREE = [hg.hop(g, 0.1) for g in (0.3, -0.6, 1.2)]
 RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
 
 
-def chain_a(k, name="a"):
+def chain_a(k, name=None):
     return hg.MarkovChain(CHAIN_A[min(k, 2)], LAW_A, name)
 
 
@@ -80,11 +80,11 @@ A_AND_B = list(product(range(2), range(3)))
 BOTH_LAWS, BOTH_CHAINS = np.kron(LAW_A, LAW_B), [np.kron(a, CHAIN_B) for a in CHAIN_A]
 
 
-def one_chain(k):
-    return Modes(chain_a(k), [GOOD, BAD])
+def one_chain(k, name=None):
+    return Modes(chain_a(k, name), [GOOD, BAD])
 
 
-def other(name="b"):
+def other(name=None):
     return Modes(hg.MarkovChain(CHAIN_B, LAW_B, name), THREE)
 
 
@@ -95,11 +95,13 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
         [Series([[GOOD, BAD][i], RELAY, THREE[j]]) for i, j in A_AND_B],
     ),
     "two hops in one shadow": (
-        lambda k: hg.amplify_and_forward([one_chain(k), Modes(chain_a(k), [RELAY, BAD])]), LAW_A, CHAIN_A,
+        lambda k: hg.amplify_and_forward([one_chain(k, "a"), Modes(chain_a(k, "a"), [RELAY, BAD])]), LAW_A, CHAIN_A,
         [Series([GOOD, RELAY]), Series([BAD, BAD])],
     ),
     "a direct link in the shadow of the first hop": (
-        lambda k: hg.with_direct_link(hg.amplify_and_forward([one_chain(k), other()]), Modes(chain_a(k), [BAD, GOOD])),
+        lambda k: hg.with_direct_link(
+            hg.amplify_and_forward([one_chain(k, "a"), other("b")]), Modes(chain_a(k, "a"), [BAD, GOOD])
+        ),
         BOTH_LAWS, BOTH_CHAINS,
         [Stack([Series([[GOOD, BAD][i], THREE[j]]), [BAD, GOOD][i]]) for i, j in A_AND_B],
     ),
