@@ -2,6 +2,8 @@
 
 from itertools import product
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -37,7 +39,7 @@ THREE = [hg.hop(g, 0.1) for g in (0.3, -0.6, 1.2)]
 RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
 
 
-def chain_a(k, name="a"):
+def chain_a(k, name=None):
     return hg.MarkovChain(CHAIN_A[min(k, 2)], LAW_A, name)
 
 
@@ -78,11 +80,11 @@ A_AND_B = list(product(range(2), range(3)))
 BOTH_LAWS, BOTH_CHAINS = np.kron(LAW_A, LAW_B), [np.kron(a, CHAIN_B) for a in CHAIN_A]
 
 
-def one_chain(k):
-    return Modes(chain_a(k), [GOOD, BAD])
+def one_chain(k, name=None):
+    return Modes(chain_a(k, name), [GOOD, BAD])
 
 
-def other(name="b"):
+def other(name=None):
     return Modes(hg.MarkovChain(CHAIN_B, LAW_B, name), THREE)
 
 
@@ -93,11 +95,13 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
         [Series([[GOOD, BAD][i], RELAY, THREE[j]]) for i, j in A_AND_B],
     ),
     "two hops in one shadow": (
-        lambda k: hg.amplify_and_forward([one_chain(k), Modes(chain_a(k), [RELAY, BAD])]), LAW_A, CHAIN_A,
+        lambda k: hg.amplify_and_forward([one_chain(k, "a"), Modes(chain_a(k, "a"), [RELAY, BAD])]), LAW_A, CHAIN_A,
         [Series([GOOD, RELAY]), Series([BAD, BAD])],
     ),
     "a direct link in the shadow of the first hop": (
-        lambda k: hg.with_direct_link(hg.amplify_and_forward([one_chain(k), other()]), Modes(chain_a(k), [BAD, GOOD])),
+        lambda k: hg.with_direct_link(
+            hg.amplify_and_forward([one_chain(k, "a"), other("b")]), Modes(chain_a(k, "a"), [BAD, GOOD])
+        ),
         BOTH_LAWS, BOTH_CHAINS,
         [Stack([Series([[GOOD, BAD][i], THREE[j]]), [BAD, GOOD][i]]) for i, j in A_AND_B],
     ),
@@ -277,3 +281,19 @@ def test_what_does_not_arrive_is_left_out():
 def test_it_keeps_the_contract_of_filters():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))
+
+
+def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
+    """Against central differences of relative error 1e-7."""
+    z = np.random.default_rng(0).normal(size=(10, 1))
+
+    def likelihood(p):
+        link = hg.gilbert_elliott(hg.hop(p[2], 0.05), hg.hop(0.2, 0.05), p[0], p[1])
+        channel = hg.amplify_and_forward([link, hg.autoregressive_fading(1.0, p[3], p[4], 0.05)])
+        return hg.log_likelihood(hg.linear_filter(PLANT, SENSOR, channel), z)
+
+    at, steps = np.array([0.05, 0.1, 1.0, 0.3, 0.8]), 1e-5 * np.eye(5)
+    with jax.enable_x64(True):
+        slopes = jax.grad(likelihood)(jnp.asarray(at))
+    expected = [(likelihood(at + d) - likelihood(at - d)) / 2e-5 for d in steps]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-6)

@@ -113,6 +113,23 @@ def test_claims_hold_in_simulation(world, item, known):
     assert known is None or claimed.mean() == pytest.approx(known, abs=5 * claimed.mean(axis=1).std() / np.sqrt(600))
 
 
+def test_arrival_that_varies_and_is_certain_at_some_steps():
+    """At a step where everything arrives, a packet lost for another reason tells nothing of the mode."""
+    chain = hg.MarkovChain(BURSTS)
+    steps = []
+    for sure in (True, False, True):
+        hops = zip((0.2, 1.0), (1.0, 1.0) if sure else ARRIVAL, strict=True)
+        steps.append(hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in hops], chain))
+    item = hg.linear_filter(PLANT, SENSOR, hg.over_time(steps))
+    found = claims(item, [[0.3], [np.nan], [np.nan]])
+    state = item.predict(item.init(), (), 0)
+    for k, z in enumerate([[0.3], [np.nan]]):
+        state = item.predict(item.correct(state, z, k)[0], (), k + 1)
+    expected = item.estimate(state)
+    assert np.all(np.isfinite(found))
+    np.testing.assert_allclose(found[2], [expected.mean[0], expected.covariance[0, 0]], rtol=1e-9)
+
+
 def test_two_lossy_links_in_one_shadow_keep_their_own_patterns():
     chain = hg.MarkovChain(BURSTS)
     links = [

@@ -21,15 +21,15 @@ def bound(channel, steps=400):
 
 
 @pytest.mark.parametrize(
-    ("radius", "published", "worst"), [(0.005, 0.301, 0.268), (0.01, 0.369, 0.297), (0.02, 0.518, 0.352)]
+    ("radius", "known", "worst"), [(0.005, 0.301, 0.268), (0.01, 0.369, 0.297), (0.02, 0.518, 0.352)]
 )
-def test_how_loose_it_is(radius, published, worst):
+def test_how_loose_it_is(radius, known, worst):
     """Not above the known bound, and not below the exact filter of the worst constant chain."""
     found = bound(rough(radius), 1000)[1][-1]
     corners = [BURSTS + radius * np.array([[a, -a], [b, -b]]) for a in (-1, 1) for b in (-1, 1)]
     exact = max(variances(PLANT, SENSOR, bursts(c), 1000)[-1, 0] for c in corners)
     assert exact == pytest.approx(worst, abs=0.0006)
-    assert exact < found < published + 0.0005
+    assert exact < found < known + 0.0005
 
 
 def test_a_radius_of_zero_is_the_exact_filter():

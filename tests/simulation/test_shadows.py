@@ -62,6 +62,7 @@ def test_hops_of_relays_share_too_in_every_slot():
 def test_a_chain_that_varies_moves_by_the_step():
     """It switches surely at odd steps and stays at even ones."""
     stay, switch = np.eye(2), np.eye(2)[::-1]
-    steps = [hg.MarkovChain(switch if k % 2 else stay, [1.0, 0.0], "c") for k in range(6)]
-    heard = gains({"a": hg.over_time([link(chain) for chain in steps])}, runs=2, horizon=6)["a"]
-    np.testing.assert_array_equal(heard, [[0.2, 0.2, 1.0, 1.0, 0.2, 0.2]] * 2)
+    for name in ("c", None):
+        steps = [hg.MarkovChain(switch if k % 2 else stay, [1.0, 0.0], name) for k in range(6)]
+        heard = gains({"a": hg.over_time([link(chain) for chain in steps])}, runs=2, horizon=6)["a"]
+        np.testing.assert_array_equal(heard, [[0.2, 0.2, 1.0, 1.0, 0.2, 0.2]] * 2)

@@ -23,6 +23,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.traced import stacked
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import nominal_spread
@@ -191,8 +192,8 @@ def heard_over(channel: Channel) -> tuple[Float[Array, " M"], Heard | OverTime]:
 
 def heard(now: JointModes, before: JointModes) -> Heard:
     """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
-    parts = [(m.moments(1).mean[:-1], nominal_spread(m).center) for m in now.maps]
-    mean, spread = (np.stack([np.asarray(part[i]) for part in parts]) for i in range(2))
+    mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
+    spread = stacked([nominal_spread(m).center for m in now.maps])
     return Heard(before.transition, before.radius, mean, spread)
 
 

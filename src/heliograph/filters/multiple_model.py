@@ -163,7 +163,7 @@ def hear(
 
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
     """
-    kind = pattern_of(channel.present, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
+    kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
     mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
     chance = weight * jnp.asarray(channel.chance)[mode, kind]
     prior = chance / jnp.sum(chance)
@@ -194,7 +194,7 @@ def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], To
     """
     steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     no_flags = np.ones((len(steps[0].initial), 1))
-    parts = [by_pattern(one, before, no_flags) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    parts = by_pattern(steps, no_flags)
     for part in parts if len(no_flags) > 1 else []:
         _check_random(part)
     return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]

@@ -1,5 +1,6 @@
 """Filters that are told something of the modes: which packets arrived, a flag with each packet, or the mode itself."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import symmetric_product
-from heliograph.random_affine.told import outcomes, second_moments
+from heliograph.random_affine.told import Outcome, outcomes, second_moments
 
 
 class Told(eqx.Module):
@@ -66,7 +67,8 @@ class ToldFilter(AbstractFilter):
     earlier laws.
 
     It hears z and, where there are `flags`, the number of the flag after it; the likelihood is that of z given these.
-    What is lost for reasons that the channel does not know must not depend on the modes.
+    What is lost for reasons that the channel does not know must not depend on the modes. Moments are kept about the
+    origin: a state whose mean is beyond 1e5 of its deviations loses the digits that tell them apart.
 
     Source: the filter of Costa (1994) with moments conditional on what is told.
     """
@@ -116,7 +118,7 @@ class ToldFilter(AbstractFilter):
         flag_there, there = ~jnp.isnan(flag), ~jnp.isnan(z)
         number = jnp.clip(jnp.where(flag_there, flag, 0.0).astype(int), 0, told.flags.shape[1] - 1)
         spelled = jnp.where(flag_there, jnp.asarray(told.flags)[:, number], 1.0)
-        kind = pattern_of(told.present, there)
+        kind = pattern_of(told, there)
         weight = jnp.asarray(told.chance)[:, kind] * spelled
         size = len(self.states) + 1
         total = weight @ state.moments[:, size - 1, size - 1]
@@ -175,10 +177,10 @@ def _used(
     return after, value, total
 
 
-def pattern_of(patterns: Bool[Array, "A m"], there: Bool[Array, " m"]) -> jax.Array:
-    """The smallest pattern in which everything that is there arrives."""
-    present = jnp.asarray(patterns)
-    fits = jnp.all(present | ~there, axis=1)
+def pattern_of(told: Told, there: Bool[Array, " m"]) -> jax.Array:
+    """The smallest pattern that can be and in which everything that is there arrives."""
+    present, possible = jnp.asarray(told.present), jnp.any(jnp.asarray(told.chance) > 0, axis=0)
+    fits = jnp.all(present | ~there, axis=1) & possible
     return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
 
 
@@ -214,7 +216,7 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
     for i, row in enumerate(chances):
         probabilities(f"flags in mode {i}", row)
-    described = [by_pattern(one, before, chances) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    described = by_pattern(steps, chances)
     known = all(m.corner_count() == 1 for one in steps for m in one.maps) and not uncertain_chain(channel)
     return ToldFilter(
         plant=plant,
@@ -229,11 +231,19 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
     )
 
 
-def by_pattern(now: JointModes, before: JointModes, flags: Float[np.ndarray, "M F"]) -> Told:
-    """The modes at one step by what arrives, and how they moved there from the step before."""
-    each = [outcomes(m) for m in now.maps]
-    kinds = sorted({tuple(o.arrived) for parts in each for o in parts}, key=lambda kind: (sum(kind), kind))
-    m, p = now.maps[0].outputs, now.maps[0].inputs + 1
+def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[Told]:
+    """The modes at each step by what arrives, with the patterns of all steps, and how they moved there."""
+    each = [[outcomes(m) for m in one.maps] for one in steps]
+    found = {tuple(o.arrived) for modes in each for parts in modes for o in parts}
+    kinds = sorted(found, key=lambda kind: (sum(kind), kind))
+    before = [steps[0], *steps[:-1]]
+    return [_told(modes, kinds, last, flags) for modes, last in zip(each, before, strict=True)]
+
+
+def _told(
+    each: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
+) -> Told:
+    m, p = each[0][0].map.outputs, each[0][0].map.inputs + 1
     shape = (len(each), len(kinds))
     chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
     for j, parts in enumerate(each):

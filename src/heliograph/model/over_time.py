@@ -11,6 +11,7 @@ from jaxtyping import Array, Int
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
+from heliograph.random_affine.base import one_memory
 
 T = TypeVar("T")
 
@@ -77,13 +78,15 @@ def _stack_leaves(*leaves: Any) -> Any:
 def over_time(items: Sequence[Any]) -> OverTime:
     """One model object per time step (a channel, a plant, ...) as a single object that varies in time.
 
+    What channels remember without a name is one memory over time, whose transition may differ from step to step.
+
     Raises:
         ValueError: no items, or items that differ in structure.
     """
     items = as_items("over_time", items, "objects, one for each step")
     if not items:
         raise fail("over_time", "at least one item", "none")
-    return OverTime(stack(items))
+    return OverTime(stack(one_memory(items)))
 
 
 def at(tree: Any, k: int | np.integer | np.ndarray | Int[Array, ""]) -> Any:

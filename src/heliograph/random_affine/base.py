@@ -1,6 +1,6 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -219,10 +219,24 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
 
 def anonymous(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
-    labels = {identity: str(i) for i, identity in enumerate(memories(channel))}
+    return _relabelled(channel, {identity: str(i) for i, identity in enumerate(memories(channel))})
 
+
+def one_memory(items: Sequence[T]) -> list[T]:
+    """The same maps at later steps: unnamed memories of each are those of the first, in order of appearance."""
+    whose = [memories(item) for item in items]
+    if not whose[0] or len({len(held) for held in whose}) > 1:
+        return list(items)
+    labels = [
+        {identity: label for (identity, m), label in zip(held.items(), whose[0], strict=True) if m.name is None}
+        for held in whose
+    ]
+    return [_relabelled(item, own) for item, own in zip(items, labels, strict=True)]
+
+
+def _relabelled(channel: T, labels: Mapping[str, str]) -> T:
     def relabelled(part: Any) -> Any:
-        if not _is_modal(part):
+        if not _is_modal(part) or part.memory.identity not in labels:
             return part
         return eqx.tree_at(lambda m: m.memory, part, part.memory.labelled(labels[part.memory.identity]))
 

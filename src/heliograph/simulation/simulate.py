@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
-from heliograph.numerics.check import array, check_count, check_times, fail
+from heliograph.numerics.check import array, check_count, check_seed, check_times, fail, instance, shown, table
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.simulation.air import AbstractAir, air_of
@@ -86,16 +86,18 @@ def monte_carlo(
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
             that is no multiple of 32, an unknown precision.
     """
+    instance("network", network, Network, "a Network")
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
-    if first_run < 0 or first_run % BLOCK:
+    if check_count("first_run", first_run, 0) % BLOCK:
         raise fail("first_run", f"a multiple of {BLOCK}", first_run)
     network.check_horizon(horizon)
     reducer: AbstractReducer[Record] | AbstractReducer[Result] = Trajectories() if keep is None else keep
+    instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
     u = _check_inputs(network, inputs, horizon)
-    base = jax.random.key(key) if isinstance(key, int | np.integer) else key
-    if precision not in get_args(Precision):
-        raise fail("precision", f"one of {', '.join(get_args(Precision))}", repr(precision))
+    base = _key(key)
+    if not isinstance(precision, str) or precision not in get_args(Precision):
+        raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     filters = AllFilters(network)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
     job = _Job(world, u, base, np.asarray(first_run + runs), reducer, precision == "float32")
@@ -131,7 +133,8 @@ def run(
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
     """
-    network = network.restricted_to(measurements)
+    instance("network", network, Network, "a Network")
+    network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
     steps = len(np.asarray(next(iter(measurements.values()))))
     if steps == 0:
         raise fail("measurements", "at least one row", "none")
@@ -235,6 +238,15 @@ def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTr
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
 
+def _key(key: object) -> jax.Array:
+    """A key from a seed, or as it is given."""
+    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
+        return key
+    if isinstance(key, jax.Array | np.ndarray):
+        raise fail("key", "a seed, or one key of jax.random.key", f"an array of {key.dtype} of shape {key.shape}")
+    return jax.random.key(check_seed("key", key))
+
+
 def _check_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
     count = len(network.inputs)
     if inputs is None and count:
@@ -243,11 +255,7 @@ def _check_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> n
 
 
 def _check_measurement(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
-    result = np.asarray(value, dtype=np.float64)
-    if result.ndim == 1 and received == 1:
-        result = result[:, None]
-    if result.shape != (steps, received):
-        raise fail(f"measurements of node {name!r}", f"shape ({steps}, {received})", f"shape {result.shape}")
-    if np.any(np.isinf(result)):
-        raise fail(f"measurements of node {name!r}", "numbers, or NaN for what is missing", "infinite values")
-    return result
+    flat = received == 1 and np.ndim(value) == 1
+    shape = (steps,) if flat else (steps, received)
+    result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
+    return result[:, None] if flat else result
