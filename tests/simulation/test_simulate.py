@@ -286,7 +286,7 @@ def test_a_filter_that_claims_no_covariance_harms_no_other():
             "do not go backwards, got 1 after 2 in row 3",
         ),
         (lambda: hg.Network(PLANT, {}), "at least one node"),
-        (lambda: hg.Network(PLANT, {"b": 3}), "a Node, got int"),
+        (lambda: hg.Network(PLANT, {"b": 3}), "a Node, got 3"),
     ],
 )
 def test_bad_calls(call, message):

@@ -255,7 +255,7 @@ def _check_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> n
 
 
 def _check_measurement(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
-    flat = received == 1 and np.ndim(value) == 1
+    flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
     shape = (steps,) if flat else (steps, received)
     result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
     return result[:, None] if flat else result
