@@ -33,6 +33,8 @@ SCHEDULE = linear.lmmse(SYSTEM)
 ESCAPE = fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)
 PRIOR = {"initial_mean": [0.0, 0.0], "initial_covariance": EYE}
 
+NETWORK = hg.Network(PLANT, {"a": NODE})
+
 CALLS = [  # what is called, and arguments with which it works
     (hg.Discrete, {"values": [1.0, 2.0], "probabilities_": [0.5, 0.5], "radius": 0.0}),
     (hg.LogNormal, {"log_mean": 0.0, "log_deviation": 1.0}),
@@ -121,6 +123,9 @@ CALLS = [  # what is called, and arguments with which it works
     (fusion.level_weights, {"levels": [1.0, 2.0]}),
     (fusion.fused_level, {"levels": [1.0, 2.0], "weights": [0.5, 0.5]}),
     (fusion.fuse, {"rule": hg.EqualIntersection(), "estimates": [hg.Estimate(np.zeros(2), EYE, "exact")] * 2}),
+    (hg.monte_carlo, {"network": NETWORK, "horizon": 2, "runs": 2, "key": 0, "keep": hg.Statistics(), "inputs": None,
+                      "chunk": 2048, "first_run": 0, "precision": "float64"}),
+    (hg.run, {"network": NETWORK, "measurements": {"a": [0.0, 1.0]}, "inputs": None, "time": None}),
     (simulation.pool, {"statistics": []}),
     (campaign.load_campaign, {"path": "nothing.toml"}),
     (campaign.open_results, {"out": "nothing"}),
