@@ -8,6 +8,7 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.schedule import Schedule
 from heliograph.model.channel import Channel, check_link
@@ -18,6 +19,7 @@ from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.simulation.centre import informed_claim
 
 FUSED = "fused"  # the name under which results of several nodes stand
 OWN = "own"  # a relay's one filter
@@ -225,7 +227,16 @@ class Network(eqx.Module):
     def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
         if isinstance(item, AbstractFilter):
             return item.claim
-        return item.claim([self.nodes[n].filters[item.filter].claim for n in self.nodes_with(item.filter)])
+        names = self.nodes_with(item.filter)
+        if not isinstance(item.rule, AbstractInformedFusion):
+            return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
+        rule, own = type(item.rule).__name__, {n: self.nodes[n] for n in names}
+        if item.quantizer is not None:
+            raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
+        known = {n: (v.sensor, v.channel, v.filters[item.filter]) for n, v in own.items() if isinstance(v, Node)}
+        if len(known) < len(own):
+            raise fail(f"fusion by {rule}", "nodes with a sensor and a channel of their own", "relays")
+        return informed_claim(rule, self.plant, known)
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

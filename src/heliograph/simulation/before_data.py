@@ -1,0 +1,165 @@
+"""What is known of a network of linear filters before any data: how their errors are correlated, what fusion gives."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.plan import Plan
+from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.fusion.weights import factored_weights, matrix_weights
+from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.compiler import large_program
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.centre import Centre
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters, plan
+
+REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative to the error: then U has an inverse
+
+
+@dataclass(frozen=True)
+class CrossCovariances:
+    """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.
+
+    x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the start of the plant and its
+    noise at each step) and a_i, node i's own, of covariance own_i. Biases are zero where filters believe in the world.
+
+    Shapes: mean (n,), state (n, sources), bias (node, n), shared (node, n, sources), own (node, n, n).
+    """
+
+    nodes: tuple[str, ...]
+    states: tuple[str, ...]
+    mean: Float[np.ndarray, " n"]
+    state: Float[np.ndarray, "n sources"]
+    bias: Float[np.ndarray, "node n"]
+    shared: Float[np.ndarray, "node n sources"]
+    own: Float[np.ndarray, "node n n"]
+
+    @property
+    def joint(self) -> Float[np.ndarray, "node n node n"]:
+        """Cov(e_i, e_j) of all pairs."""
+        count, n = self.bias.shape
+        flat, each = self.shared.reshape(count * n, -1), np.arange(count)
+        result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
+        result[each, :, each, :] += self.own
+        return result
+
+    @property
+    def of_state(self) -> Float[np.ndarray, "node n n"]:
+        """Cov(e_i, x)."""
+        return np.asarray(self.shared @ self.state.T)
+
+    @property
+    def state_covariance(self) -> Float[np.ndarray, "n n"]:
+        """Cov x."""
+        return np.asarray(self.state @ self.state.T)
+
+    def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
+        """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
+        count, n = self.bias.shape
+        scale = np.sqrt(np.einsum("iaa->ia", self.own) + np.einsum("ias,ias->ia", self.shared, self.shared))
+        scale = np.where(scale > 0, scale, 1.0)
+        least = np.linalg.eigvalsh(self.own / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+        weights = factored_weights(self.shared, self.own) if least > REGULAR else matrix_weights(self.joint)
+        shared = np.asarray(weights).reshape(n, count * n) @ self.shared.reshape(count * n, -1)
+        return np.asarray(weights), shared @ shared.T + np.einsum("aib,ibc,dic->ad", weights, self.own, weights)
+
+
+def cross_covariances(network: Network, filter: str, horizon: int, inputs: ArrayLike | None = None) -> CrossCovariances:
+    """How the errors of the filters of this name are correlated after `horizon` steps of complete data.
+
+    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
+    what a filter wrongly believes of the world enters too.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network that is not linear, filters whose gains depend on data, channels that remember.
+    Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
+    """
+    fusion = Fusion(filter, MatrixWeights())
+    filters, u = _prepared(Network(network.plant, network.nodes, {"all": fusion}, network.relays), horizon, inputs)
+    with jax.enable_x64(True):
+        found: Factors = to_numpy(_factors(filters, u))
+    parts = found.mean, found.state, found.bias, found.shared, found.own
+    return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
+
+
+def fused_covariances(
+    network: Network, horizon: int, inputs: ArrayLike | None = None
+) -> dict[str, Float[np.ndarray, "time n n"]]:
+    """The covariances of the network's informed fusions, by name, for complete data.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network without an informed fusion.
+    """
+    filters, u = _prepared(network, horizon, inputs)
+    with jax.enable_x64(True):
+        found: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
+    return found
+
+
+def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
+    """Filters planned for the inputs."""
+    network.check_horizon(check_horizon(horizon))
+    u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(network.inputs)))
+    filters = AllFilters(network)
+    if not filters.centres:
+        raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
+    return plan(filters, u), u
+
+
+@large_program
+def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
+    centre = filters.centres[0]
+
+    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
+        (own, factors), (k, u_k) = carry, row
+        local = centre.gathered(_matrices(filters, centre, own, u_k, k))
+        spread = factors.state @ factors.state.T
+        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
+        return (_followed(filters, own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+
+    own, _, _, known = filters.init()
+    start = own, initial_factors(known[0].errors, len(u))
+    result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    return result
+
+
+@large_program
+def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+    def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        (own, known), (k, u_k) = carry, row
+        told: dict[str, jax.Array] = {}
+        following = []
+        for centre, state in zip(filters.centres, known, strict=True):
+            means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
+            after, found = centre.step(state, _matrices(filters, centre, own, u_k, k), means, u_k, k)
+            following.append(after)
+            told |= {name: jnp.asarray(estimate.covariance) for name, estimate in found.items()}
+        return (_followed(filters, own, u_k, k), tuple(following)), told
+
+    own, _, _, known = filters.init()
+    return jax.lax.scan(body, (own, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+
+
+def _matrices(filters: AllFilters, centre: Centre, own: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+    """Of the centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
+    return [filters.alike[i].matrices(own[i], f, _quiet(filters, i), u, k) for i, f in centre.sources]
+
+
+def _followed(filters: AllFilters, own: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+    """The nodes' states after step k."""
+    pairs = zip(filters.alike, own, strict=True)
+    return tuple(item.step(state, _quiet(filters, i), u, k)[0] for i, (item, state) in enumerate(pairs))
+
+
+def _quiet(filters: AllFilters, kind: int) -> jax.Array:
+    return jnp.zeros((filters.alike[kind].nodes, filters.alike[kind].filters.received))
