@@ -85,6 +85,28 @@ def test_monte_carlo_agrees_with_what_is_claimed():
         np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
 
 
+def test_a_tree_of_relays_is_its_weights_on_the_leaves():
+    """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
+    plant, parts = random_case(11, nodes=5)
+    net, groups = network(plant, parts, {}), {"a": [0, 3], "b": [1, 2, 4]}
+    leaves = hg.simulation.cross_covariances(net, "own", 6)
+    level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
+    by_hand = np.zeros((2, 3, 5, 3))
+    for r, mine in enumerate(groups.values()):
+        by_hand[r][:, mine] = hg.fusion.matrix_weights(leaves.joint[mine][:, :, mine])
+    joint = np.einsum("raib,ibjc,sdjc->rasd", by_hand, leaves.joint, by_hand)
+    np.testing.assert_allclose(level.joint, joint, rtol=1e-7, atol=1e-9)  # weights lose the digits of cond(P)
+    weights, covariance = level.matrix_weights()
+    flat = leaves.matrix_weights()[1]
+    assert np.trace(flat) <= np.trace(covariance) <= min(np.trace(joint[r, :, r]) for r in (0, 1))
+    record = hg.monte_carlo(net, 6, 4000, 2)
+    errors = np.stack([record.errors(node, "own")[:, -1] for node in net.names], axis=1)
+    square = np.sum(np.einsum("ars,rsib,kib->ka", weights, by_hand, errors) ** 2, axis=-1)
+    assert abs(square.mean() - np.trace(covariance)) < 3 * square.std() / np.sqrt(len(square))
+    with pytest.raises(ValueError, match=r"nodes: expected one relay for each, got several for \['node 1'\]"):
+        leaves.fused({"a": ["node 1"], "b": ["node 1", "node 2"]})
+
+
 def test_losses_that_are_told_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
     plant, parts = random_case(7, nodes=2)

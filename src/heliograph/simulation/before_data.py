@@ -1,5 +1,6 @@
 """What is known of a network of linear filters before any data: how their errors are correlated, what fusion gives."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -43,11 +44,7 @@ class CrossCovariances:
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Cov(e_i, e_j) of all pairs."""
-        count, n = self.bias.shape
-        flat, each = self.shared.reshape(count * n, -1), np.arange(count)
-        result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
-        result[each, :, each, :] += self.own
-        return result
+        return _joint(self.shared, self.own)
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -61,13 +58,57 @@ class CrossCovariances:
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
-        count, n = self.bias.shape
-        scale = np.sqrt(np.einsum("iaa->ia", self.own) + np.einsum("ias,ias->ia", self.shared, self.shared))
-        scale = np.where(scale > 0, scale, 1.0)
-        least = np.linalg.eigvalsh(self.own / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-        weights = factored_weights(self.shared, self.own) if least > REGULAR else matrix_weights(self.joint)
-        shared = np.asarray(weights).reshape(n, count * n) @ self.shared.reshape(count * n, -1)
-        return np.asarray(weights), shared @ shared.T + np.einsum("aib,ibc,dic->ad", weights, self.own, weights)
+        weights = _weights(self.shared, self.own)
+        shared, own = _weighted(weights, self.shared, self.own)
+        return weights, shared @ shared.T + own
+
+    def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
+        """Relays that forward the matrix-weighted estimate of the nodes each hears, as the nodes of the next level.
+
+        An error W e is a linear map of the nodes' errors, so what it shares with others is W shared, and W own W' is
+        its own as long as no two relays hear the same node. Known means of the errors are taken off. A tree of any
+        depth is this again and again; its root is `matrix_weights` of the last level.
+
+        Raises:
+            ValueError: no relays, a relay that hears nobody, unknown nodes, a node that two relays hear.
+        """
+        heard = [name for names in relays.values() for name in names]
+        unknown = sorted(set(heard) - set(self.nodes))
+        if not relays or unknown or not all(relays.values()):
+            raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
+        if len(set(heard)) < len(heard):
+            raise fail("nodes", "one relay for each", f"several for {sorted({n for n in heard if heard.count(n) > 1})}")
+        place = {name: i for i, name in enumerate(self.nodes)}
+        parts = []
+        for names in relays.values():
+            mine = [place[name] for name in names]
+            shared, own = self.shared[mine], self.own[mine]
+            parts.append(_weighted(_weights(shared, own), shared, own))
+        shared, own = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+        bias = np.zeros((len(relays), len(self.mean)))
+        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, own)
+
+
+def _weights(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", own) + np.einsum("ias,ias->ia", shared, shared))
+    scale = np.where(scale > 0, scale, 1.0)
+    least = np.linalg.eigvalsh(own / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, own) if least > REGULAR else matrix_weights(_joint(shared, own)))
+
+
+def _weighted(
+    weights: np.ndarray, shared: np.ndarray, own: np.ndarray
+) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
+    """What a weighted sum of the errors shares with others, and the covariance of its own part."""
+    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, own, weights)
+
+
+def _joint(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "node n node n"]:
+    count, n, _ = shared.shape
+    flat, each = shared.reshape(count * n, -1), np.arange(count)
+    result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
+    result[each, :, each, :] += own
+    return result
 
 
 def cross_covariances(network: Network, filter: str, horizon: int, inputs: ArrayLike | None = None) -> CrossCovariances:
