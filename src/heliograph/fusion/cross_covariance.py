@@ -116,8 +116,8 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
 class Factors(NamedTuple):
     """The same by its sources: x = E x + state s, e_i = E e_i + shared_i s + what is node i's own, s white with Cov I.
 
-    s are x_0 and the process noise of each step. So Cov(e_i, e_j) = shared_i shared_j' + (own_i if i is j): a step
-    costs as much as there are nodes, not pairs of them.
+    s are x_0 and the process noise of each step, and what the channels add where nodes share them. So Cov(e_i, e_j) =
+    shared_i shared_j' + (own_i if i is j): a step costs as much as there are nodes, not pairs of them.
     """
 
     mean: Float[jax.Array, " n"]
@@ -127,31 +127,37 @@ class Factors(NamedTuple):
     own: Float[jax.Array, "node n n"]
 
 
-def initial_factors(errors: Errors, steps: int) -> Factors:
-    """Before the first of so many steps: all is the deviation of x_0."""
+def initial_factors(errors: Errors, sources: int) -> Factors:
+    """Before the first step, with room for so many sources: all is the deviation of x_0."""
     nodes, n = errors.bias.shape
-    state = jnp.zeros((n, n * (steps + 1))).at[:, :n].set(cholesky(errors.covariance))
+    state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.covariance))
     shared = jnp.broadcast_to(state, (nodes, *state.shape))
     return Factors(errors.mean, state, errors.bias, shared, jnp.zeros((nodes, n, n)))
 
 
-def advance_factors(
-    factors: Factors, step: ErrorStep, motion: Motion, noise: Float[Array, "node m m"], k: jax.Array
-) -> Factors:
-    """Over step k of nodes that share nothing but the plant: s gets the process noise of the step."""
-    n = len(factors.mean)
+def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Array, k: jax.Array) -> Factors:
+    """Over step k: s gets the process noise, and the noise of what is heard where nodes share it."""
+    nodes, n = factors.bias.shape
     root = cholesky(jnp.asarray(motion.noise))
     state = jnp.asarray(motion.matrix) @ factors.state
     shared = step.transition @ factors.shared + step.of_state @ factors.state
     bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
     moved = step.transition @ factors.own @ jnp.swapaxes(step.transition, 1, 2)
-    place = n * (k + 1)
+    new = step.of_noise @ root
+    if noise.ndim == 4:
+        m = noise.shape[1]
+        heard = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
+        new = jnp.concatenate([new, -step.gain @ heard], axis=-1)
+        root = jnp.pad(root, ((0, 0), (0, nodes * m)))
+    else:
+        moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
+    place = n + new.shape[-1] * k
     return Factors(
         jnp.asarray(motion.matrix) @ factors.mean + motion.shift,
         jax.lax.dynamic_update_slice(state, root, (0, place)),
         bias,
-        jax.lax.dynamic_update_slice(shared, step.of_noise @ root, (0, 0, place)),
-        symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2)),
+        jax.lax.dynamic_update_slice(shared, new, (0, 0, place)),
+        moved,
     )
 
 

@@ -16,7 +16,7 @@ from heliograph.numerics.check import array, check_horizon, fail
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.centre import Centre
+from heliograph.simulation.centre import Centre, Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, plan
 
@@ -124,7 +124,8 @@ def cross_covariances(network: Network, filter: str, horizon: int, inputs: Array
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
     fusion = Fusion(filter, MatrixWeights())
-    filters, u = _prepared(Network(network.plant, network.nodes, {"all": fusion}, network.relays), horizon, inputs)
+    alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
+    filters, u = _prepared(alone, horizon, inputs)
     with jax.enable_x64(True):
         found: Factors = to_numpy(_factors(filters, u))
     parts = found.mean, found.state, found.bias, found.shared, found.own
@@ -169,7 +170,9 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
         return (_followed(filters, own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
 
     own, _, _, known = filters.init()
-    start = own, initial_factors(known[0].errors, len(u))
+    nodes, n = known[0].errors.bias.shape
+    each = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
+    start = own, initial_factors(known[0].errors, each * len(u))
     result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
     return result
 

@@ -67,6 +67,42 @@ def _heard(sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covarian
     return Hearing(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
+class AbstractHears(eqx.Module):
+    """What the nodes hear of the plant, in the nodes' order, with rows of zeros up to the longest measurement."""
+
+    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+        """At step k, when the plant has these moments."""
+        raise NotImplementedError
+
+
+class Apart(AbstractHears):
+    """Nodes that share nothing, by groups; `order` brings them into the order of the nodes."""
+
+    groups: tuple[Listening, ...]
+    order: np.ndarray
+    size: int = eqx.field(static=True)
+
+    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+        """Group after group."""
+        parts = [item.hears(mean, covariance, k, self.size) for item in self.groups]
+        return Hearing(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+
+
+class Together(AbstractHears):
+    """One sensor and one channel, of which each node hears some `rows`; -1 stands for none."""
+
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+    rows: np.ndarray
+
+    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+        """The rows of each node, and how their noises are correlated."""
+        gain, offset, noise = _heard(at(self.sensor, k), at(self.channel, k), mean, covariance)
+        gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
+        noise = jnp.pad(noise, (0, 1))
+        return Hearing(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
+
+
 class CentreState(NamedTuple):
     """Moments of the errors, and the states of the rules, by name."""
 
@@ -82,7 +118,7 @@ class Centre(eqx.Module):
     """
 
     plant: AnyPlant
-    listening: tuple[Listening, ...]
+    listening: AbstractHears
     rules: dict[str, AbstractInformedFusion]
     order: np.ndarray
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -107,9 +143,7 @@ class Centre(eqx.Module):
         plant: LinearPlant = at(self.plant, k)
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
-        after = moved_state(mean, covariance, motion)
-        parts = [item.hears(*after, k, self.size) for item in self.listening]
-        hearing = Hearing(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+        hearing = self.listening.hears(*moved_state(mean, covariance, motion), k)
         return motion, error_step(local, motion, hearing), hearing.noise
 
     def gathered(self, parts: Sequence[Plan]) -> Plan:
@@ -143,10 +177,11 @@ class Centre(eqx.Module):
 
 def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Listening:
     """Nodes of one structure."""
-    return Listening(stack(list(sensors)), stack([_described(channel) for channel in channels]))
+    return Listening(stack(list(sensors)), stack([described(channel) for channel in channels]))
 
 
-def _described(channel: Channel) -> SecondOrder | OverTime:
+def described(channel: Channel) -> SecondOrder | OverTime:
+    """The channel's second moments where all of it arrives, for each step where it varies."""
     if isinstance(channel, OverTime):
         return over_time([second_order(arrived(one)) for one in unstack(channel)])
     return second_order(arrived(channel))

@@ -19,7 +19,7 @@ from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
-from heliograph.simulation.centre import Centre, CentreState, listening
+from heliograph.simulation.centre import AbstractHears, Apart, Centre, CentreState, Together, described, listening
 from heliograph.simulation.network import FUSED, Network, Node
 
 
@@ -255,16 +255,29 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
     sources = tuple({places[node, name][:2]: None for node in mine})
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
     found = {node: i for i, node in enumerate(node for names in groups for node in names)}
-    parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
+    order, size = np.array([found[node] for node in mine]), max(network.nodes[node].received for node in mine)
     return Centre(
         plant=network.plant,
-        listening=tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts),
+        listening=_hears(network, mine, groups, order, size),
         rules=rules,
-        order=np.array([found[node] for node in mine]),
+        order=order,
         sources=sources,
-        size=max(network.nodes[node].received for node in mine),
+        size=size,
         claim=claims[next(iter(rules))],
     )
+
+
+def _hears(
+    network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
+) -> AbstractHears:
+    """What a centre knows of how these nodes hear."""
+    if network.common is not None:
+        rows = network.rows()
+        padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
+        return Together(network.common.sensor, described(network.common.channel), np.array(padded))
+    parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
+    each = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    return Apart(each, order, size)
 
 
 def _initial(item: AbstractFilter) -> PyTree:
