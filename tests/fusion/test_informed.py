@@ -118,6 +118,22 @@ def test_losses_that_are_told_count_with_the_pattern_that_happened():
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
+def test_losses_at_random_keep_the_claim():
+    """Each run has the covariances of its own losses: mean squares agree within three standard errors."""
+    plant, parts = random_case(5)
+    perfect = network(plant, parts, {})
+    nodes = {
+        name: hg.Node(node.sensor, hg.erasure(node.channel, 0.6), node.filters) for name, node in perfect.nodes.items()
+    }
+    kept = {name: rules()[name] for name in ("matrix", "all_reports")}
+    record = hg.monte_carlo(hg.Network(plant, nodes, kept), 4, 3000, 11)
+    for name, estimate in record.estimates["fused"].items():
+        covariance = np.asarray(estimate.covariance)[:, -1]
+        assert estimate.claim == "exact" and np.ptp(np.trace(covariance, axis1=1, axis2=2)) > 0
+        excess = np.sum(record.errors("fused", name)[:, -1] ** 2, axis=-1) - np.trace(covariance, axis1=1, axis2=2)
+        assert abs(excess.mean()) < 3 * excess.std() / np.sqrt(len(excess))
+
+
 def test_gains_that_are_not_the_best_are_taken_as_they_are():
     """A filter that trusts the mean gain: its claim is nominal, the fused one exact, and Monte Carlo agrees."""
     plant, parts = random_case(3, nodes=2)
