@@ -113,26 +113,7 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
     quiet = jnp.zeros(item.received)
 
     def body(state: Any, row: tuple[jax.Array, jax.Array]) -> tuple[Any, tuple[Plan, jax.Array]]:
-        k, u = row
-        none = jnp.zeros_like(state.mean)
-
-        def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
-            """What follows from each, and all that the means have no part in."""
-            prior = item.predict(state._replace(mean=before), u, k)
-            after, heard = item.correct(prior._replace(mean=moved), z, k)
-            values = jnp.asarray(prior.mean), jnp.asarray(after.mean), jnp.asarray(heard.value)
-            return values, (values, prior, after, heard)
-
-        derivatives, found = jax.jacfwd(means, (0, 1, 2), has_aux=True)(none, none, quiet)
-        (drift, _, unexpected), prior, after, heard = found
-        one = Plan(
-            transition=derivatives[0][0],
-            drift=drift,
-            gain=derivatives[1][2],
-            output=-derivatives[2][1],
-            offset=-unexpected,
-            innovation=jnp.asarray(heard.covariance),
-        )
+        one, prior, after = _followed(item, state, quiet, row[1], row[0])
         return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
 
     start = item.init()
@@ -150,6 +131,53 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
         inputs=item.inputs,
         received=item.received,
     )
+
+
+def _followed(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, Any, Any]:
+    """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    none = jnp.zeros_like(state.mean)
+
+    def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+        """What follows from each, and all that the means have no part in."""
+        prior = item.predict(state._replace(mean=before), u, k)
+        after, heard = item.correct(prior._replace(mean=moved), z, k)
+        values = jnp.asarray(prior.mean), jnp.asarray(after.mean), jnp.asarray(heard.value)
+        return values, (values, prior, after, heard)
+
+    derivatives, found = jax.jacfwd(means, (0, 1, 2), has_aux=True)(none, none, z)
+    (drift, _, unexpected), prior, after, heard = found
+    one = Plan(
+        transition=derivatives[0][0],
+        drift=drift,
+        gain=derivatives[1][2],
+        output=-derivatives[2][1],
+        offset=-unexpected,
+        innovation=jnp.asarray(heard.covariance),
+    )
+    return one, prior, after
+
+
+def linear_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> Plan:
+    """The matrices of one step of a filter of which only the mean depends on data; of z only what is missing counts.
+
+    Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
+    """
+    if isinstance(item, PlannedFilter):
+        found: Plan = at(item.steps, k)
+        return found
+    one, _, _ = _followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    present = ~jnp.isnan(z)
+    return one._replace(
+        gain=jnp.where(present, one.gain, 0.0),
+        output=jnp.where(present[:, None], one.output, 0.0),
+        offset=jnp.where(present, one.offset, 0.0),
+    )
+
+
+def is_linear_filter(item: AbstractFilter) -> bool:
+    """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
+    planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)
+    return isinstance(planned, PlannedFilter) and planned.want is None
 
 
 def _seen(covariance: jax.Array, want: Array | None) -> jax.Array:

@@ -1,5 +1,13 @@
 """Public names of the room; the package loads them when first used."""
 
+from .all_reports import (
+    AllReports as AllReports,
+)
+from .informed import (
+    DiagonalWeights as DiagonalWeights,
+    MatrixWeights as MatrixWeights,
+    ScalarWeights as ScalarWeights,
+)
 from .level import (
     fused_error_norm as fused_error_norm,
     fused_level as fused_level,
@@ -17,4 +25,9 @@ from .rules import (
     InverseCovarianceIntersection as InverseCovarianceIntersection,
     WeightedFusion as WeightedFusion,
     fuse as fuse,
+)
+from .weights import (
+    diagonal_weights as diagonal_weights,
+    matrix_weights as matrix_weights,
+    scalar_weights as scalar_weights,
 )

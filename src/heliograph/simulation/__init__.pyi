@@ -1,5 +1,10 @@
 """Public names of the room; the package loads them when first used."""
 
+from .before_data import (
+    CrossCovariances as CrossCovariances,
+    cross_covariances as cross_covariances,
+    fused_covariances as fused_covariances,
+)
 from .boundedness import (
     Boundedness as Boundedness,
 )

@@ -77,6 +77,25 @@ class OwnChannels(AbstractAir):
         return tuple(after for after, _ in results), tuple(z for _, z in results)
 
 
+class CommonChannel(AbstractAir):
+    """One sensor and one channel, drawn once a step; each node hears its rows of what arrives."""
+
+    sensor: AnySensor
+    channel: Channel
+    rows: tuple[np.ndarray, ...]  # (node, received) of each group
+
+    def init(self, key: jax.Array) -> PyTree:
+        """The channel forgets."""
+        return ()
+
+    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+        """The sensor measures x, the channel delivers."""
+        sensor, place = at(self.sensor, k), checksum(SENDER)
+        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, place, SENSOR))
+        _, z = deliver(self.channel, (), y, key, k, place, ())
+        return state, tuple(z[rows] for rows in self.rows)
+
+
 class Relayed(NamedTuple):
     """What the relays will send, (relay, n), and the states of the hops that remember."""
 
@@ -187,6 +206,10 @@ def air_of(network: Network) -> AbstractAir:
             tuple(tuple(listeners[name] for name in names) for names in network.groups),
             memory_places({name: hop for name, (_, _, _, hop) in _remembering(network.relays).items()}),
         )
+    if network.common is not None:
+        rows = network.rows()
+        heard = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
+        return CommonChannel(network.common.sensor, network.common.channel, heard)
     antennas = []
     own = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in own.items()})

@@ -5,9 +5,11 @@ from typing import NamedTuple
 from zlib import crc32
 
 import equinox as eqx
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.schedule import Schedule
 from heliograph.model.channel import Channel, check_link
@@ -17,7 +19,8 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import check_horizon, fail, shown, table
-from heliograph.random_affine.base import AbstractRandomAffine, anonymous
+from heliograph.random_affine.base import AbstractRandomAffine, anonymous, check_forgets
+from heliograph.simulation.centre import informed_claim
 
 FUSED = "fused"  # the name under which results of several nodes stand
 OWN = "own"  # a relay's one filter
@@ -68,6 +71,13 @@ class Listener(eqx.Module):
     complete: bool = eqx.field(static=True)
 
 
+class Common(eqx.Module):
+    """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
+
+    sensor: AnySensor
+    channel: Channel
+
+
 class Kind(NamedTuple):
     """Filters that differ in numbers alone: `filters` of the nodes of one group."""
 
@@ -82,7 +92,8 @@ class Network(eqx.Module):
     central filter that receives all measurements, joined in the order of the nodes. In results these stand under the
     node name "fused".
 
-    `Network.of_relays` makes the network of relays that filter and forward. Nodes that share a structure form a group,
+    `Network.of_relays` makes the network of relays that filter and forward, `Network.sharing` that of nodes which share
+    a sensor's noise, a hop or a shadow. Nodes that share a structure form a group,
     their filters that share one a kind: each is one array axis from here to the results, where names come back.
 
     Raises:
@@ -93,6 +104,7 @@ class Network(eqx.Module):
     nodes: dict[str, Node | Listener]
     fused: dict[str, Fusion | AbstractFilter]
     relays: RelayNetwork | None
+    common: Common | None
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
@@ -103,8 +115,9 @@ class Network(eqx.Module):
         nodes: Mapping[str, Node | Listener],
         fused: Mapping[str, Fusion | AbstractFilter] | None = None,
         relays: RelayNetwork | None = None,
+        common: Common | None = None,
     ):
-        self.plant, self.relays = plant, relays
+        self.plant, self.relays, self.common = plant, relays, common
         self.nodes = table("nodes", nodes, "nodes")
         self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
         self.names = tuple(self.nodes)
@@ -113,7 +126,7 @@ class Network(eqx.Module):
             raise fail("network", "at least one node", "none")
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            _check_type(f"node {name!r}", node, Node if relays is None else Listener)
+            _check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
             for filter_, one in node.filters.items():
                 _check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
@@ -172,6 +185,39 @@ class Network(eqx.Module):
         }
         return Network(relays.plant, nodes, relays=relays)
 
+    @staticmethod
+    def sharing(
+        plant: AnyPlant,
+        sensor: AnySensor,
+        channel: Channel,
+        filters: Mapping[str, Mapping[str, AbstractFilter]],
+        fused: Mapping[str, Fusion | AbstractFilter] | None = None,
+    ) -> "Network":
+        """Nodes that hear parts of one channel: they share what is in it once, a sensor's noise, a hop, a shadow.
+
+        `filters` of each node, all of which hear the same number of outputs: the first node the first ones, and so on.
+
+        Raises:
+            ValueError: filters that do not hear all outputs once, a channel that remembers, parts that do not fit.
+        """
+        check_link(first(sensor), first(channel), len(first(plant).states))
+        check_forgets("channel of nodes that share it", first(channel))
+        heard = {name: max((item.received for item in own.values()), default=0) for name, own in filters.items()}
+        if sum(heard.values()) != first(channel).outputs:
+            raise fail("nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", heard)
+        names, complete = tuple(first(sensor).outputs), not first(channel).erases
+        for name, own in filters.items():
+            _check_filters(own, heard[name])
+        nodes = {name: Listener(dict(own), heard[name], names, complete) for name, own in filters.items()}
+        return Network(plant, nodes, fused, common=Common(sensor, channel))
+
+    def rows(self) -> dict[str, np.ndarray]:
+        """Which outputs of the common channel each node hears."""
+        ends = np.cumsum([self.nodes[name].received for name in self.names])
+        return {
+            name: np.arange(end - self.nodes[name].received, end) for name, end in zip(self.names, ends, strict=True)
+        }
+
     def restricted_to(self, names: Iterable[str]) -> "Network":
         """The network of a recording that lacks what some relays heard: without the filters of these.
 
@@ -229,7 +275,17 @@ class Network(eqx.Module):
     def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
         if isinstance(item, AbstractFilter):
             return item.claim
-        return item.claim([self.nodes[n].filters[item.filter].claim for n in self.nodes_with(item.filter)])
+        names = self.nodes_with(item.filter)
+        if not isinstance(item.rule, AbstractInformedFusion):
+            return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
+        rule, own = type(item.rule).__name__, {n: self.nodes[n] for n in names}
+        if item.quantizer is not None:
+            raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
+        worlds = {n: v if isinstance(v, Node) else self.common for n, v in own.items()}
+        known = {n: (w.sensor, w.channel, own[n].filters[item.filter]) for n, w in worlds.items() if w is not None}
+        if len(known) < len(own):
+            raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
+        return informed_claim(rule, self.plant, known)
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

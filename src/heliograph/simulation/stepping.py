@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plan import Plan, linear_step
+from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
@@ -17,7 +19,8 @@ from heliograph.model.over_time import at, stack, structure
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.centre import AbstractHears, Apart, Centre, CentreState, Together, described, listening
+from heliograph.simulation.network import FUSED, Network, Node
 
 
 class Alike(eqx.Module):
@@ -44,6 +47,15 @@ class Alike(eqx.Module):
         both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
         after, estimate = both(self.filters, states, jnp.tile(z, (self.count, 1)))
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), estimate)
+
+    def matrices(self, states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array) -> Plan:
+        """Matrices of this step of filter f at each node, from the states before it; (node, ...)."""
+        mine = slice(f * self.nodes, (f + 1) * self.nodes)
+        filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
+        found: Plan = eqx.filter_vmap(
+            lambda item, state, z: linear_step(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0)
+        )(filters, states, z)
+        return found
 
 
 class Fused(eqx.Module):
@@ -94,13 +106,14 @@ class Fused(eqx.Module):
 
 
 class AllFilters(eqx.Module):
-    """Every filter of a network: those of the nodes by kind, fusion rules, and central filters.
+    """Every filter of a network: those of the nodes by kind, fusion rules, centres that know more, central filters.
 
     `order` brings the groups' measurements, joined, into the order of the nodes.
     """
 
     alike: tuple[Alike, ...]
     fusions: tuple[Fused, ...]
+    centres: tuple[Centre, ...]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
@@ -117,7 +130,7 @@ class AllFilters(eqx.Module):
             for g, names in network.kinds
         )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
-        self.fusions = _fusions(network)
+        self.fusions, self.centres = _fusions(network), _centres(network)
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
         entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
@@ -126,9 +139,15 @@ class AllFilters(eqx.Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """States before the first step: of the nodes' filters, of central filters, and of quantizers."""
+        """States before the first step: of the nodes' filters, of central filters, of quantizers, and of centres."""
         central = {name: _initial(item) for name, item in self.central.items()}
-        return tuple(item.init() for item in self.alike), central, tuple(item.init(self.n) for item in self.fusions)
+        own = tuple(item.init() for item in self.alike)
+        sent = tuple(item.init(self.n) for item in self.fusions)
+        return own, central, sent, tuple(self._started(item, own) for item in self.centres)
+
+    def _started(self, centre: Centre, own: Sequence[PyTree]) -> CentreState:
+        means = [own[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
+        return centre.init(means)
 
     def step(
         self, states: PyTree, z: Sequence[jax.Array], u: jax.Array, k: jax.Array
@@ -137,7 +156,7 @@ class AllFilters(eqx.Module):
 
         Gives "estimates" by kind, (filter, node, ...), "fused" by name, and "uplinks" of what has quantizers.
         """
-        own, central, sent = states
+        own, central, sent, known = states
         results = [item.step(state, z[item.group], u, k) for item, state in zip(self.alike, own, strict=True)]
         estimates = tuple(estimate for _, estimate in results)
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
@@ -151,8 +170,15 @@ class AllFilters(eqx.Module):
             after.append(following)
             fused |= found
             uplinks |= traffic
+        learned = []
+        for centre, state in zip(self.centres, known, strict=True):
+            parts = [self.alike[i].matrices(own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources]
+            state, found = centre.step(state, parts, [estimates[i].mean[f] for i, f in centre.sources], u, k)
+            learned.append(state)
+            fused |= found
         own, central = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}
-        return (own, central, tuple(after)), {"estimates": estimates, "fused": fused, "uplinks": uplinks}
+        following = own, central, tuple(after), tuple(learned)
+        return following, {"estimates": estimates, "fused": fused, "uplinks": uplinks}
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
@@ -189,7 +215,7 @@ def _fusions(network: Network) -> tuple[Fused, ...]:
     """The network's fusions, those of one structure together."""
     alike: dict[object, list[str]] = {}
     for name, item in network.fused.items():
-        if isinstance(item, Fusion):
+        if isinstance(item, Fusion) and not isinstance(item.rule, AbstractInformedFusion):
             nodes = network.nodes_with(item.filter)
             alike.setdefault(structure((item.rule, item.uplinks(nodes), (None,) * len(nodes))), []).append(name)
     places, claims = network.places(), network.claims().get(FUSED, {})
@@ -211,6 +237,47 @@ def _fused(
     quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
     rules = stack([item.rule for item in items])
     return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims))
+
+
+def _centres(network: Network) -> tuple[Centre, ...]:
+    """One for the informed fusions of each filter."""
+    rules: dict[str, dict[str, AbstractInformedFusion]] = {}
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion):
+            rules.setdefault(item.filter, {})[name] = item.rule
+    return tuple(_centre(network, name, mine) for name, mine in rules.items())
+
+
+def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre:
+    """What the centre knows of the nodes that have the filter `name`."""
+    places, claims = network.places(), network.claims()[FUSED]
+    mine = network.nodes_with(name)
+    sources = tuple({places[node, name][:2]: None for node in mine})
+    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    found = {node: i for i, node in enumerate(node for names in groups for node in names)}
+    order, size = np.array([found[node] for node in mine]), max(network.nodes[node].received for node in mine)
+    return Centre(
+        plant=network.plant,
+        listening=_hears(network, mine, groups, order, size),
+        rules=rules,
+        order=order,
+        sources=sources,
+        size=size,
+        claim=claims[next(iter(rules))],
+    )
+
+
+def _hears(
+    network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
+) -> AbstractHears:
+    """What a centre knows of how these nodes hear."""
+    if network.common is not None:
+        rows = network.rows()
+        padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
+        return Together(network.common.sensor, described(network.common.channel), np.array(padded))
+    parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
+    each = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    return Apart(each, order, size)
 
 
 def _initial(item: AbstractFilter) -> PyTree:

@@ -1,0 +1,36 @@
+"""The example as a folder of results."""
+
+from functools import partial
+from pathlib import Path
+
+from heliograph.examples.fusion.compute import STAGES, Outcome, compute
+from heliograph.numerics.check import check_seed
+from heliograph.report.results import Json, Results, write_results
+
+NAME = "fusion"
+
+
+def example(out: Path, seed: int = 0) -> None:
+    """Compute every case and write figures, report and summary to `out`/fusion.
+
+    Raises:
+        ValueError: a folder that cannot be written, or one that holds something else.
+        ModuleNotFoundError: the extra `report` is not installed.
+    """
+    target = Path(out) / NAME
+    write_results(target, STAGES, partial(compute, check_seed("seed", seed)), results)
+    print(f"Report: {target / 'report.html'}")
+
+
+def results(outcome: Outcome) -> Results:
+    """Everything that the folder holds."""
+    from heliograph.examples.fusion.page import fusion_figures, fusion_page
+
+    return Results(fusion_figures(outcome), partial(fusion_page, outcome), summary(outcome), lambda folder: None)
+
+
+def summary(outcome: Outcome) -> dict[str, Json]:
+    """Traces by case and rule, the tree, the scale, and what was measured."""
+    cases: dict[str, Json] = {name: dict(numbers) for name, numbers in outcome.cases.items()}
+    measured: dict[str, Json] = {rule: dict(numbers) for rule, numbers in outcome.measured.items()}
+    return {**cases, "tree": dict(outcome.tree), "scale": dict(outcome.scale), "measured": measured}

@@ -1,0 +1,182 @@
+"""How the errors of local linear filters are correlated, before any data: they share the plant, and perhaps more.
+
+Filter i predicts m- = F m + f and corrects m = m- + K (z - C m- - c), whatever it believes. The world moves
+x- = A x + b + w and lets it hear z = M x- + o + nu. With e = x - m, U = I - K C and L = K (M - C):
+  e+ = U F e + [U (A - F) - L A] x + [U (b - f) - L b - K (o - c)] + (U - L) w - K nu.
+Where the filter believes in the world, the second and third term vanish: e+ = (I - K H)(A e + w) - K nu.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.plan import Plan
+from heliograph.numerics.linalg import cholesky, symmetrize
+from heliograph.numerics.small_matrix import rounding
+from heliograph.numerics.types import Array, Float
+
+SAME = 1e-13  # relative: two matrices that say the same after a few products
+
+
+class Motion(NamedTuple):
+    """The plant over one step, x- = A x + b + w with Q = Cov w: matrix A (n, n), shift b (n,), noise Q (n, n)."""
+
+    matrix: Float[Array, "n n"]
+    shift: Float[Array, " n"]
+    noise: Float[Array, "n n"]
+
+
+class Hearing(NamedTuple):
+    """What the nodes hear of x after a step, z_i = M_i x + o_i + nu_i; rows that a node has not are zero.
+
+    Shapes: gain M (node, m, n), offset o (node, m); noise E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes
+    share nothing.
+    """
+
+    gain: Float[Array, "node m n"]
+    offset: Float[Array, "node m"]
+    noise: Array
+
+
+class Errors(NamedTuple):
+    """Moments of the plant's state x and of the errors e_i = x - m_i, before any data.
+
+    mean E x and covariance Cov x; bias E e_i; own Cov(e_i, x); joint Cov(e_i, e_j).
+    """
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    bias: Float[jax.Array, "node n"]
+    own: Float[jax.Array, "node n n"]
+    joint: Float[jax.Array, "node n node n"]
+
+
+class ErrorStep(NamedTuple):
+    """e+ = transition e + of_state x + drift + of_noise w - gain nu, for each node."""
+
+    transition: Float[jax.Array, "node n n"]
+    of_state: Float[jax.Array, "node n n"]
+    drift: Float[jax.Array, "node n"]
+    of_noise: Float[jax.Array, "node n n"]
+    gain: Float[jax.Array, "node n m"]
+
+
+def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], starts: Float[Array, "node n"]) -> Errors:
+    """Before the first step: every filter starts at a known place, so all errors are x_0 but for their means."""
+    mean, covariance, starts = jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(starts)
+    nodes, n = starts.shape
+    own = jnp.broadcast_to(covariance, (nodes, n, n))
+    joint = jnp.broadcast_to(covariance[None, :, None, :], (nodes, n, nodes, n))
+    return Errors(mean, covariance, mean - starts, own, joint)
+
+
+def error_step(local: Plan, motion: Motion, hearing: Hearing) -> ErrorStep:
+    """The errors' own recursion; `local` has a leading axis of nodes."""
+    gain, identity = jnp.asarray(local.gain), jnp.eye(motion.matrix.shape[-1])
+    keep = identity - gain @ local.output
+    astray = gain @ _difference(hearing.gain, local.output)
+    moves = _difference(jnp.broadcast_to(motion.matrix, local.transition.shape), local.transition)
+    shifts = _difference(jnp.broadcast_to(motion.shift, local.drift.shape), local.drift)
+    drift = _times(keep, shifts) - astray @ jnp.asarray(motion.shift)
+    return ErrorStep(
+        transition=keep @ local.transition,
+        of_state=keep @ moves - astray @ motion.matrix,
+        drift=drift - _times(gain, _difference(hearing.offset, local.offset)),
+        of_noise=keep - astray,
+        gain=gain,
+    )
+
+
+def moved_state(
+    mean: Float[jax.Array, " n"], covariance: Float[jax.Array, "n n"], motion: Motion
+) -> tuple[Float[jax.Array, " n"], Float[jax.Array, "n n"]]:
+    """E x and Cov x after the step: what the nodes hear of depends on it."""
+    matrix = jnp.asarray(motion.matrix)
+    return matrix @ mean + motion.shift, matrix @ covariance @ matrix.T + motion.noise
+
+
+def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Errors:
+    """All pairs at once: P_ij+ = T_i P_ij T_j' + B_i Q B_j' + K_i S_ij K_j', and what a wrong belief adds."""
+    nodes, n = errors.bias.shape
+    mean, covariance = moved_state(errors.mean, errors.covariance, motion)
+    bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
+    carried = step.transition @ errors.own  # Cov(T e, x)
+    of_state = step.of_state @ errors.covariance
+    of_noise = step.of_noise @ motion.noise
+    own = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
+    left = jnp.concatenate([carried + of_state, step.of_state, of_noise], axis=-1).reshape(nodes * n, -1)
+    right = jnp.concatenate([step.of_state, carried, step.of_noise], axis=-1).reshape(nodes * n, -1)
+    once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
+    both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
+    joint = (both + left @ right.T).reshape(nodes, n, nodes, n)
+    return Errors(mean, covariance, bias, own, joint + heard_noise(step.gain, noise))
+
+
+class Factors(NamedTuple):
+    """The same by its sources: x = E x + state s, e_i = E e_i + shared_i s + what is node i's own, s white with Cov I.
+
+    s are x_0 and the process noise of each step, and what the channels add where nodes share them. So Cov(e_i, e_j) =
+    shared_i shared_j' + (own_i if i is j): a step costs as much as there are nodes, not pairs of them.
+    """
+
+    mean: Float[jax.Array, " n"]
+    state: Float[jax.Array, "n sources"]
+    bias: Float[jax.Array, "node n"]
+    shared: Float[jax.Array, "node n sources"]
+    own: Float[jax.Array, "node n n"]
+
+
+def initial_factors(errors: Errors, sources: int) -> Factors:
+    """Before the first step, with room for so many sources: all is the deviation of x_0."""
+    nodes, n = errors.bias.shape
+    state = jnp.zeros((n, n + sources)).at[:, :n].set(cholesky(errors.covariance))
+    shared = jnp.broadcast_to(state, (nodes, *state.shape))
+    return Factors(errors.mean, state, errors.bias, shared, jnp.zeros((nodes, n, n)))
+
+
+def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Array, k: jax.Array) -> Factors:
+    """Over step k: s gets the process noise, and the noise of what is heard where nodes share it."""
+    nodes, n = factors.bias.shape
+    root = cholesky(jnp.asarray(motion.noise))
+    state = jnp.asarray(motion.matrix) @ factors.state
+    shared = step.transition @ factors.shared + step.of_state @ factors.state
+    bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
+    moved = step.transition @ factors.own @ jnp.swapaxes(step.transition, 1, 2)
+    new = step.of_noise @ root
+    if noise.ndim == 4:
+        m = noise.shape[1]
+        heard = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
+        new = jnp.concatenate([new, -step.gain @ heard], axis=-1)
+        root = jnp.pad(root, ((0, 0), (0, nodes * m)))
+    else:
+        moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
+    place = n + new.shape[-1] * k
+    return Factors(
+        jnp.asarray(motion.matrix) @ factors.mean + motion.shift,
+        jax.lax.dynamic_update_slice(state, root, (0, place)),
+        bias,
+        jax.lax.dynamic_update_slice(shared, new, (0, 0, place)),
+        moved,
+    )
+
+
+def heard_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:
+    """K_i S_ij K_j', zero between nodes that share nothing."""
+    if noise.ndim == 4:
+        return jnp.einsum("iam,imjl,jbl->iajb", gain, noise, gain)
+    nodes, n, _ = gain.shape
+    each = jnp.arange(nodes)
+    blocks = symmetrize(gain @ noise @ jnp.swapaxes(gain, 1, 2))
+    return jnp.zeros((nodes, n, nodes, n)).at[each, :, each, :].set(blocks)
+
+
+def _difference(a: Array, b: Array) -> jax.Array:
+    """a - b, zero where it is rounding: a filter that believes in the world must not be told that it errs with x."""
+    a, b = jnp.asarray(a), jnp.asarray(b)
+    return jnp.where(jnp.abs(a - b) <= rounding(SAME, a) * (jnp.abs(a) + jnp.abs(b)), 0.0, a - b)
+
+
+def _times(matrix: Array, vector: Array) -> jax.Array:
+    """One product for each node."""
+    return jnp.einsum("iab,ib->ia", matrix, vector)

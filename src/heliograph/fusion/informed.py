@@ -1,0 +1,129 @@
+"""Fusion by rules that know how the local errors are correlated: best weights of what the nodes say now."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.fusion.weights import diagonal_weights, matrix_weights, scalar_weights, weighted
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Array, Float, PyTree
+
+Joint = Float[jax.Array, "node n node n"]
+
+
+class Happened(NamedTuple):
+    """What a fusion centre knows of one step: how plant and errors moved, E[nu nu'], and their moments after it."""
+
+    motion: Motion
+    step: ErrorStep
+    noise: Array
+    errors: Errors
+
+
+class AbstractInformedFusion(AbstractFusion):
+    """A rule that needs the joint covariance of the local errors; a `Network` carries it along and hands it over.
+
+    `start` is the rule's own state before the first step, `use` what it makes of the reports of one step.
+    """
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """Refused: what the local claims say of each error alone says nothing of the joint covariance."""
+        raise self._lacking()
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Refused: the local covariances alone are not enough."""
+        raise self._lacking()
+
+    def start(self, errors: Errors) -> PyTree:
+        """State before the first step."""
+        return ()
+
+    def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
+        """Next state, fused mean and covariance, from the nodes' means after a step."""
+        raise NotImplementedError
+
+    def _lacking(self) -> ValueError:
+        what = "the errors' joint covariance, which a Network of linear filters has"
+        return fail(f"fusion by {type(self).__name__}", what, "estimates with a covariance each")
+
+
+class AbstractWeights(AbstractInformedFusion):
+    """x = sum_i W_i x_i with sum_i W_i = I, best for the joint covariance P of the errors, which is then W P W'.
+
+    Known means of the errors are taken off. `with_mean`: the plant's own mean before any data is one estimate more; it
+    costs nothing, and no direction gets worse for it.
+    """
+
+    with_mean: eqx.AbstractVar[bool]
+
+    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+        """W from P."""
+        raise NotImplementedError
+
+    def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
+        """Weigh what is said now."""
+        found = happened.errors
+        unbiased, joint = jnp.asarray(means) + found.bias, found.joint
+        if self.with_mean:
+            unbiased = jnp.concatenate([unbiased, found.mean[None]])
+            joint = with_mean(found)
+        chosen = self.weights(joint)
+        return state, (jnp.einsum("aib,ib->a", chosen, unbiased), weighted(chosen, joint))
+
+
+def with_mean(errors: Errors) -> Joint:
+    """Joint covariance of the errors and of x - E x, the error of the plant's own mean."""
+    column = errors.own[:, :, None, :]
+    last = jnp.concatenate([jnp.moveaxis(errors.own, 2, 0), errors.covariance[:, None, :]], axis=1)
+    return jnp.concatenate([jnp.concatenate([errors.joint, column], axis=2), last[None]], axis=0)
+
+
+class MatrixWeights(AbstractWeights):
+    """The best linear unbiased estimate: a matrix weight for each node.
+
+    Claim: "exact" in a network of linear filters behind known laws that forget; needs what a `Network` knows.
+
+    Source: Bar-Shalom and Campo, The effect of the common process noise on the two-sensor fused-track covariance
+    (1986); Sun and Deng, Multi-sensor optimal information fusion Kalman filter (2004).
+    """
+
+    with_mean: bool = eqx.field(static=True, default=False)
+
+    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+        """Matrices."""
+        return matrix_weights(joint)
+
+
+class DiagonalWeights(AbstractWeights):
+    """The best unbiased weights of each component by itself: cheaper, and never better than `MatrixWeights`.
+
+    Claim: as `MatrixWeights`.
+
+    Source: Sun and Deng, Multi-sensor optimal information fusion Kalman filter (2004).
+    """
+
+    with_mean: bool = eqx.field(static=True, default=False)
+
+    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+        """Diagonal matrices."""
+        return diagonal_weights(joint)
+
+
+class ScalarWeights(AbstractWeights):
+    """One number for each node, the best for the trace (so units matter); poor where nodes see different states.
+
+    Claim: as `MatrixWeights`.
+
+    Source: Sun and Deng, Multi-sensor optimal information fusion Kalman filter (2004).
+    """
+
+    with_mean: bool = eqx.field(static=True, default=False)
+
+    def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
+        """Numbers."""
+        return scalar_weights(joint)

@@ -1,0 +1,90 @@
+"""Best linear unbiased weights of several estimates whose errors' joint covariance is known, also a singular one."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.types import Array, Float
+
+RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
+
+
+@compiled
+def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """W_i with sum_i W_i = I that make W P W' smallest: W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'.
+
+    P^+ alone is wrong where a combination of the estimates has no error. With U = P + E D E', D > 0, the range of E is
+    in that of U, and U gives the weights of P since W E is given. D is the mean of the estimates' own variances, so
+    units do not matter; one rank rule, on correlations.
+
+    Source: Rao, Linear Statistical Inference and its Applications (1973), 4i.4, the unified theory of least squares.
+    """
+    nodes, n = joint.shape[:2]
+    joint = jnp.asarray(joint)
+    variances = jnp.einsum("iaia->a", joint) / nodes
+    unit = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
+    scaled = joint / (unit[:, None, None] * unit)
+    total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
+    ones = jnp.tile(jnp.eye(n), (nodes, 1))
+    found = solve_known(total, ones).T  # E' U^+
+    weights = jnp.linalg.solve(found @ ones, found).reshape(n, nodes, n)
+    return jnp.asarray(unit[:, None, None] * weights / unit)
+
+
+@compiled
+def factored_weights(
+    shared: Float[Array, "node n sources"], own: Float[Array, "node n n"]
+) -> Float[jax.Array, "n node n"]:
+    """`matrix_weights` of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
+
+    P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E.
+    """
+    nodes, n, sources = shared.shape
+    factors = jnp.linalg.cholesky(jnp.asarray(own))
+    both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
+    white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
+    common, e = white[:, :sources], white[:, sources:]
+    inner = jnp.linalg.cholesky(jnp.eye(sources) + common.T @ common)
+    reduced = e - common @ jax.scipy.linalg.cho_solve((inner, True), common.T @ e)
+    information = e.T @ reduced
+    back = jax.lax.linalg.triangular_solve(factors, reduced.reshape(nodes, n, n), left_side=True, lower=True,
+                                           transpose_a=True)  # fmt: skip
+    weights = jnp.linalg.solve(information, jnp.moveaxis(back, 2, 0).reshape(n, -1)).reshape(n, nodes, n)
+    unbiased = jnp.linalg.solve(weights.sum(axis=1), weights.reshape(n, -1))  # what rounding took off the sum
+    return jnp.asarray(unbiased.reshape(n, nodes, n))
+
+
+@compiled
+def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """The best weights for each component of the state by itself, diagonal W_i."""
+    nodes, n = joint.shape[:2]
+    component = jnp.einsum("iaja->aij", jnp.asarray(joint))
+    each = jax.vmap(lambda one: matrix_weights(one.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
+    return jnp.einsum("ai,ab->aib", each, jnp.eye(n))
+
+
+@compiled
+def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
+    """One number for each estimate, W_i = w_i I, that make tr W P W' smallest."""
+    nodes, n = joint.shape[:2]
+    traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
+    one = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
+    return jnp.einsum("i,ab->aib", one, jnp.eye(n))
+
+
+def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) -> Float[jax.Array, "N q"]:
+    """U^+ B for a positive semidefinite U, by its correlation matrix; directions that U has not are skipped."""
+    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(total), 0.0))
+    scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
+    values, vectors = jnp.linalg.eigh(scale[:, None] * total * scale)
+    used = values > RANK * float(np.finfo(values.dtype).eps) * values[-1]
+    inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
+    root = scale[:, None] * vectors
+    return jnp.asarray((root * inverse) @ (root.T @ right))
+
+
+def weighted(weights: Float[jax.Array, "n node n"], joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n n"]:
+    """W P W'."""
+    return symmetrize(jnp.einsum("aib,ibjc,djc->ad", weights, joint, weights))

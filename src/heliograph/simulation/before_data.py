@@ -1,0 +1,209 @@
+"""What is known of a network of linear filters before any data: how their errors are correlated, what fusion gives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.plan import Plan
+from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.fusion.weights import factored_weights, matrix_weights
+from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.compiler import large_program
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.centre import Centre, Together
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters, plan
+
+REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative to the error: then U has an inverse
+
+
+@dataclass(frozen=True)
+class CrossCovariances:
+    """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.
+
+    x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the start of the plant and its
+    noise at each step) and a_i, node i's own, of covariance own_i. Biases are zero where filters believe in the world.
+
+    Shapes: mean (n,), state (n, sources), bias (node, n), shared (node, n, sources), own (node, n, n).
+    """
+
+    nodes: tuple[str, ...]
+    states: tuple[str, ...]
+    mean: Float[np.ndarray, " n"]
+    state: Float[np.ndarray, "n sources"]
+    bias: Float[np.ndarray, "node n"]
+    shared: Float[np.ndarray, "node n sources"]
+    own: Float[np.ndarray, "node n n"]
+
+    @property
+    def joint(self) -> Float[np.ndarray, "node n node n"]:
+        """Cov(e_i, e_j) of all pairs."""
+        return _joint(self.shared, self.own)
+
+    @property
+    def of_state(self) -> Float[np.ndarray, "node n n"]:
+        """Cov(e_i, x)."""
+        return np.asarray(self.shared @ self.state.T)
+
+    @property
+    def state_covariance(self) -> Float[np.ndarray, "n n"]:
+        """Cov x."""
+        return np.asarray(self.state @ self.state.T)
+
+    def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
+        """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
+        weights = _weights(self.shared, self.own)
+        shared, own = _weighted(weights, self.shared, self.own)
+        return weights, shared @ shared.T + own
+
+    def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
+        """Relays that forward the matrix-weighted estimate of the nodes each hears, as the nodes of the next level.
+
+        An error W e is a linear map of the nodes' errors, so what it shares with others is W shared, and W own W' is
+        its own as long as no two relays hear the same node. Known means of the errors are taken off. A tree of any
+        depth is this again and again; its root is `matrix_weights` of the last level.
+
+        Raises:
+            ValueError: no relays, a relay that hears nobody, unknown nodes, a node that two relays hear.
+        """
+        heard = [name for names in relays.values() for name in names]
+        unknown = sorted(set(heard) - set(self.nodes))
+        if not relays or unknown or not all(relays.values()):
+            raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
+        if len(set(heard)) < len(heard):
+            raise fail("nodes", "one relay for each", f"several for {sorted({n for n in heard if heard.count(n) > 1})}")
+        place = {name: i for i, name in enumerate(self.nodes)}
+        parts = []
+        for names in relays.values():
+            mine = [place[name] for name in names]
+            shared, own = self.shared[mine], self.own[mine]
+            parts.append(_weighted(_weights(shared, own), shared, own))
+        shared, own = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+        bias = np.zeros((len(relays), len(self.mean)))
+        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, own)
+
+
+def _weights(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", own) + np.einsum("ias,ias->ia", shared, shared))
+    scale = np.where(scale > 0, scale, 1.0)
+    least = np.linalg.eigvalsh(own / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, own) if least > REGULAR else matrix_weights(_joint(shared, own)))
+
+
+def _weighted(
+    weights: np.ndarray, shared: np.ndarray, own: np.ndarray
+) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
+    """What a weighted sum of the errors shares with others, and the covariance of its own part."""
+    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, own, weights)
+
+
+def _joint(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "node n node n"]:
+    count, n, _ = shared.shape
+    flat, each = shared.reshape(count * n, -1), np.arange(count)
+    result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
+    result[each, :, each, :] += own
+    return result
+
+
+def cross_covariances(network: Network, filter: str, horizon: int, inputs: ArrayLike | None = None) -> CrossCovariances:
+    """How the errors of the filters of this name are correlated after `horizon` steps of complete data.
+
+    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
+    what a filter wrongly believes of the world enters too.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network that is not linear, filters whose gains depend on data, channels that remember.
+    Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
+    """
+    fusion = Fusion(filter, MatrixWeights())
+    alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
+    filters, u = _prepared(alone, horizon, inputs)
+    with jax.enable_x64(True):
+        found: Factors = to_numpy(_factors(filters, u))
+    parts = found.mean, found.state, found.bias, found.shared, found.own
+    return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
+
+
+def fused_covariances(
+    network: Network, horizon: int, inputs: ArrayLike | None = None
+) -> dict[str, Float[np.ndarray, "time n n"]]:
+    """The covariances of the network's informed fusions, by name, for complete data.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network without an informed fusion.
+    """
+    filters, u = _prepared(network, horizon, inputs)
+    with jax.enable_x64(True):
+        found: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
+    return found
+
+
+def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
+    """Filters planned for the inputs."""
+    network.check_horizon(check_horizon(horizon))
+    u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(network.inputs)))
+    filters = AllFilters(network)
+    if not filters.centres:
+        raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
+    return plan(filters, u), u
+
+
+@large_program
+def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
+    centre = filters.centres[0]
+
+    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
+        (own, factors), (k, u_k) = carry, row
+        local = centre.gathered(_matrices(filters, centre, own, u_k, k))
+        spread = factors.state @ factors.state.T
+        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
+        return (_followed(filters, own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+
+    own, _, _, known = filters.init()
+    nodes, n = known[0].errors.bias.shape
+    each = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
+    start = own, initial_factors(known[0].errors, each * len(u))
+    result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    return result
+
+
+@large_program
+def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+    def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        (own, known), (k, u_k) = carry, row
+        told: dict[str, jax.Array] = {}
+        following = []
+        for centre, state in zip(filters.centres, known, strict=True):
+            means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
+            after, found = centre.step(state, _matrices(filters, centre, own, u_k, k), means, u_k, k)
+            following.append(after)
+            told |= {name: jnp.asarray(estimate.covariance) for name, estimate in found.items()}
+        return (_followed(filters, own, u_k, k), tuple(following)), told
+
+    own, _, _, known = filters.init()
+    return jax.lax.scan(body, (own, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+
+
+def _matrices(filters: AllFilters, centre: Centre, own: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+    """Of the centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
+    return [filters.alike[i].matrices(own[i], f, _quiet(filters, i), u, k) for i, f in centre.sources]
+
+
+def _followed(filters: AllFilters, own: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+    """The nodes' states after step k."""
+    pairs = zip(filters.alike, own, strict=True)
+    return tuple(item.step(state, _quiet(filters, i), u, k)[0] for i, (item, state) in enumerate(pairs))
+
+
+def _quiet(filters: AllFilters, kind: int) -> jax.Array:
+    return jnp.zeros((filters.alike[kind].nodes, filters.alike[kind].filters.received))

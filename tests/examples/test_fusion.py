@@ -1,0 +1,24 @@
+"""The example of fusion that knows what is shared, with smaller numbers of nodes, steps and runs."""
+
+import json
+from itertools import pairwise
+
+from heliograph.examples.fusion import compute, example
+
+RULES = ["matrix", "matrix_with_mean", "all_reports", "central"]
+
+
+def test_the_summary_has_every_rule_in_its_order(tmp_path, monkeypatch):
+    for name, value in {"STEPS": 60, "MANY": 20, "MANY_STEPS": 10, "RUNS": 64, "MEASURED_STEPS": 3}.items():
+        monkeypatch.setattr(compute, name, value)
+    example(tmp_path, 0)
+    found = json.loads((tmp_path / "fusion" / "summary.json").read_text())
+    for case in compute.CASES:
+        trace = [found[case][rule] for rule in RULES]
+        assert all(a >= b * (1 - 1e-9) for a, b in pairwise(trace)), case  # more is never worse
+        intersected = [found[case][f"equal_intersection_{what}"] for what in ("claimed", "true")]
+        assert intersected[0] > intersected[1] >= trace[0] * (1 - 1e-9)
+        assert min(found[case]["local"]) > trace[0] and found[case]["scalar"] >= trace[0] * (1 - 1e-9)
+    assert found["tree"]["root"] >= found["tree"]["flat"] >= found["tree"]["central"]
+    assert found["scale"]["matrix"] < found["scale"]["local"]
+    assert "traces.svg" in {p.name for p in (tmp_path / "fusion").iterdir()}

@@ -1,0 +1,191 @@
+import numpy as np
+import pytest
+
+import heliograph as hg
+from tests.fusion.fusion_problems import case, network, random_case, rules
+from tests.oracles.shared_information import local_gains, stacked_errors
+
+TARGETS = {  # traces after 200 steps: scalar, matrix, matrix with the plant's mean, all reports, central
+    "three_partial": (79.36, 5.130159, 5.130159, 5.097404, 5.097404),
+    "three_rooms": (0.8298, 0.326248, 0.325936, 0.325670, 0.325670),
+    "four_equal": (3.975, 3.974674, 3.383056, 3.106209, 3.106209),
+}
+
+
+def brute_force(plant, parts, steps):
+    """Joint covariance of (x, e_1, ...) and the central filter's, in NumPy."""
+    model = (plant.matrix, plant.noise.covariance, plant.initial_mean, plant.initial_covariance)
+    nodes = []
+    for c, r, gain, variance, noise in parts:
+        m = len(c)
+
+        def spread(second, c=c, r=r, gain=gain, variance=variance, noise=noise, m=m):
+            return variance * (c @ second @ c.T + r * np.eye(m)) + (gain**2 * r + noise) * np.eye(m)
+
+        nodes.append((gain * c, spread, local_gains(model, gain * c, spread, steps)))
+    return stacked_errors(model, nodes, steps)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
+    """Against the stacked problem in NumPy to 1e-9, and to the digits that the cases are stated with."""
+    plant, parts = case(name)
+    net, n = network(plant, parts, rules()), len(plant.states)
+    found = {rule: np.trace(p[-1]) for rule, p in hg.simulation.fused_covariances(net, 200).items()}
+    joint, central = brute_force(plant, parts, 200)
+    scalar, matrix, with_mean, everything, best = TARGETS[name]
+    assert found["scalar"] == pytest.approx(scalar, rel=1e-4)
+    for rule, expected in (("matrix", matrix), ("matrix_with_mean", with_mean), ("all_reports", everything)):
+        assert found[rule] == pytest.approx(expected, abs=6e-7)  # half of the last digit, and rounding of it
+    assert np.trace(central) == pytest.approx(best, abs=6e-7)
+    assert found["all_reports"] == pytest.approx(np.trace(central), rel=1e-9)  # every gain has full column rank
+    ones = np.tile(np.eye(n), (len(parts), 1))
+    information = ones.T @ np.linalg.solve(joint[n:, n:], ones)
+    assert found["matrix"] == pytest.approx(np.trace(np.linalg.inv(information)), rel=1e-9)
+    assert set(net.claims()["fused"].values()) == {"exact"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cross_covariances_are_those_of_the_stacked_problem(seed):
+    """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""
+    plant, parts = random_case(seed)
+    n = len(plant.states)
+    found = hg.simulation.cross_covariances(network(plant, parts, {}), "own", 12)
+    joint, _ = brute_force(plant, parts, 12)
+    np.testing.assert_allclose(found.joint.reshape(joint[n:, n:].shape), joint[n:, n:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.of_state.reshape(-1, n), joint[n:, :n], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.state_covariance, joint[:n, :n], rtol=1e-12)
+    np.testing.assert_allclose(found.bias, 0.0, atol=1e-14)
+    order = [2, 0, 1]
+    turned = hg.simulation.cross_covariances(network(plant, parts, {}, order), "own", 12)
+    assert turned.nodes == tuple(f"node {i}" for i in order)
+    np.testing.assert_allclose(turned.joint, found.joint[order][:, :, order], rtol=1e-12, atol=1e-14)
+    weights, covariance = found.matrix_weights()
+    lost = 10 * np.finfo(float).eps * np.linalg.cond(found.joint.reshape(3 * n, 3 * n))  # digits that a solve loses
+    np.testing.assert_allclose(weights, hg.fusion.matrix_weights(found.joint), atol=lost * np.abs(weights).max())
+    np.testing.assert_allclose(weights.sum(axis=1), np.eye(n), atol=1e-12)
+    dense = hg.simulation.fused_covariances(network(plant, parts, {"m": rules()["matrix"]}), 12)["m"][-1]
+    np.testing.assert_allclose(covariance, dense, rtol=1e-9)
+
+
+def test_monte_carlo_agrees_with_what_is_claimed():
+    """E |x - xhat|^2 at the last step within three standard errors, rules that know more never worse."""
+    net = network(*random_case(5), rules())
+    record = hg.monte_carlo(net, 10, 4000, 1)
+    for name, estimate in record.estimates["fused"].items():
+        square = np.sum(record.errors("fused", name)[:, -1] ** 2, axis=-1)
+        error = square.std() / np.sqrt(len(square))
+        assert abs(square.mean() - np.trace(estimate.covariance[0, -1])) < 3 * error, name
+    trace = {name: np.trace(e.covariance[0, -1]) for name, e in record.estimates["fused"].items()}
+    assert trace["all_reports"] <= trace["matrix"] * (1 + 1e-12) and trace["matrix"] <= trace["diagonal"]
+    assert trace["matrix_with_mean"] <= trace["matrix"] and trace["diagonal"] <= trace["scalar"]
+    data = {node: z[0] for node, z in record.measurements.items()}
+    again = hg.run(net, data)
+    for name, estimate in record.estimates["fused"].items():
+        np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
+
+
+def test_a_tree_of_relays_is_its_weights_on_the_leaves():
+    """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
+    plant, parts = random_case(11, nodes=5)
+    net, groups = network(plant, parts, {}), {"a": [0, 3], "b": [1, 2, 4]}
+    leaves = hg.simulation.cross_covariances(net, "own", 6)
+    level = leaves.fused({name: [f"node {i}" for i in mine] for name, mine in groups.items()})
+    by_hand = np.zeros((2, 3, 5, 3))
+    for r, mine in enumerate(groups.values()):
+        by_hand[r][:, mine] = hg.fusion.matrix_weights(leaves.joint[mine][:, :, mine])
+    joint = np.einsum("raib,ibjc,sdjc->rasd", by_hand, leaves.joint, by_hand)
+    np.testing.assert_allclose(level.joint, joint, rtol=1e-7, atol=1e-9)  # weights lose the digits of cond(P)
+    weights, covariance = level.matrix_weights()
+    flat = leaves.matrix_weights()[1]
+    assert np.trace(flat) <= np.trace(covariance) <= min(np.trace(joint[r, :, r]) for r in (0, 1))
+    record = hg.monte_carlo(net, 6, 4000, 2)
+    errors = np.stack([record.errors(node, "own")[:, -1] for node in net.names], axis=1)
+    square = np.sum(np.einsum("ars,rsib,kib->ka", weights, by_hand, errors) ** 2, axis=-1)
+    assert abs(square.mean() - np.trace(covariance)) < 3 * square.std() / np.sqrt(len(square))
+    with pytest.raises(ValueError, match=r"nodes: expected one relay for each, got several for \['node 1'\]"):
+        leaves.fused({"a": ["node 1"], "b": ["node 1", "node 2"]})
+
+
+def test_losses_that_are_told_count_with_the_pattern_that_happened():
+    """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
+    plant, parts = random_case(7, nodes=2)
+    silent = network(plant, parts, {"matrix": rules()["matrix"]})
+    z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
+    found = hg.run(silent, z).estimates["fused"]["matrix"].covariance
+    alone = network(plant, parts[:1], {"mean": rules()["matrix_with_mean"]})
+    expected = hg.run(alone, {"node 0": z["node 0"]}).estimates["fused"]["mean"].covariance
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+
+
+def test_losses_at_random_keep_the_claim():
+    """Each run has the covariances of its own losses: mean squares agree within three standard errors."""
+    plant, parts = random_case(5)
+    perfect = network(plant, parts, {})
+    nodes = {
+        name: hg.Node(node.sensor, hg.erasure(node.channel, 0.6), node.filters) for name, node in perfect.nodes.items()
+    }
+    kept = {name: rules()[name] for name in ("matrix", "all_reports")}
+    record = hg.monte_carlo(hg.Network(plant, nodes, kept), 4, 3000, 11)
+    for name, estimate in record.estimates["fused"].items():
+        covariance = np.asarray(estimate.covariance)[:, -1]
+        assert estimate.claim == "exact" and np.ptp(np.trace(covariance, axis1=1, axis2=2)) > 0
+        excess = np.sum(record.errors("fused", name)[:, -1] ** 2, axis=-1) - np.trace(covariance, axis1=1, axis2=2)
+        assert abs(excess.mean()) < 3 * excess.std() / np.sqrt(len(excess))
+
+
+def test_gains_that_are_not_the_best_are_taken_as_they_are():
+    """A filter that trusts the mean gain: its claim is nominal, the fused one exact, and Monte Carlo agrees."""
+    plant, parts = random_case(3, nodes=2)
+    nodes = {}
+    for i, (c, r, mean, variance, noise) in enumerate(parts):
+        sensor = hg.LinearSensor(c, r * np.eye(len(c)))
+        gain = hg.Discrete([mean - 2 * variance**0.5, mean + 2 * variance**0.5], [0.5, 0.5])
+        channel = hg.hop(gain, noise=noise * np.eye(len(c)))
+        wrong = hg.mean_gain_filter(plant, sensor, channel, initial_mean=np.ones(3))
+        nodes[f"node {i}"] = hg.Node(sensor, channel, {"own": wrong})
+    net = hg.Network(plant, nodes, {"matrix": hg.Fusion("own", hg.fusion.MatrixWeights())})
+    record = hg.monte_carlo(net, 4, 4000, 0)
+    square = np.sum(record.errors("fused", "matrix")[:, -1] ** 2, axis=-1)
+    claimed = np.trace(record.estimates["fused"]["matrix"].covariance[0, -1])
+    assert net.claims()["node 0"]["own"] == "nominal" and net.claims()["fused"]["matrix"] == "exact"
+    assert abs(square.mean() - claimed) < 3 * square.std() / np.sqrt(len(square))
+
+
+def test_nodes_that_hear_the_same_and_estimates_without_error():
+    """One rank rule: a copy changes nothing, and an estimate without error is followed whatever the others say."""
+    draw = np.random.default_rng(0)
+    root = draw.normal(size=(4, 4))
+    one = (root @ root.T).reshape(2, 2, 2, 2)
+    copied = one[[0, 1, 1]][:, :, [0, 1, 1]]
+    alone, both = hg.fusion.matrix_weights(one), hg.fusion.matrix_weights(copied)
+    np.testing.assert_allclose(both[:, 1] + both[:, 2], alone[:, 1], rtol=1e-9)
+    known = one.copy()
+    known[0], known[:, :, 0] = 0.0, 0.0
+    np.testing.assert_allclose(hg.fusion.matrix_weights(known)[:, 0], np.eye(2), atol=1e-9)
+    np.testing.assert_allclose(hg.fusion.matrix_weights(one * 1e-20), alone, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda p, s, c: hg.cubature_filter(p, s, c), "gains depend on no data, got GaussianFilter"),
+        (lambda p, s, c: hg.linear_filter(p, s, c), "expected a channel that forgets"),
+    ],
+)
+def test_what_is_not_known_is_refused(make, message):
+    plant, parts = random_case(0, nodes=1)
+    sensor = hg.LinearSensor(parts[0][0], 1.0)
+    fading = hg.Discrete([0.5, 1.0], [0.5, 0.5])
+    channel = hg.hop(fading, noise=0.1)
+    if "forgets" in message:
+        channel = hg.gilbert_elliott(channel, hg.model.silent(noise=0.1), 0.1, 0.5)
+    nodes = {"a": hg.Node(sensor, channel, {"own": make(plant, sensor, channel)})}
+    with pytest.raises(ValueError, match=message):
+        hg.Network(plant, nodes, {"matrix": hg.Fusion("own", hg.fusion.MatrixWeights())})
+
+
+def test_a_covariance_each_is_not_enough():
+    pair = [hg.Estimate(np.zeros(2), np.eye(2), "exact")] * 2
+    with pytest.raises(ValueError, match="fusion by MatrixWeights: expected the errors' joint covariance"):
+        hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
