@@ -182,7 +182,7 @@ RUNS = [
     (lambda: h.run(network(), {"a": [1.0], "b": [1.0]}), "measurements", "['b']"),
     (lambda: h.run(network(), {"a": []}), "measurements", "none"),
     (lambda: h.run(network(), {"a": np.zeros((3, 2))}), "measurements of node 'a'", "shape (3, 2)"),
-    (lambda: h.run(network(), {"a": [1.0, INF]}), "measurements of node 'a'", "infinite"),
+    (lambda: h.run(network(), {"a": [1.0, INF]}), "measurements of node 'a'", "1 that are not finite"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0, 0.5]), "time", "0.5 after 1"),
     (lambda: h.run(network(), {"a": [1.0, 2.0]}, time=[1.0]), "time", "shape (1,)"),
     (lambda: h.run(pushed(), {"a": [1.0]}), "inputs", "none"),

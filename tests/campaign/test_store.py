@@ -116,7 +116,7 @@ READING = NETWORK.replace("    plant = hg", "    if gain == 0.7:\n        input(
     ("network", "error"),
     [
         (HANGING, "TimedOut: no answer within 20 s, the campaign's timeout"),
-        (READING, "ValueError: network net.py:build: expected Python that runs, got EOFError"),
+        (READING, "InputError: network net.py:build: expected Python that runs, got EOFError"),
     ],
 )
 def test_a_setting_that_hangs_or_reads_is_a_failure_like_any_other(tmp_path, network, error):

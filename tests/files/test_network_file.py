@@ -108,7 +108,7 @@ def test_no_network(in_folder):
         ("import sys\nsys.exit(3)\n", ["SystemExit in line 2: 3"]),
         (
             "import heliograph as h\nh.hop(1.0,\n      h.Gaussian([[-1.0]]))\n",
-            ["ValueError in line 3: noise covariance", "positive semidefinite", "-1"],
+            ["InputError in line 3: noise covariance", "positive semidefinite", "-1"],
         ),
     ],
 )

@@ -112,7 +112,7 @@ def test_a_users_map_needs_no_code_for_modes():
 def test_nodes_of_a_drift_reproduce_its_moments(degree):
     """E[c_1^i c_2^j] of two standard Gaussians of correlation rho, for i, j up to the degree."""
     rho = 0.7
-    x, w, rows = Autoregression(rho).nodes(degree)
+    x, w, rows, _ = Autoregression(rho).nodes(degree)
     np.testing.assert_allclose(rows.sum(axis=1), 1, rtol=1e-13)
     nodes, weights = np.polynomial.hermite_e.hermegauss(12)
     weights = weights / weights.sum()
@@ -125,7 +125,7 @@ def test_nodes_of_a_drift_reproduce_its_moments(degree):
 
 @pytest.mark.parametrize("modes", [2, 3, 7])
 def test_a_chain_for_a_drift_has_its_mean_variance_and_correlation(modes):
-    x, w, rows = Autoregression(-0.4).chain(modes)
+    x, w, rows, _ = Autoregression(-0.4).chain(modes)
     assert np.all(rows >= 0)
     np.testing.assert_allclose([w @ x, w @ x**2, (w * x) @ rows @ x], [0, 1, -0.4], atol=1e-14)
     np.testing.assert_allclose(rows @ x, -0.4 * x, atol=1e-14)

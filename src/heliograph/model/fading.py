@@ -11,7 +11,7 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, scalar
 from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
@@ -129,7 +129,7 @@ def without_memory(channel: Channel) -> Channel:
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
-    if not first(channel).remembers:
+    if not as_maps("channel", [first(channel)])[0].remembers:
         return channel
     if not isinstance(channel, OverTime):
         return forgetful(channel)
@@ -145,7 +145,7 @@ def memory_matters(channel: Channel) -> bool:
     Raises:
         ValueError: a channel that remembers in a way of its own.
     """
-    if not first(channel).remembers:
+    if not as_maps("channel", [first(channel)])[0].remembers:
         return False
     if uncertain_chain(channel):
         return True
