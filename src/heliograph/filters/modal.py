@@ -110,34 +110,47 @@ class ModalFilter(AbstractFilter):
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        mean, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
-        heard = jnp.concatenate(list(mean @ measure), axis=1)
-        law, present = state.moments[:, -1, -1], ~jnp.isnan(z)
-        both = present[:, None] & present
+        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
+        heard = jnp.concatenate(list(gains @ measure), axis=1)
+        law = state.moments[:, -1, -1]
         second = measure @ state.moments @ measure.T + law[:, None, None] * noise
         added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
-        added = added + jnp.einsum("j,jma,ab,jlb->ml", law, mean, noise, mean)
-        cross, expected = heard @ state.covariance, heard @ state.mean
-        total = cross @ heard.T + added
-        gain, covariance = gain_and_bound(
-            state.covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
-        )
-        after = state.mean + gain @ jnp.where(present, z - expected, 0.0)
-        return state._replace(mean=after, covariance=covariance), gaussian_innovation(z, expected, total)
+        added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
+        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, z)
+        return state._replace(mean=mean, covariance=covariance), innovation
 
     @in_float64
     def estimate(self, state: ModalBelief) -> Estimate:
         """x = sum_j zeta^j."""
-        want = self._want()
+        want = sum_of_modes(len(self.states), len(self.initial))
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
-        return plan(self, inputs, np.asarray(self._want()))
+        return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
 
-    def _want(self) -> Float[Array, "n N"]:
-        n = len(self.states)
-        return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
+
+def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
+    """The matrix that takes zeta to x = sum_j zeta^j."""
+    return np.tile(np.eye(n, n + 1), (1, modes))
+
+
+def heard_linearly(
+    mean: Float[jax.Array, " N"],
+    covariance: Float[jax.Array, "N N"],
+    heard: Float[jax.Array, "m N"],
+    added: Float[jax.Array, "m m"],
+    z: Float[jax.Array, " m"],
+) -> tuple[jax.Array, jax.Array, Innovation]:
+    """Mean and covariance of zeta after what arrived of z, whose covariance given zeta is `added`."""
+    present = ~jnp.isnan(z)
+    both = present[:, None] & present
+    cross, expected = heard @ covariance, heard @ mean
+    total = cross @ heard.T + added
+    gain, after = gain_and_bound(
+        covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
+    )
+    return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
 
 
 def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:

@@ -10,12 +10,18 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import absent, gain_and_bound
-from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.modal import Heard, claim_of_modes, heard_over, measure_matrix, move_matrix, padded
+from heliograph.filters.modal import (
+    Heard,
+    claim_of_modes,
+    heard_linearly,
+    heard_over,
+    measure_matrix,
+    move_matrix,
+    padded,
+    sum_of_modes,
+)
 from heliograph.filters.plan import plan
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -92,32 +98,22 @@ class UncertainModalFilter(AbstractFilter):
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Use what arrived of z; the covariance of z given zeta is bounded over the laws of the modes."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        mean, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
-        heard, present = jnp.concatenate(list(mean @ measure), axis=1), ~jnp.isnan(z)
+        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
         second = measure @ state.second @ measure.T + noise
-        each = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + mean @ noise @ mean.swapaxes(1, 2)
-        cross, expected = heard @ state.covariance, heard @ state.mean
-        total = cross @ heard.T + _worst(each, *_middle(state.low, state.high))
-        both = present[:, None] & present
-        gain, covariance = gain_and_bound(
-            state.covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
-        )
-        after = state.mean + gain @ jnp.where(present, z - expected, 0.0)
-        return state._replace(mean=after, covariance=covariance), gaussian_innovation(z, expected, total)
+        each = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
+        added, heard = _worst(each, *_middle(state.low, state.high)), jnp.concatenate(list(gains @ measure), axis=1)
+        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, z)
+        return state._replace(mean=mean, covariance=covariance), innovation
 
     @in_float64
     def estimate(self, state: UncertainBelief) -> Estimate:
         """x = sum_j zeta^j."""
-        want = self._want()
+        want = sum_of_modes(len(self.states), len(self.initial))
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
-        return plan(self, inputs, np.asarray(self._want()))
-
-    def _want(self) -> Float[Array, "n N"]:
-        n = len(self.states)
-        return np.tile(np.eye(n, n + 1), (1, len(self.initial)))
+        return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
 
 
 def _ratio(part: jax.Array, whole: jax.Array) -> jax.Array:
