@@ -85,9 +85,11 @@ from .fusion.rules import (
     EqualIntersection as EqualIntersection,
     Fusion as Fusion,
 )
+from .simulation.node import (
+    Node as Node,
+)
 from .simulation.network import (
     Network as Network,
-    Node as Node,
 )
 from .simulation.simulate import (
     monte_carlo as monte_carlo,

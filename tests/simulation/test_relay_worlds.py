@@ -11,7 +11,8 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
-from heliograph.simulation.network import Network, Node
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import monte_carlo, run
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.sums import Statistics, error_statistics

@@ -11,7 +11,8 @@ import numpy as np
 from heliograph.files.table import read_table, write_table
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
-from heliograph.simulation.network import Listener, Network, Node
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.record import Record, is_sound
 
 TIME = "time"

@@ -17,7 +17,8 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, checksum, draw_key
-from heliograph.simulation.network import OWN, Network, Node
+from heliograph.simulation.network import OWN, Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.shadows import deliver, memory_places, start
 
 Heard = tuple[jax.Array, ...]  # (node, received) of each group

@@ -26,7 +26,8 @@ from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.told import Outcome, outcomes, second_moments
-from heliograph.simulation.network import Network, Node
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 
 CERTAIN = 1e-13  # of a row's second moment: a variance of its gain that is rounding
 

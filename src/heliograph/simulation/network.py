@@ -17,65 +17,14 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered, structure
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
-from heliograph.model.sensor import AbstractSensor, AnySensor
-from heliograph.numerics.check import check_horizon, fail, shown, table
-from heliograph.random_affine.base import AbstractRandomAffine, anonymous, check_forgets
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_horizon, fail, table
+from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import informed_claim
+from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_type
 
 FUSED = "fused"  # the name under which results of several nodes stand
 OWN = "own"  # a relay's one filter
-
-
-class Node(eqx.Module):
-    """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
-
-    Raises:
-        ValueError: a sensor and a channel that do not fit.
-    """
-
-    sensor: AnySensor
-    channel: Channel
-    filters: dict[str, AbstractFilter]
-
-    def __init__(self, sensor: AnySensor, channel: Channel, filters: Mapping[str, AbstractFilter]):
-        self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
-        _check_type("sensor", first(sensor), AbstractSensor)
-        _check_type("channel", first(channel), AbstractRandomAffine)
-        _check_filters(self.filters, self.received)
-
-    @property
-    def received(self) -> int:
-        """Length of the measurement that reaches the filters."""
-        return int(first(self.channel).outputs)
-
-    @property
-    def outputs(self) -> tuple[str, ...]:
-        """Names of what is sent to the node."""
-        return tuple(first(self.sensor).outputs)
-
-    @property
-    def complete(self) -> bool:
-        """Whether everything arrives, always."""
-        return not first(self.channel).erases
-
-
-class Listener(eqx.Module):
-    """A place in a network of relays, which hears one of them or the sensor, and the filters there.
-
-    `received` numbers named after `outputs` are heard, always all of them if it is `complete`.
-    """
-
-    filters: dict[str, AbstractFilter]
-    received: int = eqx.field(static=True)
-    outputs: tuple[str, ...] = eqx.field(static=True)
-    complete: bool = eqx.field(static=True)
-
-
-class Common(eqx.Module):
-    """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
-
-    sensor: AnySensor
-    channel: Channel
 
 
 class Kind(NamedTuple):
@@ -121,12 +70,12 @@ class Network(eqx.Module):
         self.nodes = table("nodes", nodes, "nodes")
         self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
         self.names = tuple(self.nodes)
-        _check_type("plant", first(plant), AbstractPlant)
+        check_type("plant", first(plant), AbstractPlant)
         if not self.nodes:
             raise fail("network", "at least one node", "none")
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
-            _check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
+            check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
             for filter_, one in node.filters.items():
                 _check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
@@ -148,8 +97,8 @@ class Network(eqx.Module):
                 item.check(self.nodes_with(item.filter), len(self.states))
                 self._fused_claim(item)
             else:
-                _check_type(f"fused {name!r}", item, AbstractFilter)
-                _check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
+                check_type(f"fused {name!r}", item, AbstractFilter)
+                check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
                 _check_sizes(f"fused {name!r}", item, states, inputs)
 
     @staticmethod
@@ -165,7 +114,7 @@ class Network(eqx.Module):
         Raises:
             ValueError: relays without a schedule, schedules of the wrong shape.
         """
-        _check_type("relays", relays, RelayNetwork)
+        check_type("relays", relays, RelayNetwork)
         schedules = table("relay schedules", schedules, "schedules")
         if set(schedules) != set(relays.relays):
             raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
@@ -177,7 +126,7 @@ class Network(eqx.Module):
                 raise fail(f"schedule of {name!r}", f"gains of shape {(n, heard)}", f"shape {shape}")
             filters[name] = {OWN: ScheduledFilter(schedules[name])}
         filters[RECEIVER] = dict(receivers)
-        _check_filters(filters[RECEIVER], relays.received[-1])
+        check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
         nodes = {
             name: Listener(filters[name], heard, outputs, relays.hears_always(name))
@@ -207,7 +156,7 @@ class Network(eqx.Module):
             raise fail("nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", heard)
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
         for name, own in filters.items():
-            _check_filters(own, heard[name])
+            check_filters(own, heard[name])
         nodes = {name: Listener(dict(own), heard[name], names, complete) for name, own in filters.items()}
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
@@ -298,11 +247,6 @@ def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], input
             raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
 
 
-def _check_received(name: str, item: AbstractFilter, received: int) -> None:
-    if item.received not in (0, received):  # 0: it does not listen
-        raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
-
-
 def _world(node: Node | Listener) -> object:
     """What decides how a node hears."""
     return (node.sensor, anonymous(node.channel)) if isinstance(node, Node) else (node.received, node.complete)
@@ -314,15 +258,3 @@ def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]
     for name, item in items:
         found.setdefault(structure(item), []).append(name)
     return tuple(tuple(names) for names in found.values())
-
-
-def _check_filters(filters: Mapping[str, object], received: int) -> None:
-    for name, item in filters.items():
-        _check_type(f"filter {name!r}", item, AbstractFilter)
-        if isinstance(item, AbstractFilter):
-            _check_received(f"filter {name!r}", item, received)
-
-
-def _check_type(name: str, value: object, expected: type) -> None:
-    if not isinstance(value, expected):
-        raise fail(name, f"a {expected.__name__}", shown(value))

@@ -17,7 +17,8 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.second_moments import SecondOrder, second_order
-from heliograph.simulation.network import FUSED, Network, Node
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.rescaling import Units, rescaled, rescaled_channel
 from heliograph.simulation.simulate import monte_carlo, run
 

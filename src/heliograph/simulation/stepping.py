@@ -20,7 +20,8 @@ from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.centre import AbstractHears, Apart, Centre, CentreState, Together, described, listening
-from heliograph.simulation.network import FUSED, Network, Node
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
 
 
 class Alike(eqx.Module):

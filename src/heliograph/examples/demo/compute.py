@@ -16,7 +16,8 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import AbstractRandomAffine, apply
 from heliograph.random_affine.second_moments import second_order
-from heliograph.simulation.network import Network, Node
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import run
 
 SEEDS = 5  # seeds of the relay for the spread: the one asked for and those after it

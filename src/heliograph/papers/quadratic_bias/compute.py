@@ -24,7 +24,8 @@ from heliograph.model.sensor import AnySensor
 from heliograph.papers.quadratic_bias import setting
 from heliograph.papers.quadratic_bias.bounds import Boundedness, boundedness
 from heliograph.papers.quadratic_bias.printed import Printed, printed_quadratic
-from heliograph.simulation.network import Network, Node
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.record import AbstractReducer, Record, trajectories_record
 from heliograph.simulation.simulate import monte_carlo
 from heliograph.simulation.statistics import ErrorStatistics

@@ -1,0 +1,84 @@
+"""What stands at a place of a network: a sensor, the channel its signal takes, and the filters that listen there."""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import first
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.check import fail, shown, table
+from heliograph.random_affine.base import AbstractRandomAffine
+
+
+class Node(eqx.Module):
+    """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
+
+    Raises:
+        ValueError: a sensor and a channel that do not fit.
+    """
+
+    sensor: AnySensor
+    channel: Channel
+    filters: dict[str, AbstractFilter]
+
+    def __init__(self, sensor: AnySensor, channel: Channel, filters: Mapping[str, AbstractFilter]):
+        self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
+        check_type("sensor", first(sensor), AbstractSensor)
+        check_type("channel", first(channel), AbstractRandomAffine)
+        check_filters(self.filters, self.received)
+
+    @property
+    def received(self) -> int:
+        """Length of the measurement that reaches the filters."""
+        return int(first(self.channel).outputs)
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Names of what is sent to the node."""
+        return tuple(first(self.sensor).outputs)
+
+    @property
+    def complete(self) -> bool:
+        """Whether everything arrives, always."""
+        return not first(self.channel).erases
+
+
+class Listener(eqx.Module):
+    """A place in a network of relays, which hears one of them or the sensor, and the filters there.
+
+    `received` numbers named after `outputs` are heard, always all of them if it is `complete`.
+    """
+
+    filters: dict[str, AbstractFilter]
+    received: int = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+    complete: bool = eqx.field(static=True)
+
+
+class Common(eqx.Module):
+    """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
+
+    sensor: AnySensor
+    channel: Channel
+
+
+def check_received(name: str, item: AbstractFilter, received: int) -> None:
+    """A filter that hears as much as arrives, or does not listen."""
+    if item.received not in (0, received):  # 0: it does not listen
+        raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
+
+
+def check_filters(filters: Mapping[str, object], received: int) -> None:
+    """Filters that hear what arrives at their node."""
+    for name, item in filters.items():
+        check_type(f"filter {name!r}", item, AbstractFilter)
+        if isinstance(item, AbstractFilter):
+            check_received(f"filter {name!r}", item, received)
+
+
+def check_type(name: str, value: object, expected: type) -> None:
+    """An object of a class, named in one line if it is none."""
+    if not isinstance(value, expected):
+        raise fail(name, f"a {expected.__name__}", shown(value))
