@@ -1,7 +1,8 @@
 """Ten thousand random networks: no result that is no number goes unflagged, and no claim is broken.
 
 Run: python benchmarks/soak.py [COUNT]. What is done is kept in out/soak.jsonl, so that a later start goes on; another
-seed or another release starts anew. Writes benchmarks/soak.json.
+seed or another release starts anew. Writes benchmarks/soak.json. Networks of one structure share what is compiled, so
+that one process after another takes a structure whole; compiling in a hurry pays, since little is simulated.
 
 Each network is simulated RUNS times. An estimate that is not finite, or a covariance that is indefinite, must be among
 the failures that the statistics list. Where "exact" or "upper" is claimed, e_d^2 is compared with the claimed variance
@@ -11,15 +12,20 @@ all comparisons together exceed by chance with probability FALSE_ALARM. Every SC
 """
 
 import json
+import multiprocessing
+import os
 import subprocess
 import sys
 import time
 import traceback
 import warnings
 from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy import stats
 from soak_networks import HORIZON, STRUCTURES, network
@@ -29,7 +35,7 @@ from heliograph.testing import check_scaling
 
 HERE = Path(__file__).resolve().parent
 DONE, RESULTS = HERE.parent / "out" / "soak.jsonl", HERE / "soak.json"
-COUNT, SEED, RUNS, AGAIN, SCALED = 10_000, 1, 256, 20_000, 50
+COUNT, SEED, RUNS, AGAIN, SCALED = 10_000, 1, 256, 20_480, 50
 SUSPECT, FALSE_ALARM = 4.0, 1e-3
 WORST = 10  # cases kept
 
@@ -118,7 +124,7 @@ def soak(index: int) -> dict[str, Any]:
             if (abs(place.z) if one.claim == "exact" else place.z) <= SUSPECT:
                 continue
             if again is None:
-                again = hg.monte_carlo(item, HORIZON, AGAIN, index + 10**6, keep=hg.Statistics())
+                again = hg.monte_carlo(item, HORIZON, AGAIN, index + 10**6, keep=hg.Statistics(), chunk=RUNS)
             fresh = excesses(again[node][name], place.direction[None])[place.step, 0]
             where = {
                 "at": f"{node}/{name}",
@@ -204,32 +210,57 @@ def summary(rows: list[dict[str, Any]], key: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def tried(index: int) -> dict[str, Any]:
+    """What `soak` finds, or the bug that it came upon, which is what is looked for: the others shall be tried too."""
+    try:
+        return soak(index)
+    except Exception:
+        nothing: dict[str, Any] = {"comparisons": 0, "hidden": [], "suspects": [], "flagged": [], "claims": {}}
+        return nothing | {"index": index, "error": traceback.format_exc(limit=-3)}
+
+
+def work(indices: list[int], key: dict[str, Any]) -> int:
+    """Try these networks and keep each as it is done; a line is written at once, so that processes share the file."""
+    warnings.simplefilter("ignore")
+    file = os.open(DONE, os.O_WRONLY | os.O_APPEND | os.O_CREAT)
+    for index in indices:
+        begun = time.perf_counter()
+        row = tried(index) | {"seconds": time.perf_counter() - begun, "key": key}
+        os.write(file, (json.dumps(row) + "\n").encode())
+    os.close(file)
+    jax.clear_caches()
+    return len(indices)
+
+
+def by_structure(left: list[int]) -> Iterator[list[int]]:
+    """The networks that are to be tried, structure by structure."""
+    for structure in range(STRUCTURES):
+        alike = [index for index in left if index % STRUCTURES == structure]
+        if alike:
+            yield alike
+
+
 def main(count: int) -> int:
     """Do what is not done, then sum up; 1 if a promise is broken."""
     key = {"seed": SEED, "runs": RUNS, "structures": STRUCTURES, "release": release()}
-    done = kept(key)
     DONE.parent.mkdir(exist_ok=True)
-    warnings.simplefilter("ignore")
-    with DONE.open("a") as file:
-        for index in range(count):
-            if index in done:
-                continue
-            begun = time.perf_counter()
-            try:
-                row = soak(index)
-            except Exception:  # a bug is what is looked for, and the others shall be tried too
-                row = {"index": index, "comparisons": 0, "hidden": [], "suspects": [], "flagged": [], "claims": {}}
-                row["error"] = traceback.format_exc(limit=-3)
-            row |= {"seconds": time.perf_counter() - begun, "key": key}
-            done[index] = row
-            file.write(json.dumps(row) + "\n")
-            file.flush()
-            print(f"\r{len(done):,} of {count:,} networks", end="", file=sys.stderr)
-    found = summary([done[i] for i in sorted(done) if i < count], key)
+    left = sorted(set(range(count)) - set(kept(key)))
+    done = count - len(left)
+    with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn"), compile_in_a_hurry) as pool:
+        for job in as_completed([pool.submit(work, alike, key) for alike in by_structure(left)]):
+            done += job.result()
+            print(f"\r{done:,} of {count:,} networks", end="", file=sys.stderr)
+    rows = kept(key)
+    found = summary([rows[i] for i in sorted(rows) if i < count], key)
     RESULTS.write_text(json.dumps(found, indent=1) + "\n")
     wrong = {name: len(found[name]) for name in ("errors", "broken claims", "unflagged", "depend on units")}
     print(f"\n{found['networks']:,} networks, {found['comparisons']:,} comparisons: {wrong}")
     return int(any(wrong.values()))
+
+
+def compile_in_a_hurry() -> None:
+    """Before JAX compiles anything in this process: five steps of a few hundred runs are not worth an optimisation."""
+    jax.config.update("jax_disable_most_optimizations", True)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ import numpy as np
 
 import heliograph as hg
 
-STRUCTURES = 36
+STRUCTURES = 48
 HORIZON = 5
 SINGULAR = 0.15  # share of the variances that are zero
 
@@ -26,15 +26,24 @@ def network(index: int, seed: int) -> hg.Network:
     units = 10.0 ** values.uniform(-6, 6, size=p) if kind < 2 else np.ones(p)
     laws = [int(shape.integers(4)) for _ in range(p)]
     wiring, erased = int(shape.integers(4)), shape.random() < 0.3
-    own = shape.random() < 0.3
+    own, remembers, modal = shape.random() < 0.3, shape.random() < 0.3, shape.random() < 0.4
     result = {}
     for number in range(nodes):
         sensor = (nonlinear_sensor if kind == 2 else linear_sensor)(plant, units, values)
-        channel = wired(wiring, [hop(law, unit, values) for law, unit in zip(laws, units, strict=True)], units, values)
+
+        def wire(sensor: Any = sensor) -> Any:
+            return wired(wiring, [hop(law, unit, values) for law, unit in zip(laws, units, strict=True)], units, values)
+
+        channel = wire()
+        if remembers and kind == 0:
+            channel = hg.gilbert_elliott(channel, wire(), *values.uniform(0.05, 0.9, size=2), f"sight{number}")
         filters = (nonlinear_filters if kind == 2 else linear_filters)(plant, sensor, channel, n, own)
         world = hg.erasure(channel, chance(values)) if erased else channel
+        if kind == 0:
+            filters |= told_filters(plant, sensor, world, modal)
         result[f"node{number}"] = hg.Node(sensor, world, filters)
-    return hg.Network(plant, result, fused(result, "linear" if kind < 2 else "cubature"))
+    informed = kind == 0 and not remembers and not own and 2 not in laws
+    return hg.Network(plant, result, fused(result, "linear" if kind < 2 else "cubature", informed))
 
 
 def chance(values: np.random.Generator) -> float:
@@ -159,6 +168,16 @@ def linear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> 
     return filters
 
 
+def told_filters(plant: Any, sensor: Any, world: Any, modal: bool) -> dict[str, Any]:
+    """The filters that are told what arrived; those with a Gaussian for each mode where asked for."""
+    filters: dict[str, Any] = {"told": hg.filters.told_filter(plant, sensor, world)}
+    if modal:
+        filters["imm"] = hg.filters.imm_filter(plant, sensor, world)
+        filters["gpb1"] = hg.filters.gpb1_filter(plant, sensor, world)
+        filters["gpb2"] = hg.filters.gpb2_filter(plant, sensor, world)
+    return filters
+
+
 def nonlinear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> dict[str, Any]:
     """Every filter of a nonlinear model."""
     moments = hg.filters.PolynomialMoments(2)
@@ -172,8 +191,8 @@ def nonlinear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) 
     }
 
 
-def fused(nodes: dict[str, hg.Node], name: str) -> dict[str, Any]:
-    """Every rule, and the central filter."""
+def fused(nodes: dict[str, hg.Node], name: str, informed: bool) -> dict[str, Any]:
+    """Every rule, and the central filter; what knows the joint covariance where that is known."""
     count = len(nodes)
     if count < 2:
         return {}
@@ -184,5 +203,13 @@ def fused(nodes: dict[str, hg.Node], name: str) -> dict[str, Any]:
         "fixed": hg.fusion.FixedIntersection(np.arange(1, count + 1) / (count * (count + 1) / 2)),
         "mean": hg.fusion.WeightedFusion(np.full(count, 1 / count)),
     }
+    if informed:
+        rules |= {
+            "matrix": hg.fusion.MatrixWeights(),
+            "diagonal": hg.fusion.DiagonalWeights(),
+            "scalar": hg.fusion.ScalarWeights(),
+            "matrix_with_mean": hg.fusion.MatrixWeights(with_mean=True),
+            "all_reports": hg.fusion.AllReports(),
+        }
     central = hg.filters.sequential_filter([node.filters["extended"] for node in nodes.values()])
     return {rule: hg.Fusion(name, item) for rule, item in rules.items()} | {"central": central}
