@@ -150,3 +150,10 @@ def test_claims_hold_in_the_drivers_monte_carlo():
         assert statistics.worst_direction().z < 4.0, name
         _, low, high = statistics.nees_per_dimension(0.999)
         assert low < 1 < high, name
+
+
+def test_products_with_the_past_refuse_a_channel_that_remembers():
+    s = model(EXAMPLE, HORIZON)
+    burst = hg.gilbert_elliott(s.channel, s.channel, 0.2, 0.4)
+    with pytest.raises(ValueError, match=r"^channel of a memory filter: expected one that forgets, got Modes"):
+        hg.filters.memory_filter(s.plant, s.sensor, burst, HORIZON)

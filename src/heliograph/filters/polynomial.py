@@ -24,7 +24,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
-from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.monomials import count, monomials, position
 
 
@@ -235,10 +235,10 @@ def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon:
     Claim: as `polynomial_filter`; never worse than its quadratic filter.
 
     Raises:
-        ValueError: what `polynomial_filter` refuses.
+        ValueError: what `polynomial_filter` refuses; a channel that remembers.
     Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
     """
-    as_maps("channel", [first(channel)])
+    check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
     claim = claim_of(channel)
     linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
     products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)
