@@ -1,7 +1,7 @@
 """One-step computations in NumPy, in the paper's letters: what its formulas give, and what they should give."""
 
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,8 +9,8 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters.transform import AbstractTransform
-from heliograph.numerics.float64 import to_numpy
-from heliograph.papers.cubature_fusion.setting import OUTPUTS, Setting, transition
+from heliograph.numerics.float64 import compiled, to_numpy
+from heliograph.papers.cubature_fusion.setting import OUTPUTS, Setting, Transition, transition
 
 Array = np.ndarray
 
@@ -92,12 +92,16 @@ def theorem_2(v: Innovation, b: tuple[float, float], t: Terms, ch: Channel) -> A
 
 def predicted(s: Setting, rule: AbstractTransform, covariance: Array | None = None) -> tuple[Array, Array]:
     """Node 1's first prediction by a rule, from Xi_0 or another covariance: mean (5,) and covariance (5, 5)."""
-    f = transition(s)
     spread = s.claimed_initial_variance * np.eye(5) if covariance is None else covariance
-    with jax.enable_x64(True):
-        start = jnp.asarray(s.guesses[0]), jnp.asarray(spread)
-        moved = to_numpy(rule.apply(lambda x: f(x, ()), *start))
-    return moved.mean, moved.covariance + s.process_noise * np.eye(5)
+    mean, moved = _moved(transition(s), rule, np.array(s.guesses[0]), spread)
+    return mean, moved + s.process_noise * np.eye(5)
+
+
+@compiled
+def _moved(f: Transition, rule: AbstractTransform, mean: Array, covariance: Array) -> tuple[Any, Any]:
+    """Mean and covariance of f(x); compiled once for f and rule."""
+    found = rule.apply(lambda x: f(x, ()), jnp.asarray(mean), jnp.asarray(covariance))
+    return found.mean, found.covariance
 
 
 def output(node: int) -> Array:

@@ -14,6 +14,8 @@ from heliograph.filters.transform import AbstractTransform
 from heliograph.filters.update import AbstractUpdate
 from heliograph.papers.cubature_fusion.loose_interval import LooseInterval
 
+Transition = Callable[[jax.Array, object], jax.Array]
+
 NODES = ("1", "2", "3", "4")
 STATES = ("x1", "x2", "x3", "x4", "x5")
 
@@ -86,13 +88,13 @@ STRONG = replace(
 FIXED_ZERO_MEAN_SCALAR = 1e-2  # ours: the bound is not the paper's, so the paper gives none
 
 
-def transition(s: Setting) -> Callable[[jax.Array, object], jax.Array]:
+def transition(s: Setting) -> Transition:
     """The induction machine, one Euler step; one function for one setting, so that its nodes are alike."""
     return _transition(s.voltage, s.torque)
 
 
 @cache
-def _transition(voltage: float, torque: float) -> Callable[[jax.Array, object], jax.Array]:
+def _transition(voltage: float, torque: float) -> Transition:
     def f(x: jax.Array, _: object) -> jax.Array:
         rates = [
             B1 * x[0] + K1 * x[1] + B2 * x[2] + voltage,
