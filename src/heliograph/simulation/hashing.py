@@ -96,19 +96,37 @@ def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[
     def read(items: Sequence[Any]) -> list[Any]:
         return [item.val if isinstance(item, Literal) else values[item] for item in items]
 
-    for operation in jaxpr.eqns:
-        if operation.primitive.name == "jit" and _of_keys(operation):
-            inner = operation.params["jaxpr"]
-            results = _evaluate(inner.jaxpr, inner.consts, read(operation.invars))
+    for operations in _stretches(jaxpr.eqns):
+        first = operations[0]
+        if len(operations) == 1 and first.primitive.name == "jit" and _of_keys(first):
+            inner = first.params["jaxpr"]
+            made, results = first.outvars, _evaluate(inner.jaxpr, inner.consts, read(first.invars))
         else:
-            used = list(dict.fromkeys(item for item in operation.invars if not isinstance(item, Literal)))
-            alone: Jaxpr = jaxpr.replace(  # type: ignore[no-untyped-call]
-                eqns=[operation], constvars=[], invars=used, outvars=operation.outvars,
+            made = [item for operation in operations for item in operation.outvars]
+            inside = set(made)
+            items = [item for operation in operations for item in operation.invars]
+            used = list(dict.fromkeys(i for i in items if not isinstance(i, Literal) and i not in inside))
+            part: Jaxpr = jaxpr.replace(  # type: ignore[no-untyped-call]
+                eqns=operations, constvars=[], invars=used, outvars=made,
                 debug_info=jaxpr.debug_info.with_unknown_names(),
             )  # fmt: skip
-            results = jaxpr_as_fun(ClosedJaxpr(alone, ()))(*read(used))
-        values |= zip(operation.outvars, results, strict=True)
+            results = jaxpr_as_fun(ClosedJaxpr(part, ()))(*read(used))
+        values |= zip(made, results, strict=True)
     return read(jaxpr.outvars)
+
+
+def _stretches(operations: Sequence[JaxprEqn]) -> list[list[JaxprEqn]]:
+    """Operations in order: what has to do with keys one by one, what lies between together."""
+    result: list[list[JaxprEqn]] = []
+    last = True
+    for operation in operations:
+        alone = _of_keys(operation)
+        if alone or last:
+            result.append([operation])
+        else:
+            result[-1].append(operation)
+        last = alone
+    return result
 
 
 def _takes_any_key(jaxpr: Jaxpr) -> bool:

@@ -233,7 +233,9 @@ def _single(leaf: Any) -> Any:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
+@partial(eqx.filter_jit, inline=True)
 def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
+    """Traced once, for its shapes and for the program alike; tracing is half of what a first call takes."""
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
 
