@@ -233,11 +233,13 @@ def _single(leaf: Any) -> Any:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-@partial(eqx.filter_jit, inline=True)
-def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
-    """Traced once, for its shapes and for the program alike; tracing is half of what a first call takes."""
+def _simulated(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
+
+
+# Traced once, for its shapes and for the program alike: tracing is half of what a first call takes.
+_trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulated, inline=True)  # type: ignore[call-overload]
 
 
 def _key(key: object) -> jax.Array:
