@@ -8,6 +8,10 @@ from .base import (
 from .correction import (
     Scalars as Scalars,
 )
+from .delay import (
+    late_filter as late_filter,
+    part_filter as part_filter,
+)
 from .gaussian import (
     gaussian_filter as gaussian_filter,
 )
@@ -19,6 +23,7 @@ from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
 from .linear import (
+    as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )
 from .multiple_model import (

@@ -1,6 +1,7 @@
 """Public names of the room; the package loads them when first used."""
 
 from .channel import (
+    delayed as delayed,
     mean_gain as mean_gain,
     silent as silent,
 )
@@ -14,6 +15,9 @@ from .fading import (
 )
 from .over_time import (
     OverTime as OverTime,
+)
+from .past import (
+    with_past as with_past,
 )
 from .plant import (
     with_bias as with_bias,
