@@ -214,13 +214,11 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
 
 
 def _longer(link: Delayed, more: int) -> Delay:
-    """The link's delay, and so many steps."""
+    """The link's delay and so many steps, none after a chain."""
     match link.delay:
         case Mixture():
             times = np.array(link.times, dtype=float) + more
             return Discrete(times, link.delay.choice.probabilities, link.delay.choice.radius)
-        case Modes() if not more:
+        case Modes():
             return link.delay.memory
-        case GainAndNoise():
-            return link.times[0] + more
-    raise fail("delay of a relay", "none after a delay that is a chain", more)
+    return link.times[0] + more
