@@ -5,6 +5,9 @@ from .base import (
     in_float64 as in_float64,
     predicts as predicts,
 )
+from .clock import (
+    clock_filter as clock_filter,
+)
 from .correction import (
     Scalars as Scalars,
 )

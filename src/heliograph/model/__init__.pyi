@@ -5,6 +5,11 @@ from .channel import (
     mean_gain as mean_gain,
     silent as silent,
 )
+from .clock import (
+    Clock as Clock,
+    joint_sensor as joint_sensor,
+    with_clocks as with_clocks,
+)
 from .estimate import (
     Innovation as Innovation,
 )
