@@ -75,7 +75,7 @@ def with_clocks(
     plant: AbstractPlant,
     sensors: Mapping[str, AbstractSensor],
     clocks: Mapping[str, Clock],
-    motion: Motion,
+    motion: Motion | ArrayLike,
     dt: ArrayLike,
 ) -> tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]:
     """The plant with an offset and a drift for each clock as states, and the sensors of all nodes as sensors of it.
