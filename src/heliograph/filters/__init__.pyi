@@ -5,8 +5,15 @@ from .base import (
     in_float64 as in_float64,
     predicts as predicts,
 )
+from .clock import (
+    clock_filter as clock_filter,
+)
 from .correction import (
     Scalars as Scalars,
+)
+from .delay import (
+    late_filter as late_filter,
+    part_filter as part_filter,
 )
 from .gaussian import (
     gaussian_filter as gaussian_filter,
@@ -19,6 +26,7 @@ from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
 from .linear import (
+    as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )
 from .multiple_model import (

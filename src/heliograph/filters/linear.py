@@ -1,6 +1,7 @@
 """The best linear filter behind a random channel, and the filter that hears nothing."""
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
+from heliograph.filters.delay import LateFilter, PartFilter, ToldDelayFilter, as_current, behind_delays
 from heliograph.filters.gaussian import Belief, describe
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.modal import ModalFilter, modal_filter
@@ -28,6 +30,7 @@ from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.second_moments import SecondOrder
 
 
@@ -142,17 +145,19 @@ def used(
 
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter | ModalFilter | UncertainModalFilter | ToldFilter:
+) -> LinearFilter | ModalFilter | UncertainModalFilter | ToldFilter | PartFilter | LateFilter | ToldDelayFilter:
     """The best linear filter for a linear plant and sensor behind any channel.
 
     Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
-    too; if it also loses data, what arrives tells of the modes (`told_filter`). A sensor noise correlated with its own
-    past is outside.
+    too; if it also loses data, what arrives tells of the modes (`told_filter`). Behind a link that is late what was
+    sent is estimated too, unless the delay is constant. A sensor noise correlated with its own past is outside.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
     Source: De Koning (1984), for multiplicative noise; Costa (1994), for modes.
     """
+    if as_maps("channel", [first(channel)])[0].past:
+        return behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
     if not is_linear(plant, sensor):
         raise fail("linear filter", "a LinearPlant and a LinearSensor", f"{type(first(plant)).__name__} and "
                    f"{type(first(sensor)).__name__}")  # fmt: skip
@@ -196,6 +201,22 @@ def memoryless_filter(
     item = linear_filter(plant, sensor, without_memory(channel), update)
     assert isinstance(item, LinearFilter)  # what does not remember has no other
     return replace(item, claim="nominal") if memory_matters(channel) else item
+
+
+def as_current_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
+) -> LinearFilter:
+    """The filter that takes what is late as current: the best linear one if all delays were none.
+
+    Claim: "nominal" where anything can be late; `true_error` says before any data how wrong it is then.
+
+    Raises:
+        ValueError: what `linear_filter` refuses, a channel that remembers.
+    Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
+    """
+    item = linear_filter(plant, sensor, as_current(without_memory(channel)), update)
+    assert isinstance(item, LinearFilter)  # what is neither late nor remembers has no other
+    return replace(item, claim="nominal") if first(channel).past else item
 
 
 class OpenLoop(AbstractFilter):

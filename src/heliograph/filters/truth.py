@@ -10,6 +10,7 @@ from heliograph.filters.modal import Heard, heard_over
 from heliograph.filters.plan import Plan, PlannedFilter
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at, first
+from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import array, check_horizon, fail
@@ -43,7 +44,7 @@ def true_error(
     """E[(x - xhat)(x - xhat)'] of a linear filter in a world that it need not have been made for, exactly.
 
     With r = (x, 1, s), s the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and gains.
-    The channel may remember or not, and nothing is assumed of where the gains come from.
+    The channel may remember or not, or be late, and nothing is assumed of where the gains come from.
 
     Shapes: inputs (horizon, inputs).
 
@@ -55,7 +56,7 @@ def true_error(
     if not is_linear(plant, sensor):
         raise fail("true error", "a LinearPlant and a LinearSensor", "one that is not linear")
     start, n = first(plant), len(first(plant).states)
-    check_link(first(sensor), first(channel), n)
+    check_link(first(sensor), first(channel), n, late=True)
     if filter.received != first(channel).outputs or len(filter.states) != n:
         got = f"one of {len(filter.states)} that hears {filter.received}"
         raise fail("filter", f"one of {n} states that hears {first(channel).outputs} numbers", got)
@@ -63,13 +64,16 @@ def true_error(
     planned = filter.planned(u)
     if not isinstance(planned, PlannedFilter):
         raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
+    if first(channel).past:
+        plant, sensor, channel = with_past(plant, sensor, channel)
+    begin, total = first(plant), len(first(plant).states)
     initial, world = heard_over(channel)
     want = np.eye(n) if planned.want is None else np.asarray(planned.want)
-    mean = np.concatenate([start.initial_mean, [1.0], planned.start])
+    mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
-    square[:n, :n] += start.initial_covariance
+    square[:total, :total] += begin.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
-    row = np.concatenate([np.eye(n), np.zeros((n, 1)), -want], axis=1)
+    row = np.concatenate([np.eye(n, total + 1), -want], axis=1)
     for k in range(horizon):
         rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
         moments = _moved(moments, at(plant, k), at(planned.steps, k), u[k], rows)

@@ -1,8 +1,14 @@
 """Public names of the room; the package loads them when first used."""
 
 from .channel import (
+    delayed as delayed,
     mean_gain as mean_gain,
     silent as silent,
+)
+from .clock import (
+    Clock as Clock,
+    joint_sensor as joint_sensor,
+    with_clocks as with_clocks,
 )
 from .estimate import (
     Innovation as Innovation,
@@ -14,6 +20,9 @@ from .fading import (
 )
 from .over_time import (
     OverTime as OverTime,
+)
+from .past import (
+    with_past as with_past,
 )
 from .plant import (
     with_bias as with_bias,

@@ -1,6 +1,7 @@
 """Channels between a sensor and a filter, each one random affine map: hops, relays, dropouts, direct links."""
 
 from collections.abc import Sequence
+from typing import overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,12 +12,34 @@ from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
-from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.combine import Mixture, Stack
+from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 Channel = AbstractRandomAffine | OverTime  # an OverTime holds one channel per step
+
+
+@overload
+def hop(
+    gain: AbstractLaw | ArrayLike,
+    noise: AbstractNoise | ArrayLike,
+    power: ArrayLike = 1.0,
+    amplification: ArrayLike = 1.0,
+    dimension: int = 1,
+    delay: None = None,
+) -> GainAndNoise: ...
+@overload
+def hop(
+    gain: AbstractLaw | ArrayLike,
+    noise: AbstractNoise | ArrayLike,
+    power: ArrayLike = 1.0,
+    amplification: ArrayLike = 1.0,
+    dimension: int = 1,
+    *,
+    delay: Delay,
+) -> Delayed: ...
 
 
 def hop(
@@ -25,12 +48,13 @@ def hop(
     power: ArrayLike = 1.0,
     amplification: ArrayLike = 1.0,
     dimension: int = 1,
-) -> GainAndNoise:
+    delay: Delay | None = None,
+) -> GainAndNoise | Delayed:
     """One radio hop: z = amplification sqrt(power) g y + n, the same gain for all components of y.
 
     `gain` is a law or a number; `noise` a noise law, a covariance (m, m), or one variance common to `dimension`
     components, which are independent then. A relay's hop has its amplification factor; a sensor's has 1. All numbers
-    may be traced by JAX, those of the laws too.
+    may be traced by JAX, those of the laws too. `delay` as for `delayed`.
 
     Raises:
         ValueError: a negative power, a noise that is no covariance, numbers that are not finite.
@@ -40,7 +64,8 @@ def hop(
     count = components(noise) or check_count("dimension of a hop", dimension)
     p = scalar("hop power", power, 0.0)
     factor = scalar("amplification", amplification) * library(p).sqrt(p)
-    return GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
+    result = GainAndNoise(law, factor * np.eye(count), as_noise("hop noise", noise, count))
+    return result if delay is None else Delayed(result, delay)
 
 
 def perfect(dimension: int = 1) -> GainAndNoise:
@@ -63,16 +88,29 @@ def silent(outputs: int = 1, inputs: int | None = None, noise: AbstractNoise | A
     return GainAndNoise(Constant(1.0), matrix, as_noise("noise of a silent channel", noise, outputs))
 
 
-def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> Series:
+def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     """A chain of hops through relays that amplify what they hear, noise included: z = H_N ... H_2 H_1 y.
 
-    Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n.
+    Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
+    be late by a constant, the first by chance too; the delays add up.
 
     Raises:
-        ValueError: no hop, or hops whose dimensions do not fit.
+        ValueError: no hop, hops whose dimensions do not fit, a relay that holds what it hears for a random time.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
-    return Series(hops)
+    return in_series(hops)
+
+
+def delayed(link: AbstractRandomAffine, delay: Delay, told: bool = False) -> Delayed:
+    """A link that hears at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k; before the first step, zeros.
+
+    `delay` is a number of steps, a `Discrete` law from which one is drawn at each step, or a `MarkovChain` whose mode
+    it is: then one y may be heard twice, or never. `told`: the receiver is told d, as the last number of z.
+
+    Raises:
+        ValueError: a delay that is no whole number of steps from 0, a link that is late already.
+    """
+    return Delayed(link, delay, told)
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:
@@ -105,7 +143,9 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    return Stack([relayed, direct])
+    both = as_maps("relayed and direct link", [relayed, direct])
+    past = max(c.past for c in both)
+    return Stack([c if c.past == past else of_part(c, sent(c), 0, past) for c in both])
 
 
 def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
@@ -115,10 +155,10 @@ def parallel(channels: Sequence[AbstractRandomAffine]) -> Stack:
         ValueError: no channels.
     """
     channels = as_maps("parallel channels", channels)
-    parts, start, total = [], 0, sum(c.inputs for c in channels)
+    parts, start, total, past = [], 0, sum(sent(c) for c in channels), max(c.past for c in channels)
     for c in channels:
-        parts.append(Series([known(np.eye(total)[start : start + c.inputs]), c]))
-        start += c.inputs
+        parts.append(of_part(c, total, start, past))
+        start += sent(c)
     return Stack(parts)
 
 
@@ -135,9 +175,12 @@ def mean_gain(channel: Channel) -> Channel:
     return channel.mean_gain()
 
 
-def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: int) -> None:
-    """Raise ValueError unless sensor and channel fit each other and the state."""
+def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: int, late: bool = False) -> None:
+    """Raise ValueError unless sensor and channel fit each other and the state; `late`: delays are known here."""
     check_sensor(sensor, states)
     as_maps("channel", [channel])
-    if channel.inputs != len(sensor.outputs):
-        raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{channel.inputs} inputs")
+    if channel.past and not late:
+        expected = "one without delays (linear_filter knows them; hg.filters.late_filter a constant one for any filter)"
+        raise fail("channel", expected, f"one that is late by up to {channel.past} steps")
+    if sent(channel) != len(sensor.outputs):
+        raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{sent(channel)} inputs")

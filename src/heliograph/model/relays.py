@@ -225,6 +225,8 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
             raise fail(f"{where}: sender", f"one of {[SENSOR, *network.relays]}", repr(sender))
         if not isinstance(first(link), AbstractRandomAffine):
             raise fail(f"{where}: link from {sender!r}", "a random affine map", type(first(link)).__name__)
+        if first(link).past:
+            raise fail(f"{where}: link from {sender!r}", "one without delays", f"one late by {first(link).past} steps")
         takes, length = first(link).inputs, len(first(network.sensor).outputs)
         if takes != length:
             raise fail(f"{where}: link from {sender!r}", f"one that takes {length} numbers", f"one that takes {takes}")

@@ -71,6 +71,11 @@ class AbstractRandomAffine(eqx.Module):
         return False
 
     @property
+    def past(self) -> int:
+        """Steps back of which it hears: its inputs are y_k, y_{k-1}, ..., y_{k-past}, one after another."""
+        return max((part.past for part in held_maps(self)), default=0)
+
+    @property
     def remembers(self) -> bool:
         """Whether what is drawn depends on what was drawn before; unless told, whether a map held inside does."""
         return any(part.remembers for part in held_maps(self))

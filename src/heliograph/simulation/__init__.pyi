@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .arrivals import (
+    arrivals as arrivals,
+)
 from .before_data import (
     CrossCovariances as CrossCovariances,
     cross_covariances as cross_covariances,

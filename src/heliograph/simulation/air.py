@@ -86,14 +86,14 @@ class CommonChannel(AbstractAir):
     rows: tuple[np.ndarray, ...]  # (node, received) of each group
 
     def init(self, key: jax.Array) -> PyTree:
-        """The channel forgets."""
-        return ()
+        """What a late channel holds of the past; the channel forgets all else."""
+        return start(self.channel, key, checksum(SENDER), ())
 
     def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
         """The sensor measures x, the channel delivers."""
         sensor, place = at(self.sensor, k), checksum(SENDER)
         y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, place, SENSOR))
-        _, z = deliver(self.channel, (), y, key, k, place, ())
+        state, z = deliver(self.channel, state, y, key, k, place, ())
         return state, tuple(z[rows] for rows in self.rows)
 
 

@@ -91,7 +91,7 @@ class Network(eqx.Module):
         for names in self.groups:
             node = self.nodes[names[0]]
             if isinstance(node, Node):
-                check_link(first(node.sensor), first(node.channel), len(self.states))
+                check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
         for name, item in self.fused.items():
             if isinstance(item, Fusion):
                 item.check(self.nodes_with(item.filter), len(self.states))
@@ -149,7 +149,7 @@ class Network(eqx.Module):
         Raises:
             ValueError: filters that do not hear all outputs once, a channel that remembers, parts that do not fit.
         """
-        check_link(first(sensor), first(channel), len(first(plant).states))
+        check_link(first(sensor), first(channel), len(first(plant).states), late=True)
         check_forgets("channel of nodes that share it", first(channel))
         heard = {name: max((item.received for item in own.values()), default=0) for name, own in filters.items()}
         if sum(heard.values()) != first(channel).outputs:

@@ -1,14 +1,17 @@
 """Channels in a run: their draws, and those of the memories that several of them may share."""
 
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at
-from heliograph.random_affine.base import advance, apply, begin, memories
+from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, memories
+from heliograph.random_affine.delay import sent
 from heliograph.simulation.draws import (
     CHANNEL,
     CHANNEL_START,
@@ -39,21 +42,37 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
     }
 
 
+class Late(NamedTuple):
+    """A late channel's own state, and what was sent before, the last first."""
+
+    channel: PyTree
+    line: jax.Array
+
+
 def start(channel: Channel, key: jax.Array, place: Number, shared: Places) -> PyTree:
     """A channel's state before the first step."""
     now, own = at(channel, 0), draw_key(key, 0, place, CHANNEL_START)
-    if not len(shared):
-        return now.init(own)
-    return begin(now, own, [draw_key(key, 0, memory, MEMORY_START) for memory in shared])
+    keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
+    state = begin(now, own, keys) if len(shared) else now.init(own)
+    return Late(state, jnp.zeros(now.past * sent(now))) if now.past else state
 
 
 def deliver(
     channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number, shared: Places
 ) -> tuple[PyTree, jax.Array]:
-    """The state that follows, and what the channel makes of y at step k."""
+    """The state that follows, and what the channel makes of y at step k; a late one also of what was sent before."""
     now, own = at(channel, k), draw_key(key, k, place, CHANNEL)
-    if not len(shared):
-        state, h = now.draw(state, own)
-    else:
-        state, h = advance(now, state, own, [draw_key(key, k, memory, MEMORY) for memory in shared])
+    if now.past:
+        line = jnp.concatenate([y, state.line])
+        after, h = _drawn(now, state.channel, key, k, own, shared)
+        return Late(after, line[: -len(y)]), apply(h, line)
+    state, h = _drawn(now, state, key, k, own, shared)
     return state, apply(h, y)
+
+
+def _drawn(
+    now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, own: jax.Array, shared: Places
+) -> tuple[PyTree, jax.Array]:
+    if not len(shared):
+        return now.draw(state, own)
+    return advance(now, state, own, [draw_key(key, k, memory, MEMORY) for memory in shared])

@@ -1,0 +1,175 @@
+"""Nodes whose clocks are wrong: offset and drift as states, and sensors whose values are stamped by such a clock."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
+from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
+from heliograph.numerics.check import array, fail, function, instance, scalar, table
+from heliograph.numerics.traced import library
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Square, Vector
+
+Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
+
+
+class Clock(NamedTuple):
+    """A clock that shows t + offset at t; the offset grows by `drift` a unit of time, the drift wanders.
+
+    offset, drift: their standard deviations at the start, where both have mean 0; wander: variance that the drift gains
+    at each step.
+    """
+
+    offset: float
+    drift: float
+    wander: float = 0.0
+
+
+class Stamped(AbstractSensor):
+    """A sensor whose values are of the time that its clock shows: h(x(s - o)) = h(x) - o dh/dt to first order.
+
+    `offset` is the place of o among the states, `states` the number of those that the sensor measures.
+    """
+
+    base: AbstractSensor
+    noise: AbstractNoise
+    motion: Motion | None
+    states: int = eqx.field(static=True)
+    offset: int = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """h(x) - o dh/dt; h(x) where the clock is right."""
+        own = jnp.asarray(x)[: self.states]
+        if self.motion is None:
+            return self.base.measure(own)
+        rate = jnp.asarray(self.motion(own) if callable(self.motion) else jnp.asarray(self.motion) @ own)
+        y, change = jax.jvp(self.base.measure, (own,), (rate,))
+        return jnp.asarray(y - x[self.offset] * change)
+
+
+class Clocked(AbstractPlant):
+    """A plant that is not linear, and clocks beside it."""
+
+    base: AbstractPlant
+    move: Matrix
+    noise: AbstractNoise | NoiseFunction
+    initial_mean: Vector
+    initial_covariance: Square
+    deviation: AbstractNoise | None
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+
+    def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
+        """(f(x, u), offset + dt drift, drift)."""
+        n = len(self.base.states)
+        return jnp.concatenate([self.base.transition(x[:n], u), jnp.asarray(self.move) @ x[n:]])
+
+
+def with_clocks(
+    plant: AbstractPlant,
+    sensors: Mapping[str, AbstractSensor],
+    clocks: Mapping[str, Clock],
+    motion: Motion | ArrayLike,
+    dt: ArrayLike,
+) -> tuple[LinearPlant | Clocked, dict[str, LinearSensor | Stamped]]:
+    """The plant with an offset and a drift for each clock as states, and the sensors of all nodes as sensors of it.
+
+    A value is taken as one of the time with which it is stamped. A node of `clocks` stamps by its own clock, s = t + o:
+    it then measures the plant o before that time, h = y - o dy/dt. `motion` is dx/dt, a function of x or its matrix;
+    `dt` the time of a step, over which o grows by dt drift. Named after their nodes: "NODE_offset", "NODE_drift".
+
+    Shapes: motion (n, n).
+
+    Raises:
+        ValueError: a clock whose node has no sensor, negative deviations, noise that depends on inputs, wrong shapes.
+    """
+    instance("plant with clocks", plant, AbstractPlant, "a plant that does not vary")
+    sensors, clocks = table("sensors", sensors, "sensors of nodes"), table("clocks", clocks, "clocks of nodes")
+    n, step = len(plant.states), scalar("time of a step", dt, 0.0)
+    if set(clocks) - set(sensors) or not clocks:
+        raise fail("clocks", f"those of some of the nodes {list(sensors)}", list(clocks))
+    for name, sensor in sensors.items():
+        check_sensor(instance(f"sensor of node {name!r}", sensor, AbstractSensor, "one that does not vary"), n)
+    moving = function("motion", motion, "x") if callable(motion) else array("motion", motion, (n, n))
+    places = {name: n + 2 * i for i, name in enumerate(clocks)}
+    return _plant(plant, clocks, step), {
+        name: _sensor(sensor, moving, n, n + 2 * len(clocks), places.get(name)) for name, sensor in sensors.items()
+    }
+
+
+def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> LinearPlant | Clocked:
+    if not isinstance(plant.noise, AbstractNoise):
+        raise fail("noise of a plant with clocks", "a covariance or a noise law", "a function of the inputs")
+    spread, wander = [], []
+    for name, clock in clocks.items():
+        for part in Clock._fields:
+            scalar(f"{part} of the clock of {name!r}", getattr(clock, part), 0.0)
+        spread += [clock.offset**2, clock.drift**2]
+        wander += [0.0, clock.wander]
+    move = np.kron(np.eye(len(clocks)), np.array([[1.0, dt], [0.0, 1.0]]))
+    law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
+    noise, start = Independent([plant.noise, Gaussian(np.diag(wander))]), Independent([law, Gaussian(np.diag(spread))])
+    center = library(plant.initial_mean).concatenate([plant.initial_mean - law.mean, np.zeros(len(move))])
+    states = (*plant.states, *(f"{name}_{part}" for name in clocks for part in ("offset", "drift")))
+    if isinstance(plant, LinearPlant):
+        xp, n = library(plant.matrix, plant.input_matrix), len(plant.states)
+        beside = np.zeros((n, len(move)))
+        matrix = xp.block([[plant.matrix, beside], [beside.T, move]])
+        driven = xp.concatenate([plant.input_matrix, np.zeros((len(move), len(plant.inputs)))])
+        return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs)
+    return Clocked(
+        base=plant,
+        move=move,
+        noise=noise,
+        initial_mean=center + start.mean,
+        initial_covariance=start.covariance,
+        deviation=start,
+        states=states,
+        inputs=plant.inputs,
+    )
+
+
+def _sensor(
+    sensor: AbstractSensor, motion: Motion, states: int, total: int, offset: int | None
+) -> LinearSensor | Stamped:
+    if offset is None and isinstance(sensor, LinearSensor):
+        matrix = library(sensor.matrix).pad(sensor.matrix, ((0, 0), (0, total - states)))
+        return LinearSensor(matrix, sensor.noise, sensor.outputs)
+    stamped = motion if offset is not None else None
+    return Stamped(
+        base=sensor, noise=sensor.noise, motion=stamped, states=states, offset=offset or 0, outputs=sensor.outputs
+    )
+
+
+class JointSensor(AbstractSensor):
+    """Sensors of one state, their outputs one above the other, their noises independent."""
+
+    parts: tuple[AbstractSensor, ...]
+    noise: AbstractNoise
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def measure(self, x: jax.Array) -> jax.Array:
+        """All of them."""
+        return jnp.concatenate([part.measure(x) for part in self.parts])
+
+
+def joint_sensor(sensors: Mapping[str, AbstractSensor]) -> JointSensor:
+    """What a centre hears of nodes, in their order: with `parallel` of their channels, one sensor for a filter there.
+
+    Raises:
+        ValueError: no sensors, or one that varies.
+    """
+    parts = table("sensors", sensors, "sensors of nodes")
+    if not parts:
+        raise fail("sensors", "at least one", "none")
+    for name, part in parts.items():
+        instance(f"sensor of node {name!r}", part, AbstractSensor, "one that does not vary")
+    outputs = tuple(f"{name}_{output}" for name, part in parts.items() for output in part.outputs)
+    noise = Independent([part.noise for part in parts.values()])
+    return JointSensor(parts=tuple(parts.values()), noise=noise, outputs=outputs)

@@ -1,0 +1,65 @@
+"""A linear plant with what its sensor sent before as states: what a filter needs behind a link that hears late."""
+
+from typing import Any
+
+import numpy as np
+
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import library
+from heliograph.random_affine.delay import of_line
+from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Shaped
+
+
+def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[AnyPlant, LinearSensor, Channel]:
+    """Plant, sensor and channel with the states (x_k, y_k, y_{k-1}, ..., y_{k-D}), all sent at once: nothing is late.
+
+    y+ = C (A x + B u + w) + v is a state with its noise, so that one y heard twice is known to be one. Past states x
+    instead would take its noise for two independent ones, and claim too little. Before the first step zeros were sent.
+    The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, parts that do not fit, process noise that depends on inputs.
+    """
+    if not is_linear(plant, sensor):
+        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
+        raise fail("plant and sensor behind a random delay", "a LinearPlant and a LinearSensor", got)
+    check_link(first(sensor), first(channel), len(first(plant).states), late=True)
+    past, steps = first(channel).past, steps_covered((plant, sensor))
+    if not isinstance(plant, OverTime) and not isinstance(sensor, OverTime):
+        moved: AnyPlant = _with_line(plant, sensor, past)
+    else:
+        moved = over_time([_with_line(at(plant, k), at(sensor, k), past) for k in range(steps or 0)])
+    n, total = len(first(plant).states), len(first(moved).states)
+    everything = LinearSensor(np.eye(total)[n:], np.zeros((total - n, total - n)), first(moved).states[n:])
+    return moved, everything, of_line(channel)
+
+
+def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
+    """x+ = A x + B u + w, y+ = C x+ + v, and the line moves on by one."""
+    if not isinstance(plant.noise, AbstractNoise):
+        raise fail("noise of a plant behind a random delay", "a covariance or a noise law", "a function of the inputs")
+    c = sensor.matrix
+    xp = library(plant.matrix, plant.input_matrix, c)
+    m, n = c.shape
+    kept = past * m
+    enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((kept, n + m))]])
+    shift = np.eye(kept, kept + m)
+    moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((kept, n))])
+    rest = np.concatenate([np.zeros((n + m, kept + m)), shift])
+    driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((kept, len(plant.inputs)))])
+    law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
+    names = sensor.outputs
+    line = [f"{name}_{d}_ago" if d else f"{name}_sent" for d in range(past + 1) for name in names]
+    return LinearPlant(
+        xp.concatenate([moves, rest], axis=1),
+        Shaped(enters, Independent([plant.noise, sensor.noise])),
+        xp.concatenate([plant.initial_mean - law.mean, np.zeros(kept + m)]),
+        Independent([law, Gaussian(np.zeros((kept + m, kept + m)))]),
+        driven,
+        (*plant.states, *line),
+        plant.inputs,
+    )

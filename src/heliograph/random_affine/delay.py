@@ -1,0 +1,224 @@
+"""Links that hear late: at step k what was sent d steps before, with d known or drawn, told or not."""
+
+from collections.abc import Sequence
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.numerics.check import check_count, fail, shown
+from heliograph.random_affine.atoms import GainAndNoise, known
+from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
+from heliograph.random_affine.chain import MarkovChain
+from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.modes import Modes
+
+Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain whose mode is the number of steps
+T = TypeVar("T")
+
+
+class AbstractOfLine(AbstractRandomAffine):
+    """A map of the line (y_k, y_{k-1}, ..., y_{k-past}), one after another."""
+
+    @property
+    def line(self) -> AbstractRandomAffine:
+        """The same as a plain map, of which all that the line holds is the present."""
+        raise NotImplementedError
+
+    @property
+    def outputs(self) -> int:
+        """Outputs of the map."""
+        return self.line.outputs
+
+    @property
+    def inputs(self) -> int:
+        """Length of the line."""
+        return self.line.inputs
+
+    @property
+    def erases(self) -> bool:
+        """Whether the map does."""
+        return self.line.erases
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map."""
+        return self.line.init(key)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw the map."""
+        return self.line.draw(state, key)
+
+    def moments(self, order: int) -> Moments:
+        """Those of the map."""
+        return self.line.moments(order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Those of the map."""
+        return tuple(OfLine(m, self.past) for m in self.line.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the map."""
+        return self.line.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """The map with its mean gain."""
+        return OfLine(self.line.mean_gain(), self.past)
+
+
+class OfLine(AbstractOfLine):
+    """A map that is given as one of the line."""
+
+    plain: AbstractRandomAffine
+    steps: int = eqx.field(static=True)
+
+    @property
+    def line(self) -> AbstractRandomAffine:
+        """The map."""
+        return self.plain
+
+    @property
+    def past(self) -> int:
+        """Steps back that the line reaches."""
+        return self.steps
+
+
+class Delayed(AbstractOfLine):
+    """z_k = G_k y_{k-d} + n_k: a link that hears at step k what was sent d steps before.
+
+    Of the line its mean gain is E[G] sum_d p_d S_d, where S_d chooses y_{k-d}, and its spread that of the mixture.
+    Before the first step zeros were sent. `told`: d is received too, as the last number.
+
+    Raises:
+        ValueError: a delay that is no whole number of steps from 0, a law of it whose values are none, a link that is
+            late itself (put links in series with `amplify_and_forward`).
+    """
+
+    link: AbstractRandomAffine
+    delay: AbstractRandomAffine  # from the line to what the link hears, and to d where it is told
+    times: tuple[int, ...] = eqx.field(static=True)
+    told: bool = eqx.field(static=True)
+
+    def __init__(self, link: AbstractRandomAffine, delay: Delay, told: bool = False):
+        (self.link,) = as_maps("delayed link", [link])
+        if link.past:
+            raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
+        self.times, self.told = _times(delay), told
+        each = [_chosen(d, self.past, link.inputs, told) for d in self.times]
+        match delay:
+            case Discrete():
+                self.delay = Mixture(each, delay.probabilities, delay.radius)
+            case MarkovChain():
+                self.delay = Modes(delay, each)
+            case _:
+                self.delay = each[0]
+
+    @property
+    def line(self) -> AbstractRandomAffine:
+        """The choice, then the link."""
+        if not self.told:
+            return Series([self.delay, self.link])
+        m = self.link.inputs
+        rows = np.eye(m + 1)
+        return Series([self.delay, Stack([Series([known(rows[:m]), self.link]), known(rows[m:])])])
+
+    @property
+    def past(self) -> int:
+        """The longest delay."""
+        return max(self.times)
+
+    @property
+    def constant(self) -> bool:
+        """Whether the delay never varies."""
+        return isinstance(self.delay, GainAndNoise)
+
+    def given(self, d: int) -> AbstractRandomAffine:
+        """The map of the line without the told number, for one delay."""
+        return Series([_chosen(d, self.past, self.link.inputs, False), self.link])
+
+
+def _times(delay: Delay) -> tuple[int, ...]:
+    match delay:
+        case Discrete():
+            values = [int(d) if d == int(d) else float(d) for d in np.asarray(delay.values)]
+        case MarkovChain():
+            values = list(range(delay.modes))
+        case int() | np.integer():
+            values = [delay]
+        case _:
+            raise fail("delay", "a number of steps, a Discrete law or a MarkovChain of it", shown(delay))
+    return tuple(check_count("delay", d, 0) for d in values)
+
+
+def _chosen(d: int, longest: int, size: int, told: bool) -> GainAndNoise:
+    """S_d, and below it the number d."""
+    rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
+    if not told:
+        return known(rows)
+    return known(np.pad(rows, ((0, 1), (0, 0))), np.append(np.zeros(size), float(d)))
+
+
+def of_line(channel: T) -> T:
+    """The channel (or all channels in a tree) as a plain map of the line."""
+
+    def plain(part: object) -> object:
+        return part.line if isinstance(part, AbstractOfLine) else part
+
+    result: T = jax.tree.map(plain, channel, is_leaf=lambda part: isinstance(part, AbstractOfLine))
+    return result
+
+
+def sent(channel: AbstractRandomAffine) -> int:
+    """Numbers that are sent to a channel at each step."""
+    return channel.inputs // (1 + channel.past)
+
+
+def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
+    """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
+    own, size = channel.past, sent(channel)
+    rows = np.concatenate([t * total + start + np.arange(size) for t in range(own + 1)])
+    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if own else channel])
+    return OfLine(chosen, past) if past else chosen
+
+
+def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+    """One link after another, each late by its own; constant delays, and a first random one, add up at the sensor.
+
+    A relay that forgets and holds what it heard for d steps is one that hears it d steps later: its gains and noises
+    are independent over time. One that holds it for a random time would forward one noise twice.
+
+    Raises:
+        ValueError: no links, a random delay after the first link, delays told on the way, memory before a delay.
+    """
+    links = as_maps("series", links)
+    if not any(link.past for link in links):
+        return Series(links)
+    late = [link for link in links if link.past]
+    if not all(isinstance(link, Delayed) for link in late):
+        raise fail("series", "links that are late each by itself", "a combination of late links")
+    delays = [link for link in late if isinstance(link, Delayed)]
+    start, added = (delays[0], delays[1:]) if links[0].past else (None, delays)
+    if not all(link.constant for link in added):
+        raise fail("delay of a relay", "a constant (only what the sensor sends may be late by chance)", "a random one")
+    last = max(i for i, link in enumerate(links) if link.past)
+    if any(link.told for link in delays[:-1]) or (delays[-1].told and start is not None and len(delays) > 1):
+        raise fail("delays told", "those of one link", "those of several in series")
+    for link in links[:last] if added else ():
+        if link.remembers:
+            raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
+    chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
+    told, more = any(link.told for link in delays), sum(link.times[0] for link in added)
+    return Delayed(chain, more if start is None else _longer(start, more), told)
+
+
+def _longer(link: Delayed, more: int) -> Delay:
+    """The link's delay and so many steps, none after a chain."""
+    match link.delay:
+        case Mixture():
+            times = np.array(link.times, dtype=float) + more
+            return Discrete(times, link.delay.choice.probabilities, link.delay.choice.radius)
+        case Modes():
+            return link.delay.memory
+    return link.times[0] + more

@@ -1,0 +1,48 @@
+"""A record as events: what each node heard, of which step it is, and when it was heard."""
+
+import numpy as np
+
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.random_affine.delay import Delayed
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.record import Record
+
+Arrival = tuple[str, int, float, np.ndarray, float]  # node, sequence, time, values, arrival
+
+
+def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
+    """What was heard in one run, (node, sequence, time, values, arrival), in the order of arrival.
+
+    Times are steps from 0. A value belongs to the step at which it was sent, which is its sequence number too: as a
+    constant delay says, or as was told with it. One value that is heard twice has one number, and two channel noises.
+    What was heard before anything was sent, and what was lost, is left out.
+
+    Raises:
+        ValueError: a node whose delays are random and not told, so that nobody knows of which step a value is.
+    """
+    instance("record", record, Record, "a Record")
+    found: list[Arrival] = []
+    for name, z in record.measurements.items():
+        values = z if z.ndim == 2 else z[check_count("run", run, 0)]
+        values, late = _timed(name, network.nodes[name], values)
+        there = ~np.isnan(values).all(axis=1) & ~np.isnan(late)
+        for k in np.flatnonzero(there):
+            sent = int(k - late[k])
+            if sent >= 0:
+                found.append((name, sent, float(sent), values[k], float(k)))
+    return sorted(found, key=lambda event: event[-1])
+
+
+def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Values (steps, m), and how late each is (steps,)."""
+    channel = node.channel if isinstance(node, Node) else None
+    one = at(channel, 0) if isinstance(channel, OverTime) else channel
+    if one is None or not one.past:
+        return z, np.zeros(len(z))
+    if isinstance(one, Delayed) and one.told:
+        return z[:, :-1], z[:, -1]
+    if isinstance(one, Delayed) and one.constant:
+        return z, np.full(len(z), float(one.past))
+    raise fail(f"delays of node {name!r}", "constant ones, or told ones", "random ones that nobody is told")
