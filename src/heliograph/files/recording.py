@@ -11,6 +11,7 @@ import numpy as np
 from heliograph.files.table import read_table, write_table
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
+from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.record import Record, is_sound
@@ -19,6 +20,7 @@ TIME = "time"
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 
 
+@readable
 class Recording(NamedTuple):
     """Measured data as `heliograph.run` takes it: `run(network, *recording)`.
 

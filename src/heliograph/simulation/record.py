@@ -13,11 +13,13 @@ from jaxtyping import PyTree
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
+from heliograph.numerics.readable import readable
 from heliograph.simulation.network import FUSED, Network
 
 Result = TypeVar("Result")
 
 
+@readable
 @dataclass(frozen=True)
 class Uplink:
     """What a fusion's quantizers did to the estimates of `nodes`, by component.
@@ -39,6 +41,7 @@ class Uplink:
         return float(self.symbols.mean())
 
 
+@readable
 @dataclass(frozen=True)
 class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
@@ -104,6 +107,7 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     return result
 
 
+@readable
 class AbstractReducer(eqx.Module, Generic[Result]):
     """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
 

@@ -10,11 +10,13 @@ from scipy.special import stdtrit
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.readable import readable
 from heliograph.simulation.record import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
 
 
+@readable
 @dataclass(frozen=True)
 class ErrorStatistics:
     """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
@@ -176,6 +178,7 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     )
 
 
+@readable
 @dataclass(frozen=True)
 class WorstDirection:
     """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import squared_distance
 from heliograph.simulation.lanes import BLOCK
 from heliograph.simulation.network import FUSED, Network
@@ -21,6 +22,7 @@ from heliograph.simulation.record import AbstractReducer, Record, Uplink, by_nam
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
 
+@readable
 class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
     """Statistics by node and filter; fused ones under "fused"."""
 

@@ -11,10 +11,12 @@ from scipy.linalg import toeplitz
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.likelihood import rows
 
 
+@readable
 @dataclass(frozen=True)
 class MemoryTest:
     """Correlation of innovations at lags 1, 2, ..., its standard error, and what the data say of memory and its cost.
