@@ -15,6 +15,7 @@ SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
     ["numerics"],
+    ["files.durable", "files.holding", "files.quoting", "files.whole_file", "files.table", "files.output_folder"],
     ["random_affine"],
     ["model"],
     ["filters.base", "filters.transform", "filters.scalars", "filters.correction", "filters.update"],

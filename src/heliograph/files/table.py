@@ -1,19 +1,16 @@
 """Tables in files: columns of numbers read from and written to CSV or Parquet; the extension decides."""
 
 import csv
-import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from glob import escape as glob_escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.durable import naming, replace
 from heliograph.files.quoting import from_cell, in_cell
+from heliograph.files.whole_file import whole_file
 from heliograph.numerics.check import fail, shown
 
 FORMATS = (".csv", ".parquet")
@@ -48,14 +45,14 @@ def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
     """
     path = Path(path)
     check_output(path)
-    with _whole(path) as partial:
+    with whole_file(path) as partial:
         (_write_csv if _format(path) == ".csv" else _write_parquet)(columns, partial)
 
 
-def check_output(path: str | Path) -> None:
-    """Raise what `write_table` would, before the work starts."""
+def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
+    """Raise what writing a file would, before the work starts."""
     path = Path(path)
-    if _format(path) == ".parquet":
+    if _format(path, formats) == ".parquet":
         import pyarrow.parquet  # noqa: F401
     if path.is_dir():
         raise fail(f"output file {path}", "a file", "a folder")
@@ -77,37 +74,10 @@ def check_output_folder(folder: str | Path) -> None:
         raise fail(name, "a folder that can be written", error.strerror) from None
 
 
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
-        if not _lives(left.name.split(".")[-2]):
-            left.unlink(missing_ok=True)
-    try:
-        with naming(path):
-            yield partial
-            replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-
-
-def _lives(process: str) -> bool:
-    """Whether a process of this number runs; what others left is theirs where that cannot be told."""
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OSError):
-        return True
-    return True
-
-
-def _format(path: Path) -> str:
+def _format(path: Path, formats: Sequence[str] = FORMATS) -> str:
     kind = path.suffix.lower()
-    if kind not in FORMATS:
-        raise fail(str(path), f"a name that ends in {' or '.join(FORMATS)}", repr(path.suffix))
+    if kind not in formats:
+        raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
     return kind
 
 

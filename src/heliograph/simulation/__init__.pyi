@@ -24,6 +24,7 @@ from .statistics import (
     pool as pool,
 )
 from .sums import (
+    StatisticsByName as StatisticsByName,
     error_statistics as error_statistics,
 )
 from .whiteness import (
