@@ -12,12 +12,16 @@ import numpy as np
 from heliograph.files.quoting import from_cell, in_cell
 from heliograph.files.whole_file import whole_file
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.dates import dates, in_iso, looks_like_date
 
 FORMATS = (".csv", ".parquet")
 
 
 def read_table(path: str | Path) -> dict[str, np.ndarray]:
     """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN. Rows count from 1.
+
+    A column whose first cell is a date of ISO 8601, as 2026-11-21T23:25:00+01:00, is read as dates: datetime64[ns] in
+    UTC. Dates without a zone are taken as they stand.
 
     Raises:
         ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no
@@ -93,20 +97,26 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             lines = (line for line in csv.reader(file, strict=True) if line)
             header = [from_cell(name.strip()) for name in next(lines, [])]
             _check_header(path, header)
-            rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
+            rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(header))
-    return {name: values[:, i].copy() for i, name in enumerate(header)}
+    dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
+    numbers = [
+        [np.nan if i in dated else _number(path, header[i], row, cell) for i, cell in enumerate(cells)]
+        for row, cells in enumerate(rows, 1)
+    ]
+    values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
+    columns = {name: values[:, i].copy() for i, name in enumerate(header)}
+    return columns | {header[i]: dates((cells[i] for cells in rows), f"{path}, column {header[i]!r}") for i in dated}
 
 
-def _numbers(path: Path, header: list[str], number: int, line: list[str]) -> list[float]:
+def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
     if line[0].lstrip().startswith("#"):
         raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: a table has none")
     if len(line) != len(header):
         hint = ": numbers have a decimal point" if len(line) > len(header) else ""
         raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
-    return [_number(path, name, number, cell.strip()) for name, cell in zip(header, line, strict=True)]
+    return [cell.strip() for cell in line]
 
 
 def _number(path: Path, name: str, number: int, cell: str) -> float:
@@ -142,7 +152,10 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)):
+        if pa.types.is_timestamp(kind):
+            columns[name] = np.array(column.cast(pa.timestamp("ns", kind.tz)).to_numpy(), dtype="datetime64[ns]")
+            continue
+        if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
             raise fail(f"{path}, row 1, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
         columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
     return columns
@@ -156,6 +169,8 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
 
 
 def _plain(column: np.ndarray) -> np.ndarray:
+    if column.dtype.kind == "M":
+        return in_iso(column)
     return column.astype(np.int64) if column.dtype == np.bool_ else column  # true is 1 in a CSV file
 
 
@@ -163,4 +178,6 @@ def _write_parquet(columns: Mapping[str, np.ndarray], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    pq.write_table(pa.table({name: np.ascontiguousarray(c) for name, c in columns.items()}), path)
+    arrays = {name: pa.array(np.ascontiguousarray(c)) for name, c in columns.items()}
+    dated = {name: a.cast(pa.timestamp("ns", "UTC")) for name, a in arrays.items() if columns[name].dtype.kind == "M"}
+    pq.write_table(pa.table(arrays | dated), path)

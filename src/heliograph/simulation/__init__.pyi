@@ -7,6 +7,7 @@ from .before_data import (
 )
 from .boundedness import (
     Boundedness as Boundedness,
+    certify_boundedness as certify_boundedness,
 )
 from .compilation_cache import (
     keep_compilations as keep_compilations,
