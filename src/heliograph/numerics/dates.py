@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from typing import Literal
 
 import numpy as np
 
@@ -11,6 +12,7 @@ DATE = re.compile(
     r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.]\d{1,9})?)?))?"
     r" ?(?P<zone>Z|UTC|[+-]\d\d(?::?\d\d)?)?"
 )
+UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 MISSING = np.iinfo(np.int64).min  # NumPy's NaT
 YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
 
@@ -70,5 +72,7 @@ def seconds_between(time: np.ndarray) -> np.ndarray:
 
 
 def in_iso(time: np.ndarray) -> np.ndarray:
-    """Dates as texts in UTC, as short as they all can be."""
-    return np.asarray(np.datetime_as_string(time, unit="auto", timezone="UTC"))
+    """Dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
+    there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
+    unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
+    return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))

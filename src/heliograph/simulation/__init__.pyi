@@ -30,4 +30,5 @@ from .sums import (
 )
 from .whiteness import (
     MemoryTest as MemoryTest,
+    whitened_innovations as whitened_innovations,
 )

@@ -33,7 +33,7 @@ def plot_record(
     drawn = _axes(axes, len(places), record.time, record.units)
     for one, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
-            estimate, colour = record.estimates[node][name], f"C{number}"
+            estimate, colour = record.estimates[node][name], _colour(number)
             mean = np.asarray(estimate.mean)[which][..., i]
             variance = np.asarray(estimate.covariance)[which][..., i, i]
             one.plot(record.time, mean, color=colour, label=in_figure(name))
@@ -61,9 +61,10 @@ def plot_statistics(
     drawn = _axes(axes, len(places), time, found.units)
     for one, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
-            item = found[node][name]
-            one.plot(time, np.sqrt(item.actual()[:, i, i]), color=f"C{number}", label=in_figure(name))
-            one.plot(time, np.sqrt(np.abs(item.claimed()[:, i, i])), color=f"C{number}", linestyle="--")
+            item, colour = found[node][name], _colour(number)
+            claimed = item.claimed()[:, i, i]
+            one.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
+            one.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
         one.set_ylabel(f"RMSE of {_with_unit(found.states[i], found.units)}")
     drawn[0].legend(frameon=False, title="dashed: claimed")
     return drawn
@@ -96,9 +97,9 @@ def _places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
 
 def _axes(axes: Any, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
     """The given axes, or those of a new figure, one below the other."""
-    import matplotlib.pyplot as plt
-
     if axes is None:
+        import matplotlib.pyplot as plt
+
         _, grid = plt.subplots(
             count, 1, squeeze=False, sharex=True, layout="constrained", figsize=(6.4, 1 + 1.8 * count)
         )
@@ -108,6 +109,13 @@ def _axes(axes: Any, count: int, time: np.ndarray, units: Mapping[str, str]) -> 
     if len(found) != count:
         raise fail("axes", f"{count}, one for each state", len(found))
     return found
+
+
+def _colour(number: int) -> str:
+    """The next of the user's colours, as they are now."""
+    from matplotlib.colors import to_hex
+
+    return to_hex(f"C{number % 10}")
 
 
 def _with_unit(name: str, units: Mapping[str, str]) -> str:
