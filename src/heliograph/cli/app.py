@@ -27,15 +27,21 @@ def place(text: str = "") -> Parameter:
     return Parameter(help=text, converter=_path)
 
 
-def folder(command: str, out: Path | None) -> Path:
-    """The folder of `--out`, which can be written; a command that lists without it needs it now."""
+def folder(command: str, out: Path | None, name: str) -> Path:
+    """The folder in which the results' own folder `name` is made, that can be written: `--out`, or what that is in.
+
+    Where `--out` already ends in `name`, the results are put there and not one deeper.
+
+    Raises:
+        ValueError: no folder given, which a command that only lists does without; one that cannot be written.
+    """
     from heliograph.files.table import check_output_folder
     from heliograph.numerics.check import fail
 
     if out is None:
         raise fail(command, "a folder for the results (--out DIR)", "none")
     check_output_folder(out)
-    return out
+    return out.parent if out.name == name else out
 
 
 def _whole(_: type, tokens: Sequence[Any]) -> int:

@@ -7,34 +7,19 @@ from contextlib import suppress
 from cyclopts import CycloptsError
 
 from heliograph.cli.app import app
+from heliograph.cli.completion import completion
 from heliograph.cli.example import demo, example
+from heliograph.cli.new import new
 from heliograph.cli.reproduce import reproduce
 from heliograph.cli.run import run
 from heliograph.cli.stopping import INTERRUPTED, stoppable
 from heliograph.cli.sweep import sweep
+from heliograph.numerics.extras import EXTRAS, how_to_install
 from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
-EXTRAS = {  # the extra that brings a package which the core does without
-    "pyarrow": "tables",
-    "matplotlib": "report",
-    "jinja2": "report",
-    "gtsam": "recordings",
-    "cvxpy": "lmi",
-    "clarabel": "lmi",
-    "scs": "lmi",
-    "xarray": "results",
-    "h5netcdf": "results",
-    "h5py": "results",
-    "pandas": "results",
-    "zarr": "sweep",
-    "dask": "cluster",
-    "distributed": "cluster",
-    "gym_electric_motor": "motor",
-}
-
-for one in (run, demo, example, reproduce, sweep):  # in the order of the help
+for one in (new, run, demo, example, reproduce, sweep, completion):  # in the order of the help
     app.command(one)
 
 
@@ -77,9 +62,7 @@ def _command(arguments: Sequence[str] | None) -> int:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
-        return _refuse(
-            f'{error.name}: expected to be installed, got no such package: pip install "heliograph[{extra}]"'
-        )
+        return _refuse(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
 
 
 def _refuse(message: str) -> int:

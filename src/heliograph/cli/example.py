@@ -35,4 +35,4 @@ def example(
     from heliograph.numerics.check import check_seed
 
     run_example = load_example(name)
-    run_example(folder("example", out), check_seed("--seed", seed))
+    run_example(folder("example", out, name), check_seed("--seed", seed))

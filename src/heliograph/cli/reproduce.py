@@ -28,7 +28,7 @@ def reproduce(
     chosen = list(METHODS) if method == "all" else [method]
     if method not in METHODS and method != "all":
         raise fail("method", f"one of {', '.join(METHODS)} or all", repr(method))
-    target = folder("reproduce", out)
+    target = folder("reproduce", out, "" if method == "all" else method)
     if runs is not None:
         check_count("--runs", runs)
     check_seed("--seed", seed)

@@ -14,6 +14,8 @@ from heliograph.files.whole_file import whole_file
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 
+SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
 FORMATS = (".csv", ".parquet")
 
 
@@ -112,7 +114,7 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
 
 def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
     if line[0].lstrip().startswith("#"):
-        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: a table has none")
+        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: {_rewriting(path, comment='#')}")
     if len(line) != len(header):
         hint = ": numbers have a decimal point" if len(line) > len(header) else ""
         raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
@@ -125,7 +127,12 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
             raise ValueError
         return float(cell) if cell else np.nan
     except ValueError:
-        hint = ": numbers have a decimal point" if re.fullmatch(r"[+-]?\d+,\d+", cell) else ""
+        comma = re.fullmatch(r"[+-]?\d+,\d+", cell)
+        hint = f": numbers have a decimal point: {_rewriting(path, decimal=',')}" if comma else ""
+        if re.fullmatch(r"[-+.\de]+(?: +[-+.\de]+)+", cell):
+            hint = ": several numbers: " + _rewriting(path, sep="\\s+")
+        if cell.lower() in MISSING:
+            hint = ": a cell is empty where nothing arrived"
         wanted = "a number or an empty cell"
         raise fail(f"{path}, row {number}, column {name!r}", wanted, f"{shown(cell)}{hint}") from None
 
@@ -133,11 +140,21 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
 def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     if line.startswith("#"):
-        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: a table has none")
-    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
-        if len(header) == 1 and mark in line:
-            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}")
+        remedy = _rewriting(path, comment="#")
+        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {remedy}")
+    for mark, name in SEPARATORS.items() if len(header) == 1 else ():
+        if mark in line:
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
+                commas = re.search(r"\d,\d", file.read(10_000))
+            remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
+            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
     _check_distinct(path, header)
+
+
+def _rewriting(path: Path, **how: str) -> str:
+    """What makes a table of ours of one that is written in another way."""
+    given = "".join(f", {name}={value!r}" for name, value in how.items())
+    return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:

@@ -89,8 +89,9 @@ def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
 def whitened_innovations(
     data: ArrayLike, filter: AbstractFilter, inputs: ArrayLike | None = None
 ) -> Float[np.ndarray, "steps m"]:
-    """Innovations of a recording in units of what the filter claims: L^-1 (z - E z), L L' their covariance; NaN where
-    nothing arrived. White, of variance 1, where the claim holds.
+    """Innovations of a recording in units of what the filter claims: white and of variance 1 where the claim holds.
+
+    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived.
 
     Shapes: data (steps, received), inputs (steps, inputs).
 
