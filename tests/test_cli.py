@@ -305,6 +305,8 @@ command()"""
     [
         (["rnu"], ["rnu", 'Did you mean "run"']),
         (["run", "net.py"], ["--measurements"]),
+        (["completion", "csh"], ["csh"]),
+        (["new"], ["FILE"]),
         ([*run_arguments(), "--bogus", "3"], ["--bogus"]),
         (["demo", "--out", "out", "--seed", "many"], ["--seed", "many"]),
     ],
@@ -333,10 +335,10 @@ def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
         raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot")
 
     demo_module(monkeypatch, lacking)
-    refused(folder, capsys, ["demo", "--out", "results"], "matplotlib", 'pip install "heliograph[report]"')
+    refused(folder, capsys, ["demo", "--out", "results"], "matplotlib", sys.executable, '[report]"')
     for name in ("pyarrow", "pyarrow.parquet"):
         monkeypatch.setitem(sys.modules, name, None)
-    refused(folder, capsys, run_arguments(out="out.parquet"), "pyarrow", 'pip install "heliograph[tables]"')
+    refused(folder, capsys, run_arguments(out="out.parquet"), "pyarrow", ' -m pip install "', '[tables]"')
     assert cli.main(run_arguments()) == 0  # CSV does without
 
 

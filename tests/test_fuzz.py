@@ -182,7 +182,7 @@ WORDS = [
 def test_any_command_line_ends_with_a_code_and_at_most_a_line(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     stub = SimpleNamespace(reproduce=lambda *_: None)
-    monkeypatch.setattr(cli, "import_module", lambda name: stub)  # what takes minutes is not run
+    monkeypatch.setattr("heliograph.cli.reproduce.import_module", lambda name: stub)  # what takes minutes is not run
     monkeypatch.setattr(examples, "load_example", lambda name: lambda *_: None)
     capsys.readouterr()
     code = cli.main(words)

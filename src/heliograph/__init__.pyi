@@ -9,6 +9,7 @@ from . import (
     filters as filters,
     fusion as fusion,
     simulation as simulation,
+    files as files,
     campaign as campaign,
     testing as testing,
 )
@@ -56,9 +57,6 @@ from .model.fading import (
 from .model.estimate import (
     Estimate as Estimate,
 )
-from .linear.arrival import (
-    critical_arrival as critical_arrival,
-)
 from .filters.base import (
     AbstractFilter as AbstractFilter,
 )
@@ -95,8 +93,8 @@ from .simulation.simulate import (
     monte_carlo as monte_carlo,
     run as run,
 )
-from .simulation.boundedness import (
-    certify_boundedness as certify_boundedness,
+from .simulation.transmission import (
+    transmit as transmit,
 )
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,

@@ -7,7 +7,6 @@ from heliograph.files.recording import (
     estimate_columns,
     read_recording,
     received_names,
-    recording_of,
     write_estimates,
 )
 from heliograph.files.table import write_table
@@ -48,7 +47,7 @@ def columns(**others) -> dict[str, np.ndarray]:
 
 def refused(data, net, *fragments: str) -> None:
     with pytest.raises(ValueError) as caught:
-        recording_of(data, net, "data.csv")
+        read_recording(data, net, "data.csv")
     message = str(caught.value)
     assert "\n" not in message
     assert ": expected " in message and ", got " in message
@@ -58,21 +57,21 @@ def refused(data, net, *fragments: str) -> None:
 
 def test_columns_find_their_place():
     net = network({"a": ("pos", "vel")}, inputs=("push", "dt"))
-    measured = recording_of(columns(vel=[1, 2, 3, 4], pos=[5, NAN, 7, 8], dt=[9, 9, 9, 9], push=[0, 1, 0, 1]), net)
+    measured = read_recording(columns(vel=[1, 2, 3, 4], pos=[5, NAN, 7, 8], dt=[9, 9, 9, 9], push=[0, 1, 0, 1]), net)
     np.testing.assert_array_equal(measured.time, TIME)
     np.testing.assert_array_equal(measured.measurements["a"], [[5, 1], [NAN, 2], [7, 3], [8, 4]])
     np.testing.assert_array_equal(measured.inputs, [[0, 9], [1, 9], [0, 9], [1, 9]])
 
 
 def test_time_step_is_filled():
-    measured = recording_of(columns(pos=[1, 2, 3, 4]), network({"a": ("pos",)}))
+    measured = read_recording(columns(pos=[1, 2, 3, 4]), network({"a": ("pos",)}))
     np.testing.assert_array_equal(measured.inputs, [[0.0], [0.5], [0.0], [1.5]])
 
 
 def test_no_inputs():
     plant = h.LinearPlant(np.eye(2), 0.1, [0, 0], 1.0)
     net = h.Network(plant, {"a": h.Node(sensed("pos"), h.perfect(), {})})
-    assert recording_of(columns(pos=[1, 2, 3, 4]), net).inputs.shape == (4, 0)
+    assert read_recording(columns(pos=[1, 2, 3, 4]), net).inputs.shape == (4, 0)
 
 
 def test_names_of_what_is_received():
@@ -81,14 +80,14 @@ def test_names_of_what_is_received():
     both = h.with_direct_link(relayed(2), h.perfect(2))
     assert received_names(h.Node(sensor, both, {})) == ("z0", "z1", "z2", "z3")
     net = h.Network(plant, {"a": h.Node(sensor, both, {})})
-    measured = recording_of(columns(z0=TIME, z1=TIME, z2=TIME, z3=[1, 2, 3, 4]), net)
+    measured = read_recording(columns(z0=TIME, z1=TIME, z2=TIME, z3=[1, 2, 3, 4]), net)
     np.testing.assert_array_equal(measured.measurements["a"][:, 3], [1, 2, 3, 4])
 
 
 def test_nodes_and_their_names():
     net = network({"a": ("pos", "vel"), "b": ("pos",)})
     data = columns(a__pos=[1, 1, 1, 1], vel=[2, 2, 2, 2], b__pos=[3, 3, 3, 3])
-    measured = recording_of(data, net)
+    measured = read_recording(data, net)
     np.testing.assert_array_equal(measured.measurements["a"][0], [1, 2])
     np.testing.assert_array_equal(measured.measurements["b"][0], [3])
     refused(columns(pos=TIME, vel=TIME), net, "header", "time, dt, a.pos, a.vel, b.pos", "unknown 'pos'")
@@ -97,7 +96,7 @@ def test_nodes_and_their_names():
 
 def test_a_measurement_named_like_an_input_needs_its_node():
     net = network({"a": ("speed",)}, inputs=("speed",))
-    measured = recording_of(columns(speed=[1, 1, 1, 1], a__speed=[2, 2, 2, 2]), net)
+    measured = read_recording(columns(speed=[1, 1, 1, 1], a__speed=[2, 2, 2, 2]), net)
     assert measured.inputs[0] == 1 and measured.measurements["a"][0] == 2
     refused(columns(speed=[1, 1, 1, 1]), net, "one column 'a.speed'", "only time, speed")
 

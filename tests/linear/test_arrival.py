@@ -26,7 +26,7 @@ def sensor(matrix, noise=2.5):
     ids=["scalar", "coupled", "three states", "all seen"],
 )
 def test_published_examples(matrix, output, lower, upper):
-    found = hg.critical_arrival(plant(np.array(matrix, dtype=float)), sensor(output))
+    found = hg.linear.critical_arrival(plant(np.array(matrix, dtype=float)), sensor(output))
     np.testing.assert_allclose(found[:2], (lower, upper), atol=5e-7)
 
 
@@ -37,7 +37,7 @@ def test_one_output_needs_the_product_of_all_unstable_eigenvalues(seed):
     matrix = generator.normal(size=(3, 3))
     matrix *= 1.4 / np.abs(np.linalg.eigvals(matrix)).max()
     sizes = np.abs(np.linalg.eigvals(matrix))
-    found = hg.critical_arrival(plant(matrix), sensor(generator.normal(size=(1, 3))))
+    found = hg.linear.critical_arrival(plant(matrix), sensor(generator.normal(size=(1, 3))))
     np.testing.assert_allclose(found.upper, 1 - np.prod(sizes[sizes > 1]) ** -2, atol=1e-7)
     np.testing.assert_allclose(found.lower, 1 - 1.4**-2, atol=1e-12)
 
@@ -45,33 +45,33 @@ def test_one_output_needs_the_product_of_all_unstable_eigenvalues(seed):
 def test_a_gain_that_is_kept():
     """(1 - arrival) a^2 + arrival (a - k)^2 = 1."""
     k = -0.70078691  # the Kalman gain where everything arrives
-    found = hg.critical_arrival(plant([[-1.25]]), sensor([[1.0]]), gain=[[k]])
+    found = hg.linear.critical_arrival(plant([[-1.25]]), sensor([[1.0]]), gain=[[k]])
     expected = (1.25**2 - 1) / (1.25**2 - (-1.25 - k) ** 2)
     np.testing.assert_allclose(found[:2], (expected, expected), atol=1e-8)
     assert round(found.upper, 4) == 0.4461
 
 
 def test_a_stable_plant_needs_nothing():
-    found = hg.critical_arrival(plant([[0.9]]), sensor([[1.0]]))
+    found = hg.linear.critical_arrival(plant([[0.9]]), sensor([[1.0]]))
     assert found[:2] == (0.0, 0.0)
 
 
 def test_no_process_or_sensor_noise_changes_no_threshold():
     quiet = hg.LinearPlant([[1.25, 0.0], [1.0, 1.1]], np.zeros((2, 2)), np.zeros(2), np.eye(2))
-    found = hg.critical_arrival(quiet, sensor([[1.0, 1.0]], 0.0))
+    found = hg.linear.critical_arrival(quiet, sensor([[1.0, 1.0]], 0.0))
     np.testing.assert_allclose(found.upper, 1 - 1.375**-2, atol=1e-7)
 
 
 def test_bad_input_is_one_line():
     with pytest.raises(ValueError, match="sensor: expected one that keeps the error bounded where everything arrives"):
-        hg.critical_arrival(plant([[1.2]]), sensor([[0.0]]))
+        hg.linear.critical_arrival(plant([[1.2]]), sensor([[0.0]]))
     with pytest.raises(ValueError, match="gain: expected one that keeps"):
-        hg.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[[5.0]])
+        hg.linear.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[[5.0]])
     with pytest.raises(ValueError, match="gain: expected shape"):
-        hg.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[1.0])
+        hg.linear.critical_arrival(plant([[1.2]]), sensor([[1.0]]), gain=[1.0])
     with pytest.raises(ValueError, match="boundedness: expected a LinearPlant that does not vary, got Plant"):
-        hg.critical_arrival(hg.Plant(lambda x, u: x, 1.0, [0.0], 1.0), sensor([[1.0]]))
+        hg.linear.critical_arrival(hg.Plant(lambda x, u: x, 1.0, [0.0], 1.0), sensor([[1.0]]))
     with pytest.raises(
         ValueError, match="boundedness: expected a LinearSensor that does not vary, got one that varies"
     ):
-        hg.critical_arrival(plant([[1.2]]), hg.over_time([sensor([[1.0]])]))
+        hg.linear.critical_arrival(plant([[1.2]]), hg.over_time([sensor([[1.0]])]))

@@ -15,7 +15,7 @@ def plant(matrix, process=1.0):
 
 def judged(plant_, *nodes):
     made = {f"node{i}": hg.Node(sensor, channel, {}) for i, (sensor, channel) in enumerate(nodes)}
-    return hg.certify_boundedness(hg.Network(plant_, made))
+    return hg.simulation.certify_boundedness(hg.Network(plant_, made))
 
 
 def scalar(channel, noise=2.5, a=UNSTABLE):

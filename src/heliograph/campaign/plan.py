@@ -13,6 +13,7 @@ import jax
 import numpy as np
 
 from heliograph.files.network_file import load_function
+from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
@@ -38,6 +39,7 @@ class Chunk:
     stop: int
 
 
+@readable
 @dataclass(frozen=True)
 class Campaign:
     """A campaign as read from its file, with the source of the network's module: all that its results depend on.

@@ -26,12 +26,14 @@ from heliograph.files.holding import only_here
 from heliograph.files.output_folder import check_replaceable, clear_left
 from heliograph.files.table import check_output_folder
 from heliograph.numerics.check import check_count, fail, file_path, instance
+from heliograph.numerics.readable import readable
 
 TRIES = 3  # a job that fails is tried again after the others, in case its worker was to blame
 Tell = Callable[[str, int, int], None]
 Accept = Callable[[Job, Description | None, int], None]  # a job, what it gave, and how many are done
 
 
+@readable
 @dataclass(frozen=True)
 class CampaignRun:
     """What a call did: how many chunks were there, how many it computed, what failed, and which files were damaged."""

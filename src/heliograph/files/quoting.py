@@ -1,5 +1,7 @@
 """Text of a user's, quoted for where it lands: no name breaks a table, a figure or a file, or acts in it."""
 
+import re
+
 FORMULA = ("=", "+", "-", "@", "\t", "\r")  # a cell that begins so is computed by a spreadsheet
 
 
@@ -23,3 +25,14 @@ def in_cell(text: str) -> str:
 def from_cell(cell: str) -> str:
     """What `in_cell` was given, but for characters that cannot be seen."""
     return cell[1:] if cell.startswith("'") and cell.lstrip("'").startswith(FORMULA) else cell
+
+
+def in_file(text: str) -> str:
+    """For a file of arrays: what cannot be seen, and the backslash, as Python writes it, so that `from_file` has it."""
+    return "".join(c if c.isprintable() and c != "\\" else c.encode("unicode_escape").decode() for c in text)
+
+
+def from_file(text: str) -> str:
+    """What `in_file` was given."""
+    code = r"\\(?:[\\nrt]|x[0-9a-f]{2}|u[0-9a-f]{4}|U[0-9a-f]{8})"
+    return re.sub(code, lambda found: found[0].encode().decode("unicode_escape"), text)

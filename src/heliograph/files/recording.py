@@ -8,21 +8,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.files.table import read_table, write_table
+from heliograph.files.columns import TIME, columns_of
+from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import backwards, backwards_text, fail
+from heliograph.numerics.dates import seconds_between
+from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.record import Record, is_sound
 
-TIME = "time"
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 
 
+@readable
 class Recording(NamedTuple):
     """Measured data as `heliograph.run` takes it: `run(network, *recording)`.
 
-    Shapes: measurements[node] (steps, received), NaN where one did not arrive; inputs (steps, inputs); time (steps,).
+    Shapes: measurements[node] (steps, received), NaN where one did not arrive; inputs (steps, inputs); time (steps,),
+    numbers or dates (datetime64[ns], UTC).
     """
 
     measurements: dict[str, np.ndarray]
@@ -30,28 +34,40 @@ class Recording(NamedTuple):
     time: np.ndarray
 
 
-def read_recording(path: str | Path, network: Network) -> Recording:
-    """Read measured data for a network from a CSV or Parquet file with the columns that `recording_of` takes.
+def read_recording(table: object, network: Network, name: str = "recording") -> Recording:
+    """Read measured data for a network from a CSV or Parquet file, a DataFrame, or a dictionary of columns.
+
+    Columns: `time`, numbers or dates of ISO 8601, which never goes backwards; each plant input by its name (an input
+    `dt` may be left out: it is the time since the previous row in the time's own unit, of dates in seconds, and 0 in
+    the first); each received component by `node.name` or, where only one thing has that name, by `name`. Components are
+    named as the sensor's outputs where the channel keeps their number, else z0, z1, ... A measurement that is empty or
+    NaN did not arrive. What a relay heard may be left out altogether. `name` is what errors call a table that is no
+    file.
 
     Raises:
-        ValueError: a file that is no table of numbers, or columns and rows that `recording_of` refuses.
+        ValueError: no table of numbers; unknown, missing or doubled columns; a time or an input that is missing;
+            infinite numbers; times that go backwards. One line that names the row, from 1, and the column.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    return recording_of(read_table(path), network, str(path))
+    source = str(table) if isinstance(table, str | Path) else name
+    return _recording_of(columns_of(table, source), network, source)
 
 
-def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str = "recording") -> Recording:
-    """Sort columns of numbers into what `run` takes.
-
-    Columns: `time`, which never goes backwards; each plant input by its name (an input `dt` may be left out: it is
-    the time since the previous row, 0 in the first); each received component by `node.name` or, where only one
-    thing has that name, by `name`. Components are named as the sensor's outputs where the channel keeps their
-    number, else z0, z1, ... A measurement that is NaN did not arrive. What a relay heard may be left out altogether.
+def write_recording(recording: Recording, network: Network, path: str | Path) -> None:
+    """Write a recording to a CSV or Parquet file that `read_recording` reads: time, inputs, and what was received.
 
     Raises:
-        ValueError: unknown, missing or doubled columns; a time or an input that is missing; infinite numbers;
-            times that go backwards. One line that names the row, from 1, and the column.
+        ValueError: names that coincide, another format, or a folder that cannot be written.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
+    columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
+    for node, names in _received_columns(network).items():
+        if node in recording.measurements:
+            columns |= {name[0]: z for name, z in zip(names, recording.measurements[node].T, strict=True)}
+    write_table(columns, path)
+
+
+def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: str) -> Recording:
     inputs, received = network.inputs, _received_columns(network)
     for name in () if network.relays is None else network.relays.relays:
         if not any(column in columns for names in received[name] for column in names):
@@ -64,11 +80,10 @@ def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: st
     def find(names: tuple[str, ...]) -> str:
         return _find(columns, names, source)
 
-    time = _complete(columns, find((TIME,)), source)
-    backwards = np.flatnonzero(np.diff(time) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
-        came = f"{time[row]:.10g} after {time[row - 1]:.10g}"
+    time = _times(columns, find((TIME,)), source)
+    row = backwards(time)
+    if row is not None:
+        came = backwards_text(time, row)
         raise fail(f"{source}, row {row + 1}, column {TIME!r}", "a time that does not go backwards", came)
     measurements = {
         node: np.stack([_measured(columns, find(names), source) for names in components], axis=1)
@@ -77,7 +92,7 @@ def recording_of(columns: Mapping[str, np.ndarray], network: Network, source: st
     u = np.zeros((len(time), len(inputs)))
     for i, name in enumerate(inputs):
         fill = name == TIME_STEP and name not in columns
-        u[:, i] = np.diff(time, prepend=time[0]) if fill else _complete(columns, find((name,)), source)
+        u[:, i] = seconds_between(time) if fill else _complete(columns, find((name,)), source)
     return Recording(measurements, u, time)
 
 
@@ -170,14 +185,22 @@ def _find(columns: Mapping[str, np.ndarray], names: tuple[str, ...], source: str
     return present[0]
 
 
+def _times(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    values = np.asarray(columns[name])
+    if values.dtype.kind != "M":
+        return _complete(columns, name, source)
+    _refuse(np.isnat(values), np.full(len(values), np.nan), f"column {name!r}", "a date", source)
+    return values.astype("datetime64[ns]")
+
+
 def _complete(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    values = np.asarray(columns[name], dtype=np.float64)
+    values = _numbers(columns, name, source)
     _refuse(~np.isfinite(values), values, f"column {name!r}", "a finite number", source)
     return values
 
 
 def _measured(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
-    values = np.asarray(columns[name], dtype=np.float64)
+    values = _numbers(columns, name, source)
     _refuse(
         np.isinf(values),
         values,
@@ -186,6 +209,12 @@ def _measured(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.n
         source,
     )
     return values
+
+
+def _numbers(columns: Mapping[str, np.ndarray], name: str, source: str) -> np.ndarray:
+    if columns[name].dtype.kind == "M":
+        raise fail(f"{source}, column {name!r}", "numbers", "dates")
+    return np.asarray(columns[name], dtype=np.float64)
 
 
 def _refuse(bad: np.ndarray, values: np.ndarray, what: str, expected: str, source: str) -> None:

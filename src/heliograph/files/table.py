@@ -1,26 +1,29 @@
 """Tables in files: columns of numbers read from and written to CSV or Parquet; the extension decides."""
 
 import csv
-import os
 import re
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from glob import escape as glob_escape
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.durable import naming, replace
 from heliograph.files.quoting import from_cell, in_cell
+from heliograph.files.whole_file import whole_file
 from heliograph.numerics.check import fail, shown
+from heliograph.numerics.dates import dates, in_iso, looks_like_date
 
+SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
+MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
 FORMATS = (".csv", ".parquet")
 
 
 def read_table(path: str | Path) -> dict[str, np.ndarray]:
     """Read the columns of a CSV or Parquet file as float64; an empty cell is NaN. Rows count from 1.
+
+    A column whose first cell is a date of ISO 8601, as 2026-11-21T23:25:00+01:00, is read as dates: datetime64[ns] in
+    UTC. Dates without a zone are taken as they stand.
 
     Raises:
         ValueError: no such file, an empty one, another format, no rows, duplicated columns, a cell that is no
@@ -48,14 +51,14 @@ def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
     """
     path = Path(path)
     check_output(path)
-    with _whole(path) as partial:
+    with whole_file(path) as partial:
         (_write_csv if _format(path) == ".csv" else _write_parquet)(columns, partial)
 
 
-def check_output(path: str | Path) -> None:
-    """Raise what `write_table` would, before the work starts."""
+def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
+    """Raise what writing a file would, before the work starts."""
     path = Path(path)
-    if _format(path) == ".parquet":
+    if _format(path, formats) == ".parquet":
         import pyarrow.parquet  # noqa: F401
     if path.is_dir():
         raise fail(f"output file {path}", "a file", "a folder")
@@ -77,37 +80,10 @@ def check_output_folder(folder: str | Path) -> None:
         raise fail(name, "a folder that can be written", error.strerror) from None
 
 
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A temporary file beside `path` that takes its place at the end and is removed after an error or interrupt."""
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    for left in path.parent.glob(f".{glob_escape(path.name)}.*.partial"):
-        if not _lives(left.name.split(".")[-2]):
-            left.unlink(missing_ok=True)
-    try:
-        with naming(path):
-            yield partial
-            replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
-
-
-def _lives(process: str) -> bool:
-    """Whether a process of this number runs; what others left is theirs where that cannot be told."""
-    try:
-        os.kill(int(process), 0)
-    except ProcessLookupError:
-        return False
-    except (ValueError, OSError):
-        return True
-    return True
-
-
-def _format(path: Path) -> str:
+def _format(path: Path, formats: Sequence[str] = FORMATS) -> str:
     kind = path.suffix.lower()
-    if kind not in FORMATS:
-        raise fail(str(path), f"a name that ends in {' or '.join(FORMATS)}", repr(path.suffix))
+    if kind not in formats:
+        raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
     return kind
 
 
@@ -123,20 +99,26 @@ def _read_csv(path: Path) -> dict[str, np.ndarray]:
             lines = (line for line in csv.reader(file, strict=True) if line)
             header = [from_cell(name.strip()) for name in next(lines, [])]
             _check_header(path, header)
-            rows = [_numbers(path, header, number, line) for number, line in enumerate(lines, 1)]
+            rows = [_cells(path, header, number, line) for number, line in enumerate(lines, 1)]
     except (csv.Error, UnicodeDecodeError) as error:
         raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(header))
-    return {name: values[:, i].copy() for i, name in enumerate(header)}
+    dated = {i for i, cell in enumerate(rows[0] if rows else []) if looks_like_date(cell)}
+    numbers = [
+        [np.nan if i in dated else _number(path, header[i], row, cell) for i, cell in enumerate(cells)]
+        for row, cells in enumerate(rows, 1)
+    ]
+    values = np.array(numbers, dtype=np.float64).reshape(len(rows), len(header))
+    columns = {name: values[:, i].copy() for i, name in enumerate(header)}
+    return columns | {header[i]: dates((cells[i] for cells in rows), f"{path}, column {header[i]!r}") for i in dated}
 
 
-def _numbers(path: Path, header: list[str], number: int, line: list[str]) -> list[float]:
+def _cells(path: Path, header: list[str], number: int, line: list[str]) -> list[str]:
     if line[0].lstrip().startswith("#"):
-        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: a table has none")
+        raise fail(f"{path}, row {number}", "numbers", f"a comment, {shown(line[0])}: {_rewriting(path, comment='#')}")
     if len(line) != len(header):
         hint = ": numbers have a decimal point" if len(line) > len(header) else ""
         raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", f"{len(line)}{hint}")
-    return [_number(path, name, number, cell.strip()) for name, cell in zip(header, line, strict=True)]
+    return [cell.strip() for cell in line]
 
 
 def _number(path: Path, name: str, number: int, cell: str) -> float:
@@ -145,7 +127,12 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
             raise ValueError
         return float(cell) if cell else np.nan
     except ValueError:
-        hint = ": numbers have a decimal point" if re.fullmatch(r"[+-]?\d+,\d+", cell) else ""
+        comma = re.fullmatch(r"[+-]?\d+,\d+", cell)
+        hint = f": numbers have a decimal point: {_rewriting(path, decimal=',')}" if comma else ""
+        if re.fullmatch(r"[-+.\de]+(?: +[-+.\de]+)+", cell):
+            hint = ": several numbers: " + _rewriting(path, sep="\\s+")
+        if cell.lower() in MISSING:
+            hint = ": a cell is empty where nothing arrived"
         wanted = "a number or an empty cell"
         raise fail(f"{path}, row {number}, column {name!r}", wanted, f"{shown(cell)}{hint}") from None
 
@@ -153,11 +140,21 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
 def _check_header(path: Path, header: Sequence[str]) -> None:
     line = ",".join(header)
     if line.startswith("#"):
-        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: a table has none")
-    for mark, name in ((";", "semicolons"), ("\t", "tabs"), ("|", "bars")):
-        if len(header) == 1 and mark in line:
-            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}")
+        remedy = _rewriting(path, comment="#")
+        raise fail(f"{path}, header", "names of columns", f"a comment, {shown(line)}: {remedy}")
+    for mark, name in SEPARATORS.items() if len(header) == 1 else ():
+        if mark in line:
+            with path.open(encoding="utf-8-sig", errors="replace") as file:
+                commas = re.search(r"\d,\d", file.read(10_000))
+            remedy = _rewriting(path, sep=mark, decimal=",") if commas else _rewriting(path, sep=mark)
+            raise fail(f"{path}, header", "names separated by commas", f"{name} in {shown(line)}: {remedy}")
     _check_distinct(path, header)
+
+
+def _rewriting(path: Path, **how: str) -> str:
+    """What makes a table of ours of one that is written in another way."""
+    given = "".join(f", {name}={value!r}" for name, value in how.items())
+    return f"pandas.read_csv({str(path)!r}{given}).to_csv({str(path)!r}, index=False) rewrites it"
 
 
 def _read_parquet(path: Path) -> dict[str, np.ndarray]:
@@ -172,7 +169,10 @@ def _read_parquet(path: Path) -> dict[str, np.ndarray]:
     columns = {}
     for name, column in zip(table.column_names, table.columns, strict=True):
         kind = column.type
-        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_null(kind)):
+        if pa.types.is_timestamp(kind):
+            columns[name] = np.array(column.cast(pa.timestamp("ns", kind.tz)).to_numpy(), dtype="datetime64[ns]")
+            continue
+        if not ((pa.types.is_primitive(kind) and not pa.types.is_temporal(kind)) or pa.types.is_null(kind)):
             raise fail(f"{path}, row 1, column {name!r}", "numbers", f"{kind} {column[:1].to_pylist()}")
         columns[name] = np.array(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
     return columns
@@ -186,6 +186,8 @@ def _write_csv(columns: Mapping[str, np.ndarray], path: Path) -> None:
 
 
 def _plain(column: np.ndarray) -> np.ndarray:
+    if column.dtype.kind == "M":
+        return in_iso(column)
     return column.astype(np.int64) if column.dtype == np.bool_ else column  # true is 1 in a CSV file
 
 
@@ -193,4 +195,6 @@ def _write_parquet(columns: Mapping[str, np.ndarray], path: Path) -> None:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    pq.write_table(pa.table({name: np.ascontiguousarray(c) for name, c in columns.items()}), path)
+    arrays = {name: pa.array(np.ascontiguousarray(c)) for name, c in columns.items()}
+    dated = {name: a.cast(pa.timestamp("ns", "UTC")) for name, a in arrays.items() if columns[name].dtype.kind == "M"}
+    pq.write_table(pa.table(arrays | dated), path)

@@ -13,6 +13,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = ["AbstractFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts", "step_number"]
@@ -23,6 +24,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+@readable
 class AbstractFilter(eqx.Module):
     """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
     congruence,
     diagonal,
@@ -39,6 +40,7 @@ class Signal(NamedTuple):
     second: jax.Array
 
 
+@readable
 class Scalars(eqx.Module):
     """Fixed positive scalars (beta_1, beta_2) of Young's inequality, as published bounds use them.
 

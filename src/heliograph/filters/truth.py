@@ -15,9 +15,11 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
 from heliograph.numerics.check import array, check_horizon, fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 
+@readable
 @dataclass(frozen=True)
 class TrueError:
     """What a filter claims of its error, and what it is: both (time, n, n), after each correction."""

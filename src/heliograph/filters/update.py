@@ -13,6 +13,7 @@ import numpy as np
 
 from heliograph.filters.correction import Scalars, Signal, as_array, as_scalars, young_correction, zero_mean_correction
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
@@ -26,6 +27,7 @@ from heliograph.random_affine.second_moments import (
 )
 
 
+@readable
 class AbstractUpdate(eqx.Module):
     """How a channel's uncertainty is bounded, and the gain that minimises the bound."""
 

@@ -12,12 +12,14 @@ from heliograph.model.estimate import Claim, weakest
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
 Parameter = Float[Array, "..."]  # of all components, or of each
 
 
+@readable
 class Quantized(NamedTuple):
     """What a quantizer delivers of a value x, by component.
 
@@ -31,6 +33,7 @@ class Quantized(NamedTuple):
     symbols: Int[Array, "*n"]
 
 
+@readable
 class AbstractQuantizer(eqx.Module):
     """A quantizer of vectors: `init(n)` gives the state before any value, `step` the next state and what arrives.
 

@@ -19,6 +19,7 @@ from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.check import array, fail, instance, items, probabilities
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 
 Means = Float[jax.Array, "count n"]
@@ -26,6 +27,7 @@ Covariances = Float[jax.Array, "count n n"]
 Fused = tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]
 
 
+@readable
 class AbstractFusion(eqx.Module):
     """A rule that makes one estimate of several.
 
@@ -197,6 +199,7 @@ def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
     return weakest([*claims, strongest])
 
 
+@readable
 class Fusion(eqx.Module):
     """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which uplinks.
 

@@ -8,11 +8,13 @@ import numpy as np
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
 from heliograph.h_infinity.system import GrowthSystem, smallest_eigenvalue, symmetric_weight
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix whose diagonal is -1
 
 
+@readable
 class HInfinityCertificate(NamedTuple):
     """Whether the level is certified, and every number that this rests on.
 

@@ -30,6 +30,7 @@ from heliograph.h_infinity.step import (
 )
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 SEARCH_ACCURACY = 1e-4  # relative, of a level found by bisection
@@ -37,6 +38,7 @@ SEARCH_LIMIT = 1e6  # times the first guess; a smallest level beyond is reported
 SCREEN = 1e-9  # strictness left in a solution, relative to the level squared, below which a step counts as failed
 
 
+@readable
 class HInfinityDesign(NamedTuple):
     """Gains K with weights P_0 ... and multipliers that prove `level`.
 

@@ -11,6 +11,7 @@ from scipy.stats import qmc
 from heliograph.h_infinity.slope_bound import slope_bound
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 POINTS = 2**12  # of a low-discrepancy sequence, at which slopes are taken
@@ -22,6 +23,7 @@ TOLERANCE = 1e-9  # relative excess over the constant that counts as rounding
 Function = Callable[[jax.Array], jax.Array]  # (n,) -> (m,) or (), written with jax.numpy
 
 
+@readable
 class GrowthFinding(NamedTuple):
     """What was found about |f(x) - f(y)| <= constant |x - y|, f(0) = 0, in the box from `low` to `high`.
 

@@ -17,6 +17,7 @@ from heliograph.h_infinity.step import (
     linear_forms,
 )
 from heliograph.numerics.check import fail
+from heliograph.numerics.extras import how_to_install
 from heliograph.numerics.types import Float
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def solvers() -> ModuleType:
     try:
         import cvxpy
     except ModuleNotFoundError as error:
-        text = f'{error.name}: expected to be installed, got no such package: pip install "heliograph[lmi]"'
+        text = f"{error.name}: expected to be installed, got no such package: {how_to_install('lmi')}"
         raise ModuleNotFoundError(text, name=error.name) from None
     return cvxpy
 

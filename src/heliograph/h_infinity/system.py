@@ -7,12 +7,14 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
 
 Varying = ArrayLike | OverTime  # the same at all steps, or one for each
 
 
+@readable
 class Growth(NamedTuple):
     """Growth constants of a function over the horizon: |f(x)| <= state |x| and |f(x) - f(xhat)| <= error |x - xhat|."""
 
@@ -25,6 +27,7 @@ class Growth(NamedTuple):
         return not (np.any(self.state) or np.any(self.error))
 
 
+@readable
 class GrowthSystem(NamedTuple):
     """x+ = A x + f(x) + B v, y = C x + h(x) + D v, z = M x, and received = G y + N rho, at steps s = 0 ... steps - 1.
 

@@ -2,6 +2,7 @@
 
 from .arrival import (
     CriticalArrival as CriticalArrival,
+    critical_arrival as critical_arrival,
 )
 from .comparison import (
     GainOverLinear as GainOverLinear,

@@ -10,12 +10,14 @@ from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.noise import AbstractNoise
 
 RESOLUTION = 1e-8  # of an arrival probability
 
 
+@readable
 class CriticalArrival(NamedTuple):
     """Arrival probabilities: at `lower` and below the mean error of every filter diverges, above `upper` it is bounded.
 

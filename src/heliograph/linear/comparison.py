@@ -14,12 +14,14 @@ from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.monomials import exponents
 
 SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
 
 
+@readable
 @dataclass(frozen=True)
 class GainOverLinear:
     """What each degree would bring: error covariances by degree, exact before any data.

@@ -8,9 +8,11 @@ import numpy as np
 
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.numerics.check import array, fail, file_path, instance, shown
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 
+@readable
 class Gains(NamedTuple):
     """s+ = F s + K z + c and xhat = L s + J z + d, s the state before the step; one row per step (one step: no axis).
 
@@ -35,6 +37,7 @@ class Gains(NamedTuple):
 PERHAPS = ("predicted", "innovation")  # fields that may be unknown
 
 
+@readable
 class Schedule(eqx.Module):
     """A linear filter over time from the state `start`; its covariance is claimed for complete data.
 

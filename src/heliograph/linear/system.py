@@ -6,9 +6,11 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import array, covariance, instance
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 
+@readable
 class Steps(NamedTuple):
     """What happens at each step, every array with a leading time axis (one step has none).
 
@@ -23,6 +25,7 @@ class Steps(NamedTuple):
     noise: Float[np.ndarray, "*time m m"]
 
 
+@readable
 class LinearSystem(eqx.Module):
     """y+ = A y + a + w, z = C y+ + c + v, and what is to be known, x = W y.
 

@@ -4,12 +4,14 @@ from typing import Literal
 
 import equinox as eqx
 
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
 
 Claim = Literal["exact", "upper", "nominal", "none"]
 STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
 
 
+@readable
 class Estimate(eqx.Module):
     """An estimate and the covariance claimed for its error.
 
@@ -24,6 +26,7 @@ class Estimate(eqx.Module):
     claim: Claim = eqx.field(static=True)
 
 
+@readable
 class Innovation(eqx.Module):
     """What a measurement says that the filter did not expect, and how likely the filter finds it.
 

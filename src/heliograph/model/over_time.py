@@ -11,11 +11,13 @@ from jaxtyping import Array, Int
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import one_memory
 
 T = TypeVar("T")
 
 
+@readable
 class OverTime(eqx.Module):
     """Values whose leading axis is time; an unmarked array never varies, whatever its shape.
 

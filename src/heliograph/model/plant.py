@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
 from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import library
 from heliograph.random_affine.noise import (
     AbstractNoise,
@@ -26,6 +27,7 @@ from heliograph.random_affine.noise import (
 NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), from the input u
 
 
+@readable
 class AbstractPlant(eqx.Module):
     """A system x+ = f(x, u) + w with w independent over time; x_0 has `initial_mean` and `initial_covariance`.
 

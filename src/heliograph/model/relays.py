@@ -11,6 +11,7 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import check_horizon, fail, items, names, table
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import second_moment_tensor
 
@@ -20,6 +21,7 @@ Links = Mapping[str, Channel]  # by sender
 Slot = Mapping[str, Links]  # by listener
 
 
+@readable
 class RelayNetwork(eqx.Module):
     """Relays with memory between a sensor and a receiver.
 

@@ -12,9 +12,11 @@ from numpy.typing import ArrayLike
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
+@readable
 class AbstractSensor(eqx.Module):
     """A sensor y = h(x) + v with v independent over time and of everything else."""
 

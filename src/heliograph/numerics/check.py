@@ -157,14 +157,31 @@ def check_horizon(value: object, covered: int | None = None) -> int:
 
 
 def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
-    """Return `count` times that do not go backwards."""
-    clock: np.ndarray = array(name, value, (count,))
-    backwards = np.flatnonzero(np.diff(clock) < 0)
-    if backwards.size:
-        row = int(backwards[0]) + 1
-        got = f"{clock[row]:g} after {clock[row - 1]:g} in row {row + 1}"
-        raise fail(name, "times that do not go backwards", got)
+    """Return `count` times that do not go backwards: numbers, or dates (datetime64), then to the nanosecond."""
+    if getattr(getattr(value, "dtype", None), "kind", "") == "M":
+        clock: np.ndarray = np.asarray(value).astype("datetime64[ns]")
+        if clock.shape != (count,) or np.isnat(clock).any():
+            raise fail(
+                name, f"{count} dates", f"shape {clock.shape}, {np.count_nonzero(np.isnat(clock))} of them missing"
+            )
+    else:
+        clock = array(name, value, (count,))
+    row = backwards(clock)
+    if row is not None:
+        raise fail(name, "times that do not go backwards", f"{backwards_text(clock, row)} in row {row + 1}")
     return clock
+
+
+def backwards(clock: np.ndarray) -> int | None:
+    """The first row whose time is before that of the row above."""
+    found = np.flatnonzero(clock[1:] < clock[:-1])
+    return int(found[0]) + 1 if found.size else None
+
+
+def backwards_text(clock: np.ndarray, row: int) -> str:
+    """What is wrong in that row."""
+    now, before = (str(t) if clock.dtype.kind == "M" else f"{t:.10g}" for t in (clock[row], clock[row - 1]))
+    return f"{now} after {before}"
 
 
 def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any:

@@ -10,6 +10,7 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.monomials import exponents, monomials
@@ -43,6 +44,7 @@ class Moments(eqx.Module):
         return self.matrix @ y_moments
 
 
+@readable
 class AbstractRandomAffine(eqx.Module):
     """A random affine map z = G y + n, one at each step.
 

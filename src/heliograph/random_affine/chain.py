@@ -15,6 +15,7 @@ from numpy.polynomial.hermite_e import hermegauss, hermevander
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
@@ -34,6 +35,7 @@ class Nodes(NamedTuple):
     radius: Rows | float = 0.0
 
 
+@readable
 class AbstractMemory(eqx.Module):
     """A state that moves from step to step and on which the law of what is drawn depends.
 

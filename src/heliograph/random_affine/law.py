@@ -16,6 +16,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for
 
 Scalar = Float[jax.Array | np.ndarray, ""]
@@ -24,6 +25,7 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
+@readable
 class AbstractLaw(eqx.Module):
     """A law of a real random gain, independent over time.
 

@@ -10,12 +10,14 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
 
 GainsByFilter = Mapping[str, ArrayLike]  # by name, each (steps, n, received)
 
 
+@readable
 class RelayDesign(eqx.Module):
     """Gains of every filter for each step, computed before any data, and what they give.
 

@@ -10,6 +10,7 @@ from .before_data import (
 )
 from .boundedness import (
     Boundedness as Boundedness,
+    certify_boundedness as certify_boundedness,
 )
 from .compilation_cache import (
     keep_compilations as keep_compilations,
@@ -27,8 +28,10 @@ from .statistics import (
     pool as pool,
 )
 from .sums import (
+    StatisticsByName as StatisticsByName,
     error_statistics as error_statistics,
 )
 from .whiteness import (
     MemoryTest as MemoryTest,
+    whitened_innovations as whitened_innovations,
 )

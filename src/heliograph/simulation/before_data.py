@@ -15,6 +15,7 @@ from heliograph.fusion.weights import factored_weights, matrix_weights
 from heliograph.numerics.check import array, check_horizon, fail
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
 from heliograph.simulation.centre import Centre, Together
 from heliograph.simulation.network import Network
@@ -23,6 +24,7 @@ from heliograph.simulation.stepping import AllFilters, plan
 REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative to the error: then U has an inverse
 
 
+@readable
 @dataclass(frozen=True)
 class CrossCovariances:
     """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.

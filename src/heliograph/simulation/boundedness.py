@@ -21,6 +21,7 @@ from heliograph.linear.unseen import Unseen, fastest_unseen, reached
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain
@@ -34,6 +35,7 @@ CERTAIN = 1e-13  # of a row's second moment: a variance of its gain that is roun
 Verdict = Literal["certified", "impossible", "undecided"]
 
 
+@readable
 class Boundedness(NamedTuple):
     """What is known of E P as time goes on, P the error covariance of the filter that hears all nodes, before each z.
 

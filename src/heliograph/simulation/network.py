@@ -19,6 +19,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_horizon, fail, table
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import informed_claim
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_type
@@ -34,6 +35,7 @@ class Kind(NamedTuple):
     filters: tuple[str, ...]
 
 
+@readable
 class Network(eqx.Module):
     """A plant observed by named nodes. Everything downstream (simulation, filters, reports) reads this one description.
 

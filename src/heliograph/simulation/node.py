@@ -9,9 +9,11 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, shown, table
+from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
 
+@readable
 class Node(eqx.Module):
     """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
 
@@ -45,6 +47,7 @@ class Node(eqx.Module):
         return not first(self.channel).erases
 
 
+@readable
 class Listener(eqx.Module):
     """A place in a network of relays, which hears one of them or the sensor, and the filters there.
 
@@ -57,6 +60,7 @@ class Listener(eqx.Module):
     complete: bool = eqx.field(static=True)
 
 
+@readable
 class Common(eqx.Module):
     """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
 

@@ -1,8 +1,9 @@
 """What a run leaves behind: trajectories with their claims, or running statistics of the errors."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Generic, TypeVar
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -13,11 +14,23 @@ from jaxtyping import PyTree
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
+from heliograph.numerics.readable import readable
+from heliograph.simulation.frames import record_frame, record_of_frame
+from heliograph.simulation.labelled import checked_units
+from heliograph.simulation.labelled_record import record_dataset, record_from
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.plots import plot_record
+from heliograph.simulation.saved import opened, save
+
+if TYPE_CHECKING:  # extras
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.axes import Axes
 
 Result = TypeVar("Result")
 
 
+@readable
 @dataclass(frozen=True)
 class Uplink:
     """What a fusion's quantizers did to the estimates of `nodes`, by component.
@@ -39,12 +52,14 @@ class Uplink:
         return float(self.symbols.mean())
 
 
+@readable
 @dataclass(frozen=True)
 class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
     (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
+    time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
     """
 
     time: np.ndarray
@@ -53,17 +68,124 @@ class Record:
     measurements: dict[str, np.ndarray]
     estimates: dict[str, dict[str, Estimate]]
     uplinks: dict[str, Uplink] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def runs(self) -> int | None:
+        """Number of Monte Carlo runs; None of one recording."""
+        means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
+        every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
+        return len(every[0]) if every and every[0].ndim == 3 else None
+
+    def with_units(self, units: Mapping[str, str]) -> "Record":
+        """The same record with units, by the state's name and of "time", for files, tables and figures.
+
+        Raises:
+            ValueError: a name that is no state.
+        """
+        return replace(self, units=checked_units(units, self.states))
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
 
         Raises:
-            ValueError: a recording has no truth.
+            ValueError: a recording has no truth, or there is no such filter.
         """
+        self.check_filter(node, name)
         if self.truth is None:
             raise fail("errors", "a record with the true state", "a recording without it")
         result: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
         return result
+
+    def check_filter(self, node: str, name: str) -> None:
+        """Raise ValueError unless the node has a filter of this name."""
+        if name not in self.estimates.get(node, {}):
+            known = [f"{each}/{of}" for each, filters in self.estimates.items() for of in filters]
+            raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
+
+    def rmse(self, node: str, name: str) -> dict[str, float]:
+        """Root mean square error of each state over runs and steps, in that state's unit.
+
+        Raises:
+            ValueError: a recording has no truth, or there is no such filter.
+        """
+        squares = self.errors(node, name).reshape(-1, len(self.states)) ** 2
+        return dict(zip(self.states, np.sqrt(squares.mean(axis=0)).tolist(), strict=True))
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Labelled arrays: dimensions run, time, node, filter, state; `Record.from_xarray` has the record again.
+
+        Raises:
+            ModuleNotFoundError: without xarray (extra "results").
+        """
+        return record_dataset(self)
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
+        """The record in a dataset that `to_xarray` made, or in a part of one that keeps its dimensions.
+
+        Raises:
+            ValueError: no such dataset.
+        """
+        return record_from(dataset)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A table: a row for each time (and run), columns (node, filter, quantity, component, other).
+
+        Quantities: truth, measurement, mean, "covariance (CLAIM)" of component and other, saturated, symbols.
+
+        Raises:
+            ModuleNotFoundError: without pandas (extra "results").
+        """
+        return record_frame(self)
+
+    @classmethod
+    def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
+        """The record in a table that `to_pandas` made; units are not in it.
+
+        Raises:
+            ValueError: no such table.
+        """
+        return record_of_frame(frame)
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `Record.open` has it again.
+
+        Raises:
+            ValueError: another ending, or a place that cannot be written.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        save(self.to_xarray(), path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Record":
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: no such file, or another one.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        return cls.from_xarray(opened(path))
+
+    def plot(
+        self,
+        node: str | None = None,
+        filters: Sequence[str] | None = None,
+        states: Sequence[str] | None = None,
+        axes: "Axes | Sequence[Axes] | None" = None,
+        run: int = 0,
+        sigmas: float = 2.0,
+    ) -> "list[Axes]":
+        """Draw estimates with bands of +-`sigmas` claimed deviations, and the truth where known: one axes a state.
+
+        `axes` to draw on, as many as states; new ones unless given. Of the first node, all its filters and all states
+        unless told; `run` of Monte Carlo runs.
+
+        Raises:
+            ValueError: a node, filter, state or run that there is not, another number of axes.
+            ModuleNotFoundError: without matplotlib (extra "report").
+        """
+        return plot_record(self, node, filters, states, axes, run, sigmas)
 
     def failures(self) -> list[str]:
         """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
@@ -104,6 +226,7 @@ def is_sound(estimate: Estimate) -> np.ndarray:
     return result
 
 
+@readable
 class AbstractReducer(eqx.Module, Generic[Result]):
     """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
 

@@ -10,11 +10,13 @@ from scipy.special import stdtrit
 
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.readable import readable
 from heliograph.simulation.record import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
 
 
+@readable
 @dataclass(frozen=True)
 class ErrorStatistics:
     """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
@@ -85,9 +87,20 @@ class ErrorStatistics:
         """
         self._tell()
         squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
-        mse, error = _batch_mean(squared, self.count)
-        root = float(np.sqrt(mse))
-        return root, error / (2 * root) if root else 0.0
+        return _root_mean(squared, self.count)
+
+    def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
+        self._tell()
+        squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
+        found = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
+        return np.array([root for root, _ in found]), np.array([error for _, error in found])
+
+    def deviation_by_state(self) -> np.ndarray:
+        """Root of the mean over runs and steps of each state's claimed variance, (n,)."""
+        self._tell()
+        variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))
 
     def rmse_over_time(self) -> np.ndarray:
         """Root mean squared error at each step, (time,)."""
@@ -176,6 +189,7 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
     )
 
 
+@readable
 @dataclass(frozen=True)
 class WorstDirection:
     """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""
@@ -201,6 +215,13 @@ def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
         return mean, float("nan")
     scatter = np.sum((sums - mean * count) ** 2) * groups / (groups - 1)
     return mean, float(np.sqrt(scatter) / count.sum())
+
+
+def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+    """Root of that mean, and its standard error."""
+    mean, error = _batch_mean(sums, count)
+    root = float(np.sqrt(mean))
+    return root, error / (2 * root) if root else 0.0
 
 
 def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,11 +13,14 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, PyTree
 
 Program = Callable[..., tuple[PyTree, list[jax.Array]]]
 
 
+@readable
 class Stream:
     """Feed a filter one sample at a time; it holds the filter's state and the step counter.
 
@@ -51,6 +54,14 @@ class Stream:
         self.steps += 1
         result: Estimate = placed.estimate.unflatten([np.asarray(leaf) for leaf in told])
         return result
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Filter, steps and state, in double precision wherever it is read: what is compiled is no part of it."""
+        return {"filter": self.filter, "steps": self.steps, "_state": to_numpy(self._state)}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept)
+        self._placed = _place(self.filter)
 
 
 class _Placed:

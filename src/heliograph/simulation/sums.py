@@ -1,9 +1,10 @@
 """The sums from which statistics of errors are made, run by run in bounded memory, or from kept trajectories."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -14,15 +15,106 @@ from jaxtyping import PyTree
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import squared_distance
+from heliograph.simulation.frames import statistics_frame
+from heliograph.simulation.labelled import checked_units
+from heliograph.simulation.labelled_statistics import statistics_dataset, statistics_from
 from heliograph.simulation.lanes import BLOCK
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.plots import plot_statistics
 from heliograph.simulation.record import AbstractReducer, Record, Uplink, by_name, uplinks_of
+from heliograph.simulation.saved import opened, save
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
+if TYPE_CHECKING:  # extras
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.axes import Axes
 
+
+@readable
 class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
-    """Statistics by node and filter; fused ones under "fused"."""
+    """Statistics by node and filter; fused ones under "fused". They know the states' names, and units if given."""
+
+    def __init__(
+        self,
+        found: Mapping[str, dict[str, ErrorStatistics]],
+        states: tuple[str, ...],
+        units: Mapping[str, str] | None = None,
+    ):
+        super().__init__(found)
+        self.states, self.units = states, dict(units or {})
+
+    def with_units(self, units: Mapping[str, str]) -> "StatisticsByName":
+        """The same statistics with units, by the state's name, for files, tables and figures.
+
+        Raises:
+            ValueError: a name that is no state.
+        """
+        return StatisticsByName(self, self.states, checked_units(units, self.states))
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
+
+        Raises:
+            ModuleNotFoundError: without xarray (extra "results").
+        """
+        return statistics_dataset(self)
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> "StatisticsByName":
+        """The statistics in a dataset that `to_xarray` made.
+
+        Raises:
+            ValueError: no such dataset.
+        """
+        return statistics_from(dataset)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A row for each node and filter: claim, runs, RMSE and NEES with their errors, each state's RMSE and claim.
+
+        Raises:
+            ModuleNotFoundError: without pandas (extra "results").
+        """
+        return statistics_frame(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write them to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all.
+
+        Raises:
+            ValueError: another ending, or a place that cannot be written.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        save(self.to_xarray(), path)
+
+    @classmethod
+    def open(cls, path: str | Path) -> "StatisticsByName":
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: no such file, or another one.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        return cls.from_xarray(opened(path))
+
+    def plot(
+        self,
+        node: str | None = None,
+        filters: Sequence[str] | None = None,
+        states: Sequence[str] | None = None,
+        axes: "Axes | Sequence[Axes] | None" = None,
+    ) -> "list[Axes]":
+        """Draw the RMSE over time, and dashed what the filter claims: one axes a state.
+
+        `axes` to draw on, as many as states; new ones unless given. Of the first node, all its filters and all states
+        unless told.
+
+        Raises:
+            ValueError: a node, filter or state that there is not, another number of axes.
+            ModuleNotFoundError: without matplotlib (extra "report").
+        """
+        return plot_statistics(self, node, filters, states, axes)
 
     def failures(self) -> list[str]:
         """One line for each filter whose estimate was no number, or its covariance none, in some run, as of a record.
@@ -119,7 +211,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         axes = enumerate((-3, -2, -3, -2, -2))
         each = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
         count = _folded(carry.count)
-        result = StatisticsByName()
+        result = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             result[node] = {
                 name: _statistics(count, [part[node][name] for part in each], claim) for name, claim in claims.items()

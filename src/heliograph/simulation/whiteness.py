@@ -11,10 +11,12 @@ from scipy.linalg import toeplitz
 from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.likelihood import rows
 
 
+@readable
 @dataclass(frozen=True)
 class MemoryTest:
     """Correlation of innovations at lags 1, 2, ..., its standard error, and what the data say of memory and its cost.
@@ -55,7 +57,16 @@ def memory_test(
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
-    white = _standardised(data) if filter is None else _of_filter(filter, data, inputs)
+    white = _standardised(data) if filter is None else whitened_innovations(data, filter, inputs)
+    return memory_of(white, lags, claimed=filter is not None)
+
+
+def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> MemoryTest:
+    """What whitened innovations say; of their power alone where they are in units of what a filter claims.
+
+    Raises:
+        ValueError: too few steps for the lags.
+    """
     if len(white) < 10 * lags:
         raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
     size, size_error = _mean(_by_step(white**2))
@@ -63,7 +74,7 @@ def memory_test(
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
     p_value = float(2 * stats.norm.sf(abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
     share = float(correlation @ np.linalg.lstsq(toeplitz([1.0, *correlation[:-1]]), correlation)[0])
-    power = (size, size_error) if filter is not None else (np.nan, np.nan)
+    power = (size, size_error) if claimed else (np.nan, np.nan)
     return MemoryTest(correlation, error, p_value, share, *power)
 
 
@@ -75,8 +86,19 @@ def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     return np.asarray(value / np.where(deviation > 0, deviation, 1.0))
 
 
-def _of_filter(item: AbstractFilter, data: ArrayLike, inputs: ArrayLike | None) -> Float[np.ndarray, "steps m"]:
-    """Innovations of a recording in units of what the filter claims."""
+def whitened_innovations(
+    data: ArrayLike, filter: AbstractFilter, inputs: ArrayLike | None = None
+) -> Float[np.ndarray, "steps m"]:
+    """Innovations of a recording in units of what the filter claims: white and of variance 1 where the claim holds.
+
+    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived.
+
+    Shapes: data (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
+    """
+    item = filter
     if item.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
     z = rows("measurements", data, None, item.received, missing=True)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.io import loadmat
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.extras import how_to_install
 
 MOVING = 0.01  # m in one odometry row of 0.1 s: the robot has started
 
@@ -54,7 +55,7 @@ def find_recording() -> Path:
     spec = find_spec("gtsam")
     if spec is None or spec.origin is None:
         raise ModuleNotFoundError(
-            'gtsam: expected to be installed, got no such package: pip install "heliograph[recordings]"', name="gtsam"
+            f"gtsam: expected to be installed, got no such package: {how_to_install('recordings')}", name="gtsam"
         )
     path = Path(spec.origin).parent / "Data" / "Plaza2_.mat"
     if not path.is_file():

@@ -79,8 +79,8 @@ EXAMPLES = {"scalar": setting.SCALAR, "coupled": setting.COUPLED, "one_unstable"
 def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = lambda what: None) -> Reproduction:
     """Compute all of it; `advance` is told what begins."""
     advance("thresholds")
-    critical = {name: hg.critical_arrival(e.plant(), e.sensor()) for name, e in EXAMPLES.items()}
-    always = hg.critical_arrival(setting.SCALAR.plant(), setting.SCALAR.sensor(), steady_gain(setting.SCALAR))
+    critical = {name: hg.linear.critical_arrival(e.plant(), e.sensor()) for name, e in EXAMPLES.items()}
+    always = hg.linear.critical_arrival(setting.SCALAR.plant(), setting.SCALAR.sensor(), steady_gain(setting.SCALAR))
     recovery = {fail: critical_recovery(fail) for fail in (0.01, 0.1, 0.5)}
     components = critical_component(0), critical_component(1)
     advance("bounds and simulated filters")
@@ -109,7 +109,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
 
 def judge(example: Example, link: hg.AbstractRandomAffine) -> hg.simulation.Boundedness:
     """The package's verdict on an example over a link."""
-    return hg.certify_boundedness(example.network(link))
+    return hg.simulation.certify_boundedness(example.network(link))
 
 
 def steady_gain(example: Example) -> np.ndarray:

@@ -1,0 +1,57 @@
+"""The app that holds the commands, and the kinds of options they take."""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from cyclopts import App, Parameter
+
+import heliograph
+
+app = App(
+    name="heliograph",
+    help="State estimation over relay networks.",
+    version=heliograph.__version__,
+    help_format="plaintext",
+)
+
+
+def number(text: str) -> Parameter:
+    """An option that is a whole number."""
+    return Parameter(help=text, converter=_whole)
+
+
+def place(text: str = "") -> Parameter:
+    """An option that is a file or folder."""
+    return Parameter(help=text, converter=_path)
+
+
+def folder(command: str, out: Path | None, name: str) -> Path:
+    """The folder in which the results' own folder `name` is made, that can be written: `--out`, or what that is in.
+
+    Where `--out` already ends in `name`, the results are put there and not one deeper.
+
+    Raises:
+        ValueError: no folder given, which a command that only lists does without; one that cannot be written.
+    """
+    from heliograph.files.table import check_output_folder
+    from heliograph.numerics.check import fail
+
+    if out is None:
+        raise fail(command, "a folder for the results (--out DIR)", "none")
+    check_output_folder(out)
+    return out.parent if out.name == name else out
+
+
+def _whole(_: type, tokens: Sequence[Any]) -> int:
+    """Digits: no fraction is rounded away."""
+    if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
+        raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
+    return int(tokens[0].value)
+
+
+def _path(_: type, tokens: Sequence[Any]) -> Path:
+    if not tokens[0].value or "\0" in tokens[0].value:
+        raise ValueError(f"expected a path, got {tokens[0].value!r}")
+    return Path(tokens[0].value)

@@ -1,0 +1,72 @@
+"""The command line as a function: from arguments to an exit code."""
+
+import sys
+from collections.abc import Sequence
+from contextlib import suppress
+
+from cyclopts import CycloptsError
+
+from heliograph.cli.app import app
+from heliograph.cli.completion import completion
+from heliograph.cli.example import demo, example
+from heliograph.cli.new import new
+from heliograph.cli.reproduce import reproduce
+from heliograph.cli.run import run
+from heliograph.cli.stopping import INTERRUPTED, stoppable
+from heliograph.cli.sweep import sweep
+from heliograph.numerics.extras import EXTRAS, how_to_install
+from heliograph.simulation.compilation_cache import keep_compilations
+
+BAD_INPUT = 2
+
+for one in (new, run, demo, example, reproduce, sweep, completion):  # in the order of the help
+    app.command(one)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command, return its exit code; bad input is one line on stderr, a bug keeps its traceback.
+
+    Ctrl-C ends it with INTERRUPTED and without a word, at any moment.
+    """
+    stopped: list[int] = []
+    try:
+        with stoppable(stopped):
+            code = _command(arguments)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except Exception:
+        if stopped:  # what was interrupted told it in its own way
+            return INTERRUPTED
+        raise
+    return INTERRUPTED if stopped else code
+
+
+def _command(arguments: Sequence[str] | None) -> int:
+    with suppress(ValueError):  # a home that cannot be written to: then everything is compiled again
+        keep_compilations()
+    try:
+        command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
+        code: int | None = command(*bound.args, **bound.kwargs)
+        return code or 0
+    except CycloptsError as error:
+        return _refuse(str(error))
+    except ValueError as error:
+        from heliograph.numerics.check import InputError
+
+        if not isinstance(error, InputError):
+            raise
+        return _refuse(str(error))
+    except OSError as error:
+        return _refuse(f"{error.filename}: {error.strerror or error}" if error.filename else str(error))
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get((error.name or "").partition(".")[0])
+        if extra is None:
+            raise
+        return _refuse(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
+
+
+def _refuse(message: str) -> int:
+    from heliograph.files.quoting import visible
+
+    print("heliograph:", visible(" ".join(message.split())), file=sys.stderr)
+    return BAD_INPUT

@@ -1,0 +1,38 @@
+"""`heliograph example` and `heliograph demo`, which is the first of them."""
+
+from pathlib import Path
+from typing import Annotated
+
+from cyclopts import Parameter
+
+from heliograph.cli.app import folder, number, place
+
+
+def demo(
+    *,
+    out: Annotated[Path, place("Folder for the estimates, figures, report and summary; made if missing.")],
+    seed: Annotated[int, number("Seed of the simulated relays.")] = 0,
+) -> None:
+    """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
+    example("demo", out=out, seed=seed)
+
+
+def example(
+    name: Annotated[str | None, Parameter(help="Which example; without it, the list of them.")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
+    seed: Annotated[int, number("Seed of what is simulated.")] = 0,
+) -> None:
+    """Run an example and report, or list them."""
+    from heliograph.examples import examples, load_example
+
+    if name is None:
+        known = examples()
+        width = max(map(len, known))
+        print("\n".join(f"{each:{width}}  {what}" for each, what in known.items()))
+        return
+    from heliograph.numerics.check import check_seed
+
+    run_example = load_example(name)
+    run_example(folder("example", out, name), check_seed("--seed", seed))

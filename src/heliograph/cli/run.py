@@ -1,0 +1,97 @@
+"""`heliograph run`: the filters of a network over measured data."""
+
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import heliograph
+from heliograph.cli.app import place
+
+if TYPE_CHECKING:
+    from heliograph.files.recording import Recording
+    from heliograph.simulation.network import Network
+    from heliograph.simulation.record import Record
+
+
+def run(
+    network: str,
+    /,
+    *,
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    out: Annotated[Path | None, place("CSV or Parquet to write: estimates with their claimed covariances.")] = None,
+    report: Annotated[Path | None, place("Folder for figures and a page on estimates, innovations and links.")] = None,
+) -> None:
+    """Run the filters of your own network over measured data.
+
+    Parameters
+    ----------
+    network:
+        A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
+        holds several. The name may be that of a function that returns one.
+    """
+    from heliograph.files.quoting import visible
+    from heliograph.numerics.check import fail
+    from heliograph.report.progress import progress
+
+    if out is None and report is None:
+        raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
+    _check_places(measurements, out, report)
+    with progress(3) as advance:
+        advance("starting")
+        from heliograph.files.network_file import load_network
+        from heliograph.files.recording import read_recording, write_estimates
+
+        loaded = load_network(network)
+        if not any(node.filters for node in loaded.nodes.values()):
+            raise fail(f"network {network}", "at least one filter to run", "none")
+        recording = read_recording(measurements, loaded)
+        advance(f"filtering {len(recording.time)} rows")
+        record = heliograph.run(loaded, *recording)
+        if out is not None:
+            advance(f"writing {out}")
+            write_estimates(record, out)
+    if report is not None:
+        _write_report(network, loaded, record, recording, report)
+    for failure in record.failures():
+        print(f"heliograph: warning: {visible(failure)}", file=sys.stderr)
+    filters = [
+        f"{node}/{name} ({estimate.claim})"
+        for node, estimates in record.estimates.items()
+        for name, estimate in estimates.items()
+    ]
+    if out is not None:
+        print(visible(f"{out}: {len(record.time)} rows of {', '.join(filters)}"))
+    if report is not None:
+        print(visible(f"{report / 'report.html'}: {len(record.time)} rows of {', '.join(filters)}"))
+
+
+def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
+    """What is written can be written, before the work starts."""
+    from heliograph.files.table import check_output
+    from heliograph.numerics.check import fail
+
+    if out is not None:
+        check_output(out)
+        if out.resolve() == measurements.resolve():
+            raise fail(f"output file {out}", "another file than the measurements", "the same")
+    if report is not None:
+        from heliograph.files.output_folder import check_replaceable
+        from heliograph.report.results import NEEDS, SUMMARY
+
+        for name in NEEDS:
+            import_module(name)
+        check_replaceable(report, SUMMARY)
+
+
+def _write_report(name: str, network: "Network", record: "Record", recording: "Recording", report: Path) -> None:
+    from heliograph.report.health import Health, examine
+    from heliograph.report.results import Results, write_results
+
+    def tell(health: Health) -> Results:
+        from heliograph.report.run_page import run_results
+
+        return run_results(health, name)
+
+    count = sum(len(node.filters) for node in network.nodes.values())
+    write_results(report, count, lambda advance: examine(network, record, recording.inputs, advance), tell)

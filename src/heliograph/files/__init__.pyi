@@ -1,0 +1,15 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .network_file import (
+    load_network as load_network,
+)
+from .recording import (
+    Recording as Recording,
+    read_recording as read_recording,
+    write_estimates as write_estimates,
+    write_recording as write_recording,
+)
+from .table import (
+    read_table as read_table,
+    write_table as write_table,
+)

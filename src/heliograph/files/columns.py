@@ -1,0 +1,67 @@
+"""Tables from wherever they are: a file, a DataFrame of pandas or polars, or columns by name."""
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.table import read_table
+from heliograph.numerics.check import fail, shown
+from heliograph.numerics.dates import dates
+
+TIME = "time"
+
+
+def columns_of(table: object, name: str = "table") -> dict[str, np.ndarray]:
+    """Columns by name, numbers as float64 and dates as datetime64[ns] in UTC; what is missing is NaN or NaT.
+
+    `table` is the path of a CSV or Parquet file, a DataFrame of pandas or polars, or a dictionary of arrays. An index
+    of pandas called "time" is a column too.
+
+    Raises:
+        ValueError: no such table, a column that holds neither numbers nor dates; one line that names the column.
+        ModuleNotFoundError: Parquet without pyarrow (extra "tables").
+    """
+    if isinstance(table, str | os.PathLike):
+        return read_table(Path(table))
+    if isinstance(table, Mapping):
+        named = dict(table)
+    elif hasattr(table, "columns") and hasattr(table, "__getitem__"):
+        frame: Any = table
+        index = getattr(frame, "index", None)
+        named = {TIME: index} if getattr(index, "name", None) == TIME and TIME not in frame.columns else {}
+        named |= {column: frame[column] for column in frame.columns}
+    else:
+        raise fail(name, "a file, a DataFrame, or a dictionary of columns", shown(table))
+    for column in named:
+        if not isinstance(column, str):
+            raise fail(f"{name}, columns", "names that are text", shown(column))
+    return {column: _values(values, f"{name}, column {column!r}") for column, values in named.items()}
+
+
+def _values(values: Any, name: str) -> np.ndarray:
+    """One column, whose own kind of missing value may be another than NaN."""
+    missing = values.isna() if hasattr(values, "isna") else None
+    if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
+        return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
+    found = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
+    if found.dtype.kind == "M":
+        return np.asarray(found.astype("datetime64[ns]"))
+    if found.dtype.kind in "fiub":
+        return np.asarray(found, dtype=np.float64)
+    if found.dtype.kind in "OUT":
+        return _of_objects(found, name)
+    raise fail(name, "numbers or dates", f"{found.dtype}")
+
+
+def _of_objects(found: np.ndarray, name: str) -> np.ndarray:
+    """Numbers with None among them, or dates; text that reads as a number is none."""
+    some = next((each for each in found if each is not None), None)
+    if isinstance(some, str) or hasattr(some, "isoformat"):
+        return dates(found, name)
+    try:
+        return np.array([np.nan if each is None else float(each) for each in found])
+    except (TypeError, ValueError):
+        raise fail(name, "numbers or dates", shown(some)) from None

@@ -1,0 +1,31 @@
+"""Packages that the core does without, and the command that brings them."""
+
+import sys
+from pathlib import Path
+
+import heliograph
+
+EXTRAS = {  # the extra that brings a package which the core does without
+    "pyarrow": "tables",
+    "matplotlib": "report",
+    "jinja2": "report",
+    "gtsam": "recordings",
+    "cvxpy": "lmi",
+    "clarabel": "lmi",
+    "scs": "lmi",
+    "xarray": "results",
+    "h5netcdf": "results",
+    "h5py": "results",
+    "pandas": "results",
+    "zarr": "sweep",
+    "dask": "cluster",
+    "distributed": "cluster",
+    "gym_electric_motor": "motor",
+}
+
+
+def how_to_install(extra: str) -> str:
+    """A command that brings an extra to this Python, also from a clone, whose name no index knows."""
+    clone = Path(heliograph.__file__).parents[2]
+    place = clone if (clone / "pyproject.toml").is_file() else "heliograph"
+    return f'{sys.executable} -m pip install "{place}[{extra}]"'

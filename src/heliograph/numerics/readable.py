@@ -1,0 +1,127 @@
+"""How an object of ours looks on a terminal and in a notebook, and when it equals another: one way for all of them."""
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import partial
+from html import escape
+from itertools import islice
+from typing import Any, TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.numerics.same import same
+
+T = TypeVar("T", bound=type)
+
+WIDTH, LINES, DEPTH = 110, 10, 3  # characters, lines and levels of what is shown
+FEW, SOME, MANY = 4, 8, 20  # numbers of an array, items on a line, rows of a table
+
+
+def readable(kind: T) -> T:
+    """Give a class, and those made from it, the short `repr`, the table for notebooks and an `==` with one answer."""
+    for name, method in (("__repr__", _repr), ("_repr_html_", _html), ("__eq__", _equal)):
+        setattr(kind, name, method)
+    return kind
+
+
+def _repr(self: Any) -> str:
+    """One line, or a line for each part."""
+    whole = line(self, DEPTH)
+    if len(whole) <= WIDTH:
+        return whole
+    parts = [f"  {name}={line(value, DEPTH - 1)}" for name, value in islice(_parts(self), LINES - 2)]
+    left = sum(1 for _ in _parts(self)) - len(parts)
+    more = [f"  … {left} more"] if left else []
+    return "\n".join([f"{type(self).__name__}(", *(_cut(part) for part in (*parts, *more)), ")"])
+
+
+def _html(self: Any) -> str:
+    """A table of the parts; what has parts itself opens where it stands."""
+    return _table(self, DEPTH)
+
+
+def _equal(self: Any, other: object) -> bool:
+    """Of the same class and the same in every part, NaN like NaN."""
+    if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
+        return same(self.__getstate__(), other.__getstate__())
+    return same(self, other)
+
+
+def line(value: Any, depth: int) -> str:
+    """Any value on one line: arrays by their size, what lies deeper than `depth` by its name."""
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return _array(value)
+    if isinstance(value, Mapping) and not _ours(value):
+        return _joined(
+            "{", value.items(), len(value), depth, lambda item: f"{item[0]!r}: {line(item[1], depth - 1)}", "}"
+        )
+    if isinstance(value, tuple | list) and not _ours(value):
+        marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
+        return _joined(marks[0], value, len(value), depth, lambda item: line(item, depth - 1), marks[1])
+    if _ours(value) or is_dataclass(value):
+        name, parts = type(value).__name__, list(islice(_parts(value), MANY))
+        return _joined(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
+    if isinstance(value, partial):
+        return line(value.func, depth)
+    if callable(value):
+        return str(getattr(value, "__name__", type(value).__name__))
+    return " ".join(repr(value).split())
+
+
+def _ours(value: Any) -> bool:
+    return getattr(type(value), "__repr__", None) is _repr
+
+
+def _parts(value: Any) -> Iterable[tuple[str, Any]]:
+    """Names and values of what an object holds and anybody may use."""
+    if isinstance(value, Mapping):
+        return ((repr(key), each) for key, each in value.items())
+    if is_dataclass(value):
+        named = ((field.name, getattr(value, field.name, None)) for field in fields(value))
+    else:
+        named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
+    return ((name, each) for name, each in named if not name.startswith("_"))
+
+
+def _array(value: Any) -> str:
+    if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
+        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
+    numbers = np.asarray(value).tolist()
+    return repr(numbers) if value.dtype.kind != "f" else _rounded(numbers)
+
+
+def _rounded(numbers: Any) -> str:
+    if isinstance(numbers, list):
+        return f"[{', '.join(map(_rounded, numbers))}]"
+    return f"{numbers:.4g}"
+
+
+def _joined(start: str, items: Iterable[Any], count: int, depth: int, of: Callable[[Any], str], end: str) -> str:
+    if count and depth <= 0:
+        return f"{start}…{end}"
+    more = [f"… {count - SOME} more"] if count > SOME else []
+    return f"{start}{', '.join([*map(of, islice(items, SOME)), *more])}{end}"
+
+
+def _cut(text: str) -> str:
+    return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
+
+
+def _table(value: Any, depth: int) -> str:
+    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(each, depth - 1)}</td></tr>" for name, each in _entries(value)]
+    return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
+
+
+def _entries(value: Any) -> Iterable[tuple[str, Any]]:
+    found = _parts(value)
+    yield from islice(found, MANY)
+    left = sum(1 for _ in found)
+    if left:
+        yield "…", f"{left} more"
+
+
+def _cell(value: Any, depth: int) -> str:
+    text = escape(_cut(line(value, depth)))
+    opens = _ours(value) or (isinstance(value, Mapping) and value)
+    return f"<details><summary>{text}</summary>{_table(value, depth)}</details>" if opens and depth > 0 else text

@@ -1,0 +1,125 @@
+"""What a recording says of the network it came through: how its links did, and whether its filters' claims held."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliograph.files.recording import received_names
+from heliograph.filters.base import AbstractFilter
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.record import Record
+from heliograph.simulation.whiteness import MemoryTest, memory_of, whitened_innovations
+
+LAGS = 10  # of the test for memory, with ten rows for each at least
+SURE = 2.58  # standard errors: one warning in a hundred is a false one
+
+
+@dataclass(frozen=True)
+class Link:
+    """One component of what a node heard: whether it arrived (time,), and the values that did."""
+
+    node: str
+    component: str
+    arrived: np.ndarray
+    values: np.ndarray
+    loses: bool  # whether the network says that it may be lost
+
+    @property
+    def share(self) -> float:
+        """Share of the rows in which it arrived."""
+        return float(self.arrived.mean())
+
+    @property
+    def longest_gap(self) -> int:
+        """Most rows in a row without it."""
+        ends = np.flatnonzero(np.concatenate([[True], self.arrived, [True]]))
+        return int(np.max(np.diff(ends)) - 1)
+
+
+@dataclass(frozen=True)
+class Listening:
+    """What one filter did not expect: innovations in units of its claim (time, m), and the test of them.
+
+    Both are None of a filter that claims nothing, the test also where there are too few rows.
+    """
+
+    node: str
+    filter: str
+    claim: str
+    white: np.ndarray | None
+    test: MemoryTest | None
+
+
+@dataclass(frozen=True)
+class Health:
+    """A record, and what it says of links and filters."""
+
+    record: Record
+    links: list[Link]
+    filters: list[Listening]
+
+    def warnings(self) -> list[str]:
+        """One line for each thing that should make one think."""
+        lines = list(self.record.failures())
+        for link in self.links:
+            name = f"{link.node}: {link.component}"
+            if not link.arrived.any():
+                lines.append(f"{name} never arrived")
+            elif not link.loses and link.share < 1:
+                lines.append(
+                    f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
+                )
+        for one in self.filters:
+            lines += _doubts(one)
+        return lines
+
+
+def _doubts(one: Listening) -> Iterator[str]:
+    if one.test is None:
+        return
+    name, test = f"{one.node}/{one.filter}", one.test
+    if test.power > 1 + SURE * test.power_error:
+        yield (
+            f"{name} is too sure: what it did not expect is {test.power:.2f} times what it claims (squared); "
+            "the model leaves something out"
+        )
+    elif test.power < 1 - SURE * test.power_error:
+        yield f"{name} is too cautious: what it did not expect is {test.power:.2f} times what it claims (squared)"
+    if test.found:
+        yield (
+            f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "
+            "links or the plant remember what the model forgets"
+        )
+
+
+def examine(
+    network: Network, record: Record, inputs: np.ndarray, advance: Callable[[str], object] = lambda what: None
+) -> Health:
+    """Judge links and filters of a recording that was run through the network."""
+    heard = record.measurements
+    links = []
+    for node in heard:
+        z, place = heard[node], network.nodes[node]
+        for i, name in enumerate(received_names(place)):
+            there = ~np.isnan(z[:, i])
+            links.append(Link(node, name, there, z[there, i], not place.complete))
+    filters = []
+    for node, name, item, z in _listening(network, record):
+        advance(f"testing {node}/{name}")
+        white = None if item.claim == "none" or not item.received else whitened_innovations(z, item, inputs)
+        lags = min(LAGS, len(z) // 10)
+        enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
+        test = memory_of(white, lags, claimed=True) if white is not None and enough else None
+        filters.append(Listening(node, name, item.claim, white, test))
+    return Health(record, links, filters)
+
+
+def _listening(network: Network, record: Record) -> Iterator[tuple[str, str, AbstractFilter, np.ndarray]]:
+    """Every filter with what it hears: those of the nodes, and central ones."""
+    for node, z in record.measurements.items():
+        for name, item in network.nodes[node].filters.items():
+            yield node, name, item, z
+    for name, fusion in network.fused.items():
+        if isinstance(fusion, AbstractFilter):
+            yield FUSED, name, fusion, np.concatenate(list(record.measurements.values()), axis=1)

@@ -1,0 +1,192 @@
+"""A run over a recording as figures and a page: estimates with bands, innovations, links, and what is doubtful."""
+
+from collections.abc import Mapping
+from functools import partial
+
+import matplotlib
+import numpy as np
+from cycler import cycler
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from heliograph.files.quoting import in_figure, visible
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph.report.health import Health, Listening
+from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+from heliograph.report.results import Json, Results
+
+COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
+MOST = 8  # nodes, filters and links that are drawn; tables and summary hold all
+BAND = 2.0  # deviations
+LOOK = STYLE | {"axes.prop_cycle": cycler(color=COLOURS), "date.converter": "concise"}
+
+
+def run_results(health: Health, network: str) -> Results:
+    """Everything that the folder holds; `network` is what the user calls it."""
+    return Results(run_figures(health), partial(run_page, health, network), run_summary(health), lambda folder: None)
+
+
+def run_figures(health: Health) -> dict[str, Figure]:
+    """Estimates of each node, innovations of each filter, and when links delivered, by file name."""
+    drawn = {f"estimates_{i}": _estimates(health, node) for i, node in enumerate(_nodes(health))}
+    tested = _tested(health)
+    if tested:
+        drawn["innovations"] = _innovations(health, tested)
+    if health.links:
+        drawn["links"] = _links(health)
+    return drawn
+
+
+def _nodes(health: Health) -> list[str]:
+    return [node for node, filters in health.record.estimates.items() if filters][:MOST]
+
+
+def _tested(health: Health) -> list[Listening]:
+    return [one for one in health.filters if one.white is not None][:MOST]
+
+
+@matplotlib.rc_context(LOOK)
+def _estimates(health: Health, node: str) -> Figure:
+    record = health.record
+    figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(record.states)), layout="constrained")
+    grid = figure.subplots(len(record.states), 1, squeeze=False, sharex=True)[:, 0]
+    record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=list(grid), sigmas=BAND)
+    _time_axis(health, grid[-1])
+    return figure
+
+
+@matplotlib.rc_context(LOOK)
+def _innovations(health: Health, tested: list[Listening]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
+    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, one in zip(grid, tested, strict=True):
+        white = np.asarray(one.white)
+        for i, component in enumerate(white.T):
+            axes.plot(health.record.time, component, ".", markersize=3, color=COLOURS[i % len(COLOURS)])
+        for level in (-BAND, BAND):
+            axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
+        axes.set_title(in_figure(f"{one.node}/{one.filter}"))
+        axes.set_ylabel("in deviations")
+    _time_axis(health, grid[-1])
+    return figure
+
+
+@matplotlib.rc_context(LOOK)
+def _links(health: Health) -> Figure:
+    links = health.links[: 3 * MOST]
+    figure = Figure(figsize=(WIDTH, 0.8 + 0.28 * len(links)), layout="constrained")
+    axes = figure.subplots()
+    for row, link in enumerate(links):
+        lost = health.record.time[~link.arrived]
+        axes.plot(health.record.time[link.arrived], np.full(link.arrived.sum(), row), "|", color=BLUE, markersize=5)
+        axes.plot(lost, np.full(len(lost), row), "|", color=VERMILION, markersize=9)
+    names = [in_figure(f"{link.node}: {link.component} ({link.share:.0%})") for link in links]
+    axes.set_yticks(range(len(links)), names)
+    axes.set_ylim(len(links) - 0.5, -0.5)
+    axes.grid(visible=False)
+    _time_axis(health, axes)
+    return figure
+
+
+def _time_axis(health: Health, axes: Axes) -> None:
+    units, dated = health.record.units, health.record.time.dtype.kind == "M"
+    axes.set_xlabel("time (UTC)" if dated else in_figure(f"time ({units['time']})" if "time" in units else "time"))
+
+
+def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Page:
+    """The report; `drawings` holds each figure as SVG."""
+    record, doubts = health.record, health.warnings()
+    arrived = np.mean([link.share for link in health.links]) if health.links else np.nan
+    keys = [
+        KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
+        KeyFigure("arrived", f"{arrived:.1%}", f"of what {len(record.measurements)} nodes could hear", GREEN),
+        KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
+    ]
+    estimates = [
+        Picture(drawings[f"estimates_{i}"], f"Estimates of {visible(node)} over time with bands",
+                f"{visible(node)}: estimates with bands of {BAND:g} claimed deviations on each side.")
+        for i, node in enumerate(_nodes(health))
+    ]  # fmt: skip
+    return Page(
+        kicker="Heliograph run",
+        title=visible(network),
+        lead="What the network's filters made of the recording, and whether the recording agrees with the network.",
+        sections=[
+            Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
+            Section("Estimates", estimates),
+            Section("Innovations", _tests(health, drawings)),
+            Section("Links", _health(health, drawings)),
+        ],
+    )
+
+
+def _span(time: np.ndarray) -> str:
+    if time.dtype.kind == "M":
+        return f"{str(time[0])[:19]} to {str(time[-1])[:19]} UTC"
+    return f"from {time[0]:g} to {time[-1]:g}"
+
+
+def _warned(doubts: list[str]) -> list[Points | Text]:
+    return [Points([visible(line) for line in doubts])] if doubts else [Text(["No warnings."])]
+
+
+def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
+    rows = []
+    for one in health.filters:
+        test, name = one.test, visible(f"{one.node}/{one.filter}")
+        if test is None:
+            rows.append([name, one.claim, "–", "–", "–"])
+        else:
+            size = f"{test.power:.2f} ± {1.96 * test.power_error:.2f}"
+            rows.append(
+                [
+                    name,
+                    one.claim,
+                    size,
+                    f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
+                    f"{test.p_value:.3f}",
+                ]
+            )
+    caption = (
+        "**Size**: mean square of what the filter did not expect, in units of what it claims (the normalised "
+        "innovation squared per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
+        "one row apart: 0 where the filter uses all that it hears. Both with 95 % intervals; **p**: probability of "
+        "such a correlation if there were none."
+    )
+    text = "An innovation is what arrived less what the filter expected. The tests need no true state."
+    picture = [Picture(drawings["innovations"], "Innovations over time in claimed deviations",
+                       f"Innovations in claimed deviations, one colour a component; 5 of 100 may lie beyond ±{BAND:g}.")
+               ] if "innovations" in drawings else []  # fmt: skip
+    return [Text([text]), Table(["filter", "claim", "size", "correlation", "p"], rows, caption), *picture]
+
+
+def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Picture]:
+    rows = []
+    for link in health.links:
+        mean, deviation = (f"{link.values.mean():.4g}", f"{link.values.std():.4g}") if len(link.values) else ("–", "–")
+        told = "may be lost" if link.loses else "never lost"
+        name = visible(f"{link.node}: {link.component}")
+        rows.append([name, f"{link.share:.1%}", str(link.longest_gap), told, mean, deviation])
+    headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "deviation"]
+    caption = "When each component arrived; red: it did not."
+    picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
+    return [Table(headers, rows), *picture]
+
+
+def run_summary(health: Health) -> dict[str, Json]:
+    """All numbers of the page, by node and filter, and by node and component."""
+    filters: dict[str, dict[str, Json]] = {}
+    for one in health.filters:
+        found: dict[str, Json] = {"claim": one.claim}
+        if one.test is not None:
+            found |= {
+                "size": one.test.power,
+                "size_error": one.test.power_error,
+                "correlation": float(one.test.correlation[0]),
+                "p_value": one.test.p_value,
+            }
+        filters.setdefault(one.node, {})[one.filter] = found
+    links: dict[str, dict[str, Json]] = {}
+    for link in health.links:
+        links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}
+    return {"rows": len(health.record.time), "warnings": health.warnings(), "filters": filters, "links": links}

@@ -1,0 +1,52 @@
+"""A recorded signal through any channel."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at, first, steps_covered
+from heliograph.numerics.check import array, check_horizon, check_seed, fail, instance
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, apply
+from heliograph.simulation.draws import CHANNEL, CHANNEL_START, checksum, draw_key
+
+SENDER = checksum("transmit")
+
+
+def transmit(signal: ArrayLike, channel: Channel, seed: int = 0) -> Float[np.ndarray, "steps outputs"]:
+    """What arrives of a recorded signal at the end of a channel, drawn anew at each step; links that remember do.
+
+    z_k = G_k y_k + n_k. NaN in the signal was not sent: what would be made of it (G_k not zero there) is NaN, all else
+    arrives. The result is NaN too where the channel loses it. A table of pandas or polars is a signal as well.
+
+    Shapes: signal (steps, inputs), or (steps,) for a channel with one input.
+
+    Raises:
+        ValueError: no channel, a signal of another shape or with infinite values, more steps than the channel covers.
+    """
+    instance("channel", first(channel), AbstractRandomAffine, "a channel, such as hop(...)")
+    inputs = first(channel).inputs
+    values = np.asarray(signal)
+    y = array("signal", values[:, None] if values.ndim == 1 and inputs == 1 else values, (None, inputs), missing=True)
+    if not len(y):
+        raise fail("signal", "at least one step", "none")
+    check_horizon(len(y), steps_covered(channel))
+    return np.asarray(_transmitted(channel, y, np.asarray(check_seed("seed", seed))))
+
+
+@compiled
+def _transmitted(channel: Channel, y: Float[Array, "steps m"], seed: Array) -> jax.Array:
+    key = jax.random.key(seed)
+
+    def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, jax.Array]:
+        k, y_k = row
+        missing = jnp.isnan(y_k)
+        state, h = at(channel, k).draw(state, draw_key(key, k, SENDER, CHANNEL))
+        unsent = jnp.any((h[:-1, :-1] != 0) & missing, axis=1)
+        return state, jnp.where(unsent, jnp.nan, apply(h, jnp.where(missing, 0.0, y_k)))
+
+    start = at(channel, 0).init(draw_key(key, 0, SENDER, CHANNEL_START))
+    result: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(y)), jnp.asarray(y)))[1]
+    return result

@@ -1,0 +1,111 @@
+"""What the command does for somebody who begins: a first file, completion, hints that work, paths that do not nest."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pandas
+import pytest
+
+from heliograph import cli
+from heliograph.examples import load_example
+from heliograph.files.table import read_table
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_new_network_runs(folder, capsys):
+    assert cli.main(["new", "cart.py"]) == 0
+    assert capsys.readouterr().out == "cart.py: next, python cart.py\n"
+    text = (folder / "cart.py").read_text()
+    assert "heliograph run cart.py --measurements data.csv --report report" in text and "my_network" not in text
+    done = subprocess.run([sys.executable, "cart.py"], cwd=folder, capture_output=True, text=True, check=True)
+    rows = re.findall(r"(\w+): rmse ([\d.]+) .*NEES ([\d.]+)", done.stdout)
+    (aware, aware_rmse, aware_nees), (_, mean_rmse, mean_nees) = rows
+    assert aware == "relay_aware" and float(aware_rmse) < float(mean_rmse)
+    assert abs(float(aware_nees) - 1) < abs(float(mean_nees) - 1)
+    command = re.search(r"heliograph (run cart.py .*?)  ", text)[1]
+    assert cli.main(command.split()) == 0
+    summary = json.loads((folder / "report" / "summary.json").read_text())
+    assert summary["rows"] == 200 and abs(summary["links"]["cart"]["left"]["arrived"] - 0.9) < 0.11  # 5 deviations
+    assert summary["filters"]["cart"]["relay_aware"]["size"] < summary["filters"]["cart"]["mean_gain"]["size"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("there.py", "a new name"), ("no/x.py", "an existing folder"), ("x.txt", "ends in .py")]
+)
+def test_a_new_network_takes_nobodys_place(folder, capsys, name, words):
+    (folder / "there.py").write_text("mine")
+    assert cli.main(["new", name]) == 2 and words in capsys.readouterr().err
+    assert (folder / "there.py").read_text() == "mine" and len(list(folder.iterdir())) == 1
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_shells_complete(capsys, shell):
+    assert cli.main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert all(word in script for word in ("reproduce", "example", "measurements", "report"))
+    if shutil.which(shell):
+        assert subprocess.run([shell, "-n"], input=script, text=True).returncode == 0
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash")
+def test_bash_completes_a_word(capsys):
+    assert cli.main(["completion", "bash"]) == 0
+    script = capsys.readouterr().out
+    name = re.search(r"complete .*-F (\w+) ", script)[1]
+    asked = "COMP_WORDS=(heliograph rep); COMP_CWORD=1; COMP_LINE='heliograph rep'; COMP_POINT=14"
+    ask = f"{asked}; {name}; echo ${{COMPREPLY[@]}}"
+    done = subprocess.run(["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True)
+    assert "reproduce" in done.stdout.split()
+
+
+@pytest.mark.parametrize(("out", "expected"), [("out", "out"), ("out/fusion", "out"), ("fusion", ".")])
+def test_results_are_not_put_one_folder_deeper_than_said(monkeypatch, out, expected):
+    calls = []
+    load_example("fusion")
+    monkeypatch.setattr("heliograph.examples.fusion.example", lambda place, seed: calls.append(str(place)))
+    assert cli.main(["example", "fusion", "--out", out]) == 0 and calls == [expected]
+    module = type("Paper", (), {"reproduce": staticmethod(lambda place, runs, seed: calls.append(str(place)))})
+    monkeypatch.setattr("heliograph.cli.reproduce.import_module", lambda name: module)
+    assert cli.main(["reproduce", "quadratic-bias", "--out", out.replace("fusion", "quadratic-bias")]) == 0
+    assert calls[1] == expected
+    assert cli.main(["reproduce", "all", "--out", "out/all"]) == 0 and set(calls[2:]) == {"out/all"}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "time;pos\n0.5;1.5\n",
+        "time;pos\n0,5;1,5\n",
+        "time\tpos\n0.5\t1.5\n",
+        "time|pos\n0.5|1.5\n",
+        "time pos\n0.5 1.5\n",
+        'time,pos\n"0,5","1,5"\n',
+        "# a drive\ntime,pos\n0.5,1.5\n",
+        "time,pos\n# a pause\n0.5,1.5\n",
+    ],
+)
+def test_a_hint_is_a_remedy(folder, text):
+    """Whatever it says to do is done here, and the table then is one."""
+    (folder / "data.csv").write_text(text)
+    with pytest.raises(ValueError) as told:
+        read_table("data.csv")
+    remedy = re.search(r": (pandas.*) rewrites it$", str(told.value))[1]
+    exec(remedy, {"pandas": pandas})
+    np.testing.assert_array_equal(read_table("data.csv")["pos"], [1.5])
+    np.testing.assert_array_equal(read_table("data.csv")["time"], [0.5])
+
+
+@pytest.mark.parametrize("word", ["NA", "null", "-"])
+def test_a_word_for_nothing_is_told_to_be_empty(folder, word):
+    (folder / "data.csv").write_text(f"time,pos\n0,{word}\n")
+    with pytest.raises(ValueError, match="a cell is empty where nothing arrived"):
+        read_table("data.csv")

@@ -1,0 +1,163 @@
+"""Dates with zones and DataFrames in, dates out."""
+
+from datetime import UTC, datetime, timedelta, timezone
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import heliograph as hg
+from heliograph.files.columns import columns_of
+from heliograph.files.table import read_table, write_table
+from heliograph.numerics.dates import dates, in_iso, seconds_between
+
+PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
+SENSOR = hg.Sensor(lambda x: x, noise=0.1, outputs=["pos"])
+NETWORK = hg.Network(
+    PLANT, {"a": hg.Node(SENSOR, hg.perfect(), {"f": hg.cubature_filter(PLANT, SENSOR, hg.perfect())})}
+)
+MOMENTS = st.datetimes(datetime(1700, 1, 1), datetime(2200, 1, 1))
+ZONES = st.integers(-23 * 60, 23 * 60).map(lambda minutes: timezone(timedelta(minutes=minutes)))
+
+
+@settings(max_examples=100, derandomize=True)
+@given(moment=MOMENTS, zone=ZONES, space=st.booleans())
+def test_a_date_is_the_instant_that_python_says(moment, zone, space):
+    aware = moment.replace(tzinfo=zone)
+    text = aware.isoformat(sep=" " if space else "T")
+    (found,) = dates([text], "time")
+    expected = np.datetime64(aware.astimezone(UTC).replace(tzinfo=None), "ns")
+    assert found == expected and dates([aware], "time")[0] == expected
+    assert dates(in_iso(np.array([found])), "time")[0] == found
+
+
+def test_what_else_is_a_date_and_what_is_none():
+    found = dates(["2026-11-21T23:25:00.123456789Z", "2026-11-21 23:25:00.5UTC", "2026-11-22T01:25+02"], "time")
+    assert [str(t) for t in found] == [
+        "2026-11-21T23:25:00.123456789",
+        "2026-11-21T23:25:00.500000000",
+        "2026-11-21T23:25:00.000000000",
+    ]
+    assert dates(["2026-11-21"], "time")[0] == np.datetime64("2026-11-21") and np.isnat(dates(["", None], "time")).all()
+    assert dates(["1969-12-31T23:59:59.999999999"], "time").astype(int)[0] == -1
+    for wrong in ("2026-13-01", "2026-11-21T25:00", "1600-01-01", "21.11.2026", "2026-11-21T23:25+99:00", "today"):
+        with pytest.raises(ValueError, match=r"time, row 1: expected a date as 2026-11-21T23:25:00\+01:00, .* got"):
+            dates([wrong], "time")
+    with pytest.raises(ValueError, match="row 2: expected a zone with every date or with none"):
+        dates(["2026-11-21T00:00Z", "2026-11-21T01:00"], "time")
+
+
+def test_seconds_between_dates_lose_nothing():
+    time = np.datetime64("2026-11-21T23:25:00", "ns") + np.array([0, 1, 1_000_000_001]) * np.timedelta64(1, "ns")
+    np.testing.assert_array_equal(seconds_between(time), [0, 1e-9, 1.0])
+    np.testing.assert_array_equal(seconds_between(np.array([3.0, 3.5])), [0, 0.5])
+
+
+ACROSS_WINTER_TIME = ["2026-10-25T02:59:58+02:00", "2026-10-25T02:59:59+02:00", "2026-10-25T02:00:00+01:00"]
+
+
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_dates_pass_through_a_run(tmp_path, ending):
+    (tmp_path / "in.csv").write_text("time,pos\n" + "".join(f"{t},{i}\n" for i, t in enumerate(ACROSS_WINTER_TIME)))
+    recording = hg.files.read_recording(tmp_path / "in.csv", NETWORK)
+    np.testing.assert_array_equal(recording.inputs[:, 0], [0, 1, 1])
+    record = hg.run(NETWORK, *recording)
+    assert record.time[2] == np.datetime64("2026-10-25T01:00:00")
+    hg.files.write_estimates(record, tmp_path / f"out{ending}")
+    np.testing.assert_array_equal(read_table(tmp_path / f"out{ending}")["time"], record.time)
+    if ending == ".csv":
+        assert (tmp_path / "out.csv").read_text().splitlines()[1].startswith("2026-10-25T00:59:58Z,")
+    hg.files.write_recording(recording, NETWORK, tmp_path / f"again{ending}")
+    assert hg.files.read_recording(tmp_path / f"again{ending}", NETWORK) == recording
+    assert record.to_pandas().index[0] == pd.Timestamp("2026-10-25T00:59:58")
+    record.save(tmp_path / "record.nc")
+    assert hg.Record.open(tmp_path / "record.nc") == record
+
+
+def test_dataframes_are_tables():
+    numbers = {"time": [0.0, 0.5, 0.5], "pos": [1.0, np.nan, 3.0]}
+    expected = hg.files.read_recording({k: np.array(v) for k, v in numbers.items()}, NETWORK)
+    frame = pd.DataFrame(numbers)
+    assert hg.files.read_recording(frame, NETWORK) == expected
+    assert hg.files.read_recording(frame.set_index("time"), NETWORK) == expected
+    assert hg.files.read_recording(frame.convert_dtypes(), NETWORK) == expected  # pandas's own missing values
+    assert hg.files.read_recording(frame.astype(object).where(frame.notna(), None), NETWORK) == expected
+    zoned = pd.DataFrame({"time": pd.to_datetime(ACROSS_WINTER_TIME, utc=True).tz_convert("Europe/Berlin"), "pos": 1.0})
+    dated = hg.files.read_recording(zoned, NETWORK)
+    assert dated.time[0] == np.datetime64("2026-10-25T00:59:58") and dated.inputs[2, 0] == 1
+    assert hg.files.read_recording(zoned.assign(time=ACROSS_WINTER_TIME), NETWORK) == dated
+    assert hg.files.read_recording(zoned.set_index("time"), NETWORK) == dated
+
+
+class OfPolars:
+    """The part of a polars DataFrame that is used: columns, and series that hand out arrays."""
+
+    class Series(list):
+        def to_numpy(self):
+            return np.array(self)
+
+    def __init__(self, **named):
+        self.columns, self._named = list(named), named
+
+    def __getitem__(self, name):
+        return self.Series(self._named[name])
+
+
+def test_other_frames_are_tables():
+    found = columns_of(OfPolars(time=np.array(["2026-11-21T23:25"], dtype="datetime64[us]"), pos=[3]))
+    assert found["time"].dtype == "datetime64[ns]" and found["pos"].dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        (pd.DataFrame({0: [1.0]}), "columns: expected names that are text, got 0"),
+        ({"time": ["one"]}, "column 'time', row 1: expected a date"),
+        ({"time": [0.0], "pos": [1j]}, "column 'pos': expected numbers or dates"),
+        ({"time": [0.0], "pos": [object()]}, "column 'pos': expected numbers or dates"),
+        (3, "expected a file, a DataFrame, or a dictionary of columns, got 3"),
+        ({"time": [0.0], "pos": pd.to_datetime(["2026-11-21"])}, "column 'pos': expected numbers, got dates"),
+        (
+            {"time": pd.to_datetime(["2026-11-21", "2026-11-20"]), "pos": [0, 0]},
+            "2026-11-20T00:00:00.000000000 after 2026",
+        ),
+        ({"time": pd.to_datetime(["2026-11-21", None]), "pos": [0, 0]}, "row 2, column 'time': expected a date"),
+    ],
+)
+def test_tables_that_are_none(table, words):
+    with pytest.raises(ValueError) as told:
+        hg.files.read_recording(table, NETWORK)
+    assert words in str(told.value) and "\n" not in str(told.value)
+
+
+def test_times_of_a_run_may_be_dates_that_do_not_go_backwards():
+    time = np.array(["2026-11-21", "2026-11-20"], dtype="datetime64[s]")
+    for wrong in (time, time[:1], np.array(["2026-11-21", "NaT"], dtype="datetime64[s]")):
+        with pytest.raises(ValueError, match="time: expected"):
+            hg.run(NETWORK, {"a": [1.0, 2.0]}, [[0.0], [1.0]], wrong)
+
+
+@settings(max_examples=30, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    values=st.lists(st.floats(allow_infinity=False), min_size=1, max_size=5),
+    ending=st.sampled_from([".csv", ".parquet"]),
+)
+def test_a_recording_comes_back_bit_for_bit(values, ending, tmp_path):
+    time, z = np.arange(len(values)) / 3, np.array(values)
+    recording = hg.files.Recording({"a": z[:, None]}, time[:, None], time)
+    hg.files.write_recording(recording, NETWORK, tmp_path / f"recording{ending}")
+    found = hg.files.read_recording(tmp_path / f"recording{ending}", NETWORK)
+    assert (
+        found == recording
+        and np.signbit(found.measurements["a"])[~np.isnan(z)].tolist() == np.signbit(z[~np.isnan(z), None]).tolist()
+    )
+
+
+def test_a_column_of_dates_in_a_table_is_dates(tmp_path):
+    (tmp_path / "t.csv").write_text("when,x\n2026-11-21,1\n,2\n")
+    found = read_table(tmp_path / "t.csv")
+    assert np.isnat(found["when"][1]) and found["x"].tolist() == [1, 2]
+    write_table(found, tmp_path / "u.parquet")
+    np.testing.assert_array_equal(read_table(tmp_path / "u.parquet")["when"], found["when"])

@@ -1,0 +1,101 @@
+"""The page of a run: its numbers are those of the recording, and what is wrong is said."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph import cli
+from heliograph.report.health import Link, examine
+from heliograph.report.run_page import run_figures, run_page, run_summary
+
+STEPS = 300
+DRIFT = 0.95 * np.eye(1)
+BAD = "</h2>\x1b[31m$x_{"
+PLANT = hg.LinearPlant(DRIFT, [[1.0]], [0.0], [[10.0]], states=["level"])
+SENSOR = hg.LinearSensor([[1.0], [1.0]], 0.1 * np.eye(2), outputs=["left", "right"])
+LINK = hg.erasure(hg.perfect(2), 0.9)
+GOOD = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
+SURE = hg.linear_filter(hg.LinearPlant(DRIFT, [[0.01]], [0.0], [[10.0]], states=["level"]), SENSOR, hg.perfect(2))
+NETWORK = hg.Network(
+    PLANT, {"a": hg.Node(SENSOR, LINK, {"good": GOOD, "sure": SURE}), BAD: hg.Node(SENSOR, hg.perfect(2), {})}
+)
+
+
+@pytest.fixture(scope="module")
+def health():
+    record = hg.monte_carlo(NETWORK, STEPS, 1, key=1)
+    heard = {node: z[0].copy() for node, z in record.measurements.items()}
+    heard[BAD][10:14, 1] = np.nan
+    return examine(NETWORK, hg.run(NETWORK, heard), np.zeros((STEPS, 0)))
+
+
+def test_claims_are_judged_by_innovations(health):
+    good, sure = (next(one for one in health.filters if one.filter == name) for name in ("good", "sure"))
+    assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.found
+    assert good.white.shape == (STEPS, 2) and sure.test.power > 5
+    assert sure.test.correlation[0] > 0.3  # a filter that follows too slowly is wrong the same way again
+    # the whitened innovation of one step by hand: the first, whose prior is the plant's own
+    arrived = np.flatnonzero(~np.isnan(health.record.measurements["a"][:, 0]))[0]
+    prior = 10.0 * 0.95 ** (2 * (arrived + 1)) + sum(0.95 ** (2 * i) for i in range(arrived + 1))
+    first = health.record.measurements["a"][arrived, 0] / np.sqrt(prior + 0.1)
+    assert np.isclose(good.white[arrived, 0], first, rtol=1e-9)
+
+
+def test_links_are_told_as_they_were(health):
+    links = {(link.node, link.component): link for link in health.links}
+    one = links[BAD, "right"]
+    assert one.share == 1 - 4 / STEPS and one.longest_gap == 4 and not one.loses and links["a", "left"].loses
+    assert Link("a", "b", np.zeros(7, bool), np.zeros(0), True).longest_gap == 7
+    assert Link("a", "b", np.ones(7, bool), np.zeros(7), True).longest_gap == 0
+
+
+def test_what_is_doubtful_is_said_and_no_more(health):
+    lines = health.warnings()
+    assert len([line for line in lines if "a/sure is too sure" in line]) == 1
+    assert any("right is missing in 1.3% of the rows; the network says that it is never lost" in line for line in lines)
+    assert not any("a/good" in line or "left" in line for line in lines)
+
+
+def test_the_page_holds_every_number_and_names_do_not_act_in_it(health):
+    figures = run_figures(health)
+    assert list(figures) == ["estimates_0", "innovations", "links"]
+    page = run_page(health, BAD, dict.fromkeys(figures, b"<svg/>")).html()
+    assert "a/sure" in page and "98.7%" in page and "</h2>\x1b" not in page and "&lt;/h2&gt;\\x1b" in page
+    summary = json.loads(json.dumps(run_summary(health)))
+    assert summary["rows"] == STEPS and summary["links"][BAD]["right"] == {"arrived": 1 - 4 / STEPS, "longest_gap": 4}
+    assert summary["filters"]["a"]["good"]["size"] == health.filters[0].test.power
+
+
+NET = """
+import numpy as np
+import heliograph as hg
+
+plant = hg.LinearPlant(0.9 * np.eye(1), np.eye(1), [0.0], np.eye(1))
+sensor = hg.LinearSensor(np.eye(1), np.eye(1), outputs=["y"])
+node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor), "open": hg.open_loop_filter(plant)})
+network = hg.Network(plant, {"n": node})
+"""
+
+
+@pytest.mark.parametrize("rows", [3, 120])
+def test_the_command_writes_a_report(tmp_path, monkeypatch, capsys, rows):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "net.py").write_text(NET)
+    times = np.datetime64("2026-11-21T23:59") + np.arange(rows) * np.timedelta64(1, "s")
+    (tmp_path / "data.csv").write_text(
+        "time,y\n" + "".join(f"{t}+01:00,{jnp.sin(1.0 * i)}\n" for i, t in enumerate(times))
+    )
+    arguments = ["run", "net.py", "--measurements", "data.csv", "--report", "out/run"]
+    assert cli.main(arguments) == 0 and cli.main([*arguments, "--out", "estimates.csv"]) == 0
+    said = capsys.readouterr()
+    assert "out/run/report.html: " in said.out and said.err.count("warning") == 0
+    assert {p.name for p in (tmp_path / "out" / "run").iterdir()} >= {"report.html", "summary.json", "estimates_0.png"}
+    summary = json.loads((tmp_path / "out" / "run" / "summary.json").read_text())
+    assert ("size" in summary["filters"]["n"]["f"]) == (rows == 120)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis").touch()
+    assert cli.main([*arguments[:-1], "mine"]) == 2 and "other files" in capsys.readouterr().err
+    assert cli.main(arguments[:-2]) == 2 and "(--out FILE) or a folder for a report" in capsys.readouterr().err
