@@ -323,11 +323,11 @@ def demo_module(monkeypatch, example) -> None:
 
 def test_demo_takes_folder_and_seed(folder, monkeypatch):
     calls = []
-    demo_module(monkeypatch, lambda out, seed: calls.append((str(out), seed)))
+    demo_module(monkeypatch, lambda out, seed, drive="plaza2": calls.append((str(out), seed, drive)))
     assert cli.main(["demo", "--out", "results", "--seed", "3"]) == 0
-    assert cli.main(["demo", "--out", "results"]) == 0
+    assert cli.main(["demo", "--out", "results", "--recording", "plaza1"]) == 0
     assert cli.main(["example", "demo", "--out", "results", "--seed", "4"]) == 0
-    assert calls == [("results", 3), ("results", 0), ("results", 4)]
+    assert calls == [("results", 3, "plaza2"), ("results", 0, "plaza1"), ("results", 4, "plaza2")]
 
 
 def test_a_missing_extra_is_named(folder, capsys, monkeypatch):

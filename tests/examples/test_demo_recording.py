@@ -6,6 +6,8 @@ from heliograph.examples.demo import robot
 from heliograph.examples.demo.calibration import WINDOW, calibrate, calibrate_odometry, calibrate_ranges
 from heliograph.examples.demo.recording import PlazaRecording, find_recording, read_recording
 
+PLAZA2 = robot.DRIVES["plaza2"]
+
 
 @pytest.fixture(scope="module")
 def recording() -> PlazaRecording:
@@ -36,13 +38,48 @@ def test_odometry_belongs_to_the_truth_of_its_row(recording: PlazaRecording) -> 
 def test_constants_of_the_example_are_what_the_recording_gives(recording: PlazaRecording) -> None:
     got = calibrate(recording)
     # Half a unit in the last digit printed in the example.
-    assert got.gyro_rate == pytest.approx(robot.GYRO_RATE, abs=0.5e-6)
+    assert got.gyro_rate == pytest.approx(PLAZA2.gyro_rate, abs=0.5e-6)
     assert got.range_scale == pytest.approx(robot.RANGE_SCALE, abs=0.5e-5)
     assert got.range_variance == pytest.approx(robot.RANGE_VARIANCE, abs=0.5e-5)
     assert got.position_walk == pytest.approx(robot.POSITION_WALK, abs=0.5e-7)
     assert got.heading_walk == pytest.approx(robot.HEADING_WALK, abs=0.5e-9)
-    np.testing.assert_allclose(robot.BEACONS, recording.beacons, atol=0.5e-3)
-    np.testing.assert_allclose(robot.START, recording.start_pose, atol=0.5e-3)
+    np.testing.assert_allclose(PLAZA2.beacons, recording.beacons, atol=0.5e-3)
+    np.testing.assert_allclose(PLAZA2.start, recording.start_pose, atol=0.5e-3)
+
+
+@pytest.fixture(scope="module")
+def other() -> PlazaRecording:
+    return read_recording("plaza1")
+
+
+def test_another_drive_is_read_in_the_order_of_its_time_stamps(other: PlazaRecording) -> None:
+    heard = ~np.isnan(other.ranges)
+    assert heard.sum() == 3529 and np.all(heard.sum(axis=1) <= 1)  # every range, none twice in a row
+    step = other.odometry[:, 2]
+    assert np.all(np.diff(other.time) >= 0)
+    assert step.max() <= 1.0 and np.all(step >= 0)  # gaps of up to 97 s are bridged by the odometry
+    np.testing.assert_allclose(step.sum(), other.time[-1] - other.start)
+    # Ranges are where their stamps say, before and after the file goes back: a scale is all that is off.
+    off = other.ranges[heard] - robot.RANGE_SCALE * other.distances()[heard]
+    assert all(abs(part.mean()) < 0.25 and part.std() < 0.8 for part in np.array_split(off, 30))
+
+
+def test_the_other_drive_has_three_things_of_its_own(other: PlazaRecording) -> None:
+    own = robot.DRIVES["plaza1"]
+    assert other.gyro_rate == pytest.approx(own.gyro_rate, abs=0.5e-9)
+    np.testing.assert_allclose(own.beacons, other.beacons, atol=0.5e-3)
+    np.testing.assert_allclose(own.start, other.start_pose, atol=0.5e-3)
+
+
+def test_headings_are_those_of_travel_on_either_drive(recording: PlazaRecording, other: PlazaRecording) -> None:
+    for drive in (recording, other):
+        poses = np.vstack([drive.start_pose, drive.truth])
+        steps = np.diff(poses[:, :2], axis=0)
+        forward = np.linalg.norm(steps, axis=1) > 0.1
+        course = np.arctan2(steps[:, 1], steps[:, 0]) - (poses[:-1, 2] + poses[1:, 2]) / 2
+        assert abs(np.angle(np.mean(np.exp(1j * course[forward])))) < 0.02
+    with pytest.raises(ValueError, match="recording: expected one of plaza1, plaza2, got 'plaza3'"):
+        find_recording("plaza3")
 
 
 def synthetic(rows: int, seed: int) -> PlazaRecording:
@@ -57,7 +94,9 @@ def synthetic(rows: int, seed: int) -> PlazaRecording:
     distance = np.linalg.norm(truth[:, None, :2] - beacons, axis=-1)
     ranges = 1.1 * distance + rng.normal(0, 0.5, distance.shape)
     ranges[::2, 0] = np.nan
-    return PlazaRecording(0.0, np.zeros(3), np.arange(1, rows + 1) * 0.2, truth, odometry, ranges, beacons, 0.0)
+    return PlazaRecording(
+        "plaza2", 0.0, np.zeros(3), np.arange(1, rows + 1) * 0.2, truth, odometry, ranges, beacons, 0.0
+    )
 
 
 def test_calibration_recovers_known_constants() -> None:

@@ -12,9 +12,13 @@ def demo(
     *,
     out: Annotated[Path, place("Folder for the estimates, figures, report and summary; made if missing.")],
     seed: Annotated[int, number("Seed of the simulated relays.")] = 0,
+    recording: Annotated[str, Parameter(help="Which drive: plaza1 or plaza2.")] = "plaza2",
 ) -> None:
     """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
-    example("demo", out=out, seed=seed)
+    from heliograph.examples.demo import example as demonstrate
+    from heliograph.numerics.check import check_seed
+
+    demonstrate(folder("demo", out, "demo"), check_seed("--seed", seed), recording)
 
 
 def example(

@@ -18,6 +18,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
@@ -86,17 +87,18 @@ class ClockFilter(AbstractFilter):
     @corrects
     def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
         """Use what arrived of z, for those clocks alone that can be observed."""
-        base, z = self.base, jnp.asarray(z)
+        base = self.base
         channel: SecondOrder = at(base.channel, k)
         sensor, prior = at(base.sensor, k), Belief(state.mean, state.covariance)
-        signal = signal_of(sensor, base.transform, prior)
+        signal = signal_of(at(base.plant, k), sensor, base.transform, prior)
+        expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
+        z = nearest(jnp.asarray(z), expected, base.heard_angles)
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
         silence = jnp.where(present, 0, state.silence)
         heard = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
         observed = self._observed(state, lambda x: heard @ sensor.measure(x), k) & jnp.any(present)
         gain, _ = base.update.correct(prior.covariance, signal, channel, present)
         gain = gain * self._estimated(observed)[:, None]
-        expected = channel.mean_gain @ signal.mean + channel.offset
         mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
         after = _considered(prior.covariance, gain, signal, channel, total)
         belief = ClockBelief(mean, after, state.inputs, silence, observed)
@@ -136,8 +138,8 @@ class ClockFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: ClockBelief) -> Estimate:
-        """The belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
 
 
 def _share(square: jax.Array, place: int) -> jax.Array:

@@ -13,12 +13,14 @@ from heliograph.filters.innovation import gaussian_innovation, innovation_covari
 from heliograph.filters.plan import plan
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
+from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link, mean_gain
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
+from heliograph.numerics.angle import Angles, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
@@ -44,7 +46,8 @@ class GaussianFilter(AbstractFilter):
     `channel` is what the filter believes; the world may have another. Its innovation covariance is M Cov(y) M' and the
     spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
 
-    `linear`: plant and sensor are, and no gain is random, so that nothing but the mean depends on data.
+    `linear`: plant and sensor are, no gain is random and nothing is an angle, so that nothing but the mean depends on
+    data. `heard_angles`: which components of z are angles; z is then read within half a turn of what is expected.
     """
 
     plant: AnyPlant
@@ -55,6 +58,7 @@ class GaussianFilter(AbstractFilter):
     initial_mean: np.ndarray
     initial_covariance: np.ndarray
     linear: bool = eqx.field(static=True)
+    heard_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -73,13 +77,13 @@ class GaussianFilter(AbstractFilter):
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
-        signal = signal_of(at(self.sensor, k), self.transform, state)
-        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z))
+        signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
+        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.heard_angles)
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
-        """The belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""
@@ -91,28 +95,29 @@ def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief,
     if isinstance(plant, LinearPlant):
         moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
     else:
-        moved = transform.apply(lambda x: plant.transition(x, u), *state)
+        moved = transform.apply(plant.moves(u, state.mean), *state)
     return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
 
-def signal_of(sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
-    """What the sensor is expected to send."""
+def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
+    """What the sensor is expected to send of this plant's state."""
     if isinstance(sensor, LinearSensor):
         measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
     else:
-        measured = transform.apply(sensor.measure, *state)
+        measured = transform.apply(continued(sensor.measure, state.mean, plant.angles, sensor.angles), *state)
     mean = measured.mean + sensor.noise.mean
     spread = measured.covariance + sensor.noise.covariance
     return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
 
 
 def corrected(
-    prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array
+    prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array, angles: Angles = ()
 ) -> tuple[Belief, Innovation]:
     """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
+    expected = channel.mean_gain @ signal.mean + channel.offset
+    z = nearest(z, expected, angles)
     gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
     after = _use(prior, gain, bound, signal.mean, channel, z)
-    expected = channel.mean_gain @ signal.mean + channel.offset
     return after, gaussian_innovation(z, expected, innovation_covariance(signal, channel))
 
 
@@ -147,6 +152,7 @@ def _build(
     instance("update", update, AbstractUpdate, "one such as Polytope()")
     n = len(start.states)
     check_link(first(sensor), first(channel), n)
+    angles = received_angles(plant, sensor, channel)
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
     spread = start.initial_covariance
     if initial_covariance is not None:
@@ -155,7 +161,8 @@ def _build(
     channel = without_memory(channel)
     described = describe(channel, update)
     pairs = zip(_each(channel), _each(described), strict=True)
-    linear = is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
+    on_line = not start.circular and not first(sensor).circular
+    linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     own_prior = initial_mean is not None or initial_covariance is not None
     claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
     return GaussianFilter(
@@ -167,6 +174,7 @@ def _build(
         initial_mean=mean,
         initial_covariance=spread,
         linear=linear,
+        heard_angles=angles,
         claim=claim,
         states=start.states,
         inputs=start.inputs,

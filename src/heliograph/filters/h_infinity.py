@@ -13,7 +13,7 @@ from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, check_sensor
+from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
@@ -95,6 +95,7 @@ def h_infinity_filter(
     if n != system.states or design.gains.shape != (system.steps, n, system.received):
         raise fail("system", f"{n} states and gains {design.gains.shape}", f"{system.states} states")
     check_sensor(first(sensor), n)
+    refuse_angles("H-infinity filter", plant, sensor)
     if len(first(sensor).outputs) != inputs:
         raise fail("sensor", f"the system's {inputs} outputs", len(first(sensor).outputs))
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))

@@ -20,7 +20,7 @@ def kalman_filter(
 
     P- = A P A' + Q, S = C P- C' + R, K = P- C' S^-1, m = m- + K (z - C m- - v), P = P- - K C P-.
 
-    Claim: "exact" from the plant's own initial law, whatever the laws' shapes; "nominal" from another.
+    Claim: "exact" from the plant's own initial law, whatever the laws' shapes; "nominal" from another, and with angles.
 
     Raises:
         ValueError: a plant or sensor that is not linear, parts that do not fit, an initial covariance that is none.

@@ -25,7 +25,8 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
-from heliograph.model.sensor import AnySensor, is_linear
+from heliograph.model.sensor import AnySensor, check_linear
+from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
@@ -158,9 +159,7 @@ def linear_filter(
     """
     if as_maps("channel", [first(channel)])[0].past:
         return behind_delays(plant, sensor, channel, partial(linear_filter, update=update))
-    if not is_linear(plant, sensor):
-        raise fail("linear filter", "a LinearPlant and a LinearSensor", f"{type(first(plant)).__name__} and "
-                   f"{type(first(sensor)).__name__}")  # fmt: skip
+    check_linear("linear filter", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states))
     if first(channel).remembers:
         if update is not None:
@@ -240,7 +239,7 @@ class OpenLoop(AbstractFilter):
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
         plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = self.transform.apply(lambda x: plant.transition(x, u), *state)
+        moved = self.transform.apply(plant.moves(u, state.mean), *state)
         return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
     @corrects
@@ -251,7 +250,7 @@ class OpenLoop(AbstractFilter):
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
         """The prediction."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
 
 def open_loop_filter(
@@ -272,7 +271,7 @@ def open_loop_filter(
     if initial_covariance is not None:
         spread = covariance("filter's initial covariance", initial_covariance, n)
     own = initial_mean is None and initial_covariance is None
-    claim: Claim = "exact" if isinstance(start, LinearPlant) and own else "nominal"
+    claim: Claim = "exact" if isinstance(start, LinearPlant) and own and not start.circular else "nominal"
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

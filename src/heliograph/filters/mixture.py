@@ -10,11 +10,13 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.innovation import log_density, mixed_innovation
+from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
@@ -72,6 +74,7 @@ class MixtureFilter(AbstractFilter):
     plant: AnyPlant
     components: Components | OverTime
     initial: Float[Array, " M"]
+    heard_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -103,7 +106,7 @@ class MixtureFilter(AbstractFilter):
         def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
             cross = jnp.where(present[:, None], gain @ spread, 0.0)
             total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
-            value = z - gain @ mean - offset
+            value = wrapped(z - gain @ mean - offset, self.heard_angles)
             heard = jnp.where(present, value, 0.0)
             solved = psd_solve(total, jnp.concatenate([cross, heard[:, None]], axis=1))
             free = jnp.diagonal(cholesky(total)) > 0
@@ -120,14 +123,15 @@ class MixtureFilter(AbstractFilter):
             - jnp.einsum("a,aij->ij", weight, known)
             + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
         )
+        value = nearest(value, value[jnp.argmax(prior)], self.heard_angles)
         heard = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
         return MixtureBelief(mean + shift, symmetrize(after), modes, state.moved), heard
 
     @in_float64
     def estimate(self, state: MixtureBelief) -> Estimate:
-        """The belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
@@ -161,6 +165,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
         raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
     check_link(first(sensor), first(channel), len(first(plant).states))
+    angles = received_angles(plant, sensor, channel)
     floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
     if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
         modes = [_modes(channel)]
@@ -175,6 +180,7 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         plant=plant,
         components=components,
         initial=modes[0].initial,
+        heard_angles=angles,
         claim="nominal",
         states=start.states,
         inputs=start.inputs,

@@ -18,11 +18,13 @@ from heliograph.filters.innovation import mixed_innovation
 from heliograph.filters.told import Told, by_pattern, pattern_of
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
+from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last
@@ -114,6 +116,7 @@ class MultipleModelFilter(AbstractFilter):
     initial: Float[Array, " M"]
     merging: AbstractMerging
     transform: AbstractTransform
+    heard_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -134,30 +137,42 @@ class MultipleModelFilter(AbstractFilter):
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
         mean, spread = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        mean = together(plant, mean, jnp.sum(state.weight, axis=1))
         return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
         """Hear z with each component in each mode, and weigh them by it."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
-        signals = jax.vmap(lambda *own: signal_of(sensor, self.transform, Belief(*own)))(*state[:2])
+        signals = jax.vmap(lambda *own: signal_of(plant, sensor, self.transform, Belief(*own)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        after, weight, mixed = hear(belief, signal, channel, jnp.asarray(j), state.weight[i, j], z)
+        after, weight, mixed = hear(belief, signal, channel, jnp.asarray(j), state.weight[i, j], z, self.heard_angles)
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
-        (mean, spread), law = merged(after.mean, after.covariance, posterior)
+        (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
         return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
 
     @in_float64
     def estimate(self, state: ModalBeliefs) -> Estimate:
-        """Mean and covariance of the whole mixture."""
+        """Mean and covariance of the whole mixture, angles between -pi and pi."""
         whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-        return Estimate(whole.mean[0], whole.covariance[0], self.claim)
+        return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
+
+
+def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
+    """Means (components, n) with their angles near those of the likeliest component, so that they can be averaged."""
+    return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
 
 
 def hear(
-    belief: Belief, signal: Signal, channel: Told, mode: jax.Array, weight: jax.Array, z: jax.Array
+    belief: Belief,
+    signal: Signal,
+    channel: Told,
+    mode: jax.Array,
+    weight: jax.Array,
+    z: jax.Array,
+    angles: Angles = (),
 ) -> tuple[Belief, jax.Array, Innovation]:
     """Each belief corrected in its mode, its weight after z and after what arrived of it, and the mixture's innovation.
 
@@ -172,7 +187,7 @@ def hear(
         law = QuadraticMap(spread, jnp.zeros_like(spread))
         none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
         link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
-        return corrected(own, sent, link, Polytope(), z)
+        return corrected(own, sent, link, Polytope(), z, angles)
 
     found, heard = jax.vmap(one)(belief, signal, mean, spread)
     possible = prior > 0  # a mode in which this cannot arrive has no map for it
@@ -181,7 +196,8 @@ def hear(
         jnp.where(possible[:, None, None], found.covariance, belief.covariance),
     )
     weighed = jnp.where(possible, jnp.log(prior) + heard.log_likelihood, -jnp.inf)
-    mixed = mixed_innovation(prior, heard.value, heard.covariance, jax.nn.logsumexp(weighed))
+    value = nearest(jnp.asarray(heard.value), heard.value[jnp.argmax(prior)], angles)
+    mixed = mixed_innovation(prior, value, heard.covariance, jax.nn.logsumexp(weighed))
     return after, jax.nn.softmax(weighed), mixed
 
 
@@ -219,6 +235,7 @@ def _build(
 ) -> MultipleModelFilter:
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
+    angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)
     return MultipleModelFilter(
         plant=plant,
@@ -227,6 +244,7 @@ def _build(
         initial=initial,
         merging=merging,
         transform=Cubature() if transform is None else transform,
+        heard_angles=angles,
         claim="nominal",
         states=start.states,
         inputs=start.inputs,

@@ -8,14 +8,16 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, predicted, signal_of
-from heliograph.filters.multiple_model import describe_modes, hear, merged
+from heliograph.filters.multiple_model import describe_modes, hear, merged, together
 from heliograph.filters.told import Told
 from heliograph.filters.transform import AbstractTransform, Cubature
+from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.check import check_count
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
@@ -49,6 +51,7 @@ class ParticleFilter(AbstractFilter):
     channel: Told | OverTime
     initial: Float[Array, " M"]
     transform: AbstractTransform
+    heard_angles: Angles = eqx.field(static=True)
     particles: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -74,16 +77,18 @@ class ParticleFilter(AbstractFilter):
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
         mean, spread = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
         mode = jnp.where(state.moved, drawn, state.mode)
+        mean = together(plant, mean, state.weight)
         return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
 
     @corrects
     def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
         """Hear z with each particle, weigh them by it, and draw them anew where half of them weigh next to nothing."""
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
-        signals = jax.vmap(lambda *own: signal_of(sensor, self.transform, Belief(*own)))(*belief)
+        signals = jax.vmap(lambda *own: signal_of(plant, sensor, self.transform, Belief(*own)))(*belief)
 
-        after, weight, mixed = hear(belief, signals, channel, state.mode, state.weight, z)
+        after, weight, mixed = hear(belief, signals, channel, state.mode, state.weight, z, self.heard_angles)
+        after = after._replace(mean=together(plant, after.mean, weight))
         key = _folded(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
         poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
@@ -93,9 +98,9 @@ class ParticleFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Particles) -> Estimate:
-        """Mean and covariance of the whole mixture."""
+        """Mean and covariance of the whole mixture, angles between -pi and pi."""
         whole, _ = merged(state.mean, state.covariance, state.weight[:, None])
-        return Estimate(whole.mean[0], whole.covariance[0], self.claim)
+        return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
 
 
 def _chosen(law: jax.Array, place: jax.Array) -> jax.Array:
@@ -140,6 +145,7 @@ def particle_filter(
     """
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
+    angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)
     return ParticleFilter(
         plant=plant,
@@ -147,6 +153,7 @@ def particle_filter(
         channel=described,
         initial=initial,
         transform=Cubature() if transform is None else transform,
+        heard_angles=angles,
         particles=check_count("particles", particles),
         seed=check_count("seed", seed, 0),
         claim="nominal",

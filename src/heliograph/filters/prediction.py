@@ -55,7 +55,7 @@ class PredictionFilter(AbstractFilter):
     @in_float64
     def estimate(self, state: Ahead) -> Estimate:
         """The prediction."""
-        return Estimate(state.prior.mean, state.prior.covariance, self.claim)
+        return self.base.estimate(state.prior)
 
 
 def prediction_of(filter: AbstractFilter) -> PredictionFilter:

@@ -19,8 +19,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
-from heliograph.numerics.check import fail
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, given, memories
@@ -189,8 +188,7 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Re
 
 
 def _revealed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> RevealedFilter:
-    if not is_linear(plant, sensor):
-        raise fail("filter that is told the mode", "a LinearPlant and a LinearSensor", "one that is not linear")
+    check_linear("filter that is told the mode", plant, sensor)
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     return RevealedFilter(

@@ -62,8 +62,9 @@ class SequentialFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
-        """The belief."""
-        return Estimate(state.mean, state.covariance, self.claim)
+        """The belief, as the first node's filter tells it."""
+        told = self.filters[0].estimate(state)
+        return Estimate(told.mean, told.covariance, self.claim)
 
 
 def _joined(each: Sequence[Innovation]) -> Innovation:

@@ -18,8 +18,8 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AnyPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
-from heliograph.numerics.check import array, fail, probabilities
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -207,8 +207,7 @@ def told_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Arr
         ValueError: a plant or sensor that is not linear, parts that do not fit, flags that are no probabilities.
     Source: the filter of Costa (1994) with moments conditional on what is told.
     """
-    if not is_linear(plant, sensor):
-        raise fail("told filter", "a LinearPlant and a LinearSensor", "one that is not linear")
+    check_linear("told filter", plant, sensor)
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]

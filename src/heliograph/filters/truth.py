@@ -12,7 +12,7 @@ from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at, first
 from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, check_horizon, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.readable import readable
@@ -55,8 +55,7 @@ def true_error(
             channel that loses data.
     Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
     """
-    if not is_linear(plant, sensor):
-        raise fail("true error", "a LinearPlant and a LinearSensor", "one that is not linear")
+    check_linear("true error", plant, sensor)
     start, n = first(plant), len(first(plant).states)
     check_link(first(sensor), first(channel), n, late=True)
     if filter.received != first(channel).outputs or len(filter.states) != n:

@@ -17,6 +17,7 @@ from heliograph.fusion.intersection import (
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
+from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, fail, instance, items, probabilities
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
@@ -46,11 +47,11 @@ class AbstractFusion(eqx.Module):
         raise NotImplementedError
 
 
-def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
-    """Fuse estimates of one state; leading axes (run, time) are carried along.
+def fuse(rule: AbstractFusion, estimates: list[Estimate], angles: Sequence[int] = ()) -> Estimate:
+    """Fuse estimates of one state; leading axes (run, time) are carried along. `angles`: which states are angles.
 
     Raises:
-        ValueError: no estimates, or estimates of different state dimensions.
+        ValueError: no estimates, estimates of different state dimensions, angles that are no places in the state.
     Source: cubature fusion under amplify-and-forward relays, equation (8).
     """
     instance("fusion rule", rule, AbstractFusion, "one such as CovarianceIntersection()")
@@ -60,8 +61,13 @@ def fuse(rule: AbstractFusion, estimates: list[Estimate]) -> Estimate:
         raise fail("fusion", "estimates of one state dimension", [np.shape(e.mean) for e in estimates])
     rule.check(len(estimates))
     means = np.stack([np.asarray(e.mean) for e in estimates], axis=-2)
+    which = tuple(int(i) for i in array("angles", items("angles", angles, "places"), (None,)))
+    if not set(which) <= set(range(means.shape[-1])):
+        raise fail("angles", f"places from 0 to {means.shape[-1] - 1}", list(which))
+    means = nearest(means, means[..., :1, :], which)
     covariances = np.stack([np.asarray(e.covariance) for e in estimates], axis=-3)
-    return Estimate(*_combine_all(rule, means, covariances), rule.claim([e.claim for e in estimates]))
+    mean, covariance = _combine_all(rule, means, covariances)
+    return Estimate(wrapped(np.asarray(mean), which), covariance, rule.claim([e.claim for e in estimates]))
 
 
 @compiled

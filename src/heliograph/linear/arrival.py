@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.linear.told_losses import ONE, ToldSystem, certified_radius, find_gains, spectral_radius
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor
+from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -91,6 +91,7 @@ def plant_matrices(plant: AnyPlant) -> tuple[Float[np.ndarray, "n n"], Float[np.
     """
     if isinstance(plant, OverTime) or not isinstance(plant, LinearPlant) or not isinstance(plant.noise, AbstractNoise):
         raise fail("boundedness", "a LinearPlant that does not vary", _kind(plant))
+    refuse_angles("boundedness", plant)
     return np.asarray(plant.matrix), np.asarray(plant.noise.covariance)
 
 
@@ -103,6 +104,7 @@ def sensor_matrices(sensor: AnySensor, states: int) -> tuple[Float[np.ndarray, "
     if isinstance(sensor, OverTime) or not isinstance(sensor, LinearSensor):
         raise fail("boundedness", "a LinearSensor that does not vary", _kind(sensor))
     check_sensor(sensor, states)
+    refuse_angles("boundedness", sensor)
     return np.asarray(sensor.matrix), np.asarray(sensor.noise.covariance)
 
 

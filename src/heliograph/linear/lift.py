@@ -11,7 +11,7 @@ from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, is_linear
+from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Array, Float
@@ -169,9 +169,7 @@ def initial_moments(plant: LinearPlant, order: int) -> Float[np.ndarray, "monomi
 def check_model(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> None:
     """Raise ValueError unless plant and sensor are linear, fit the channel, and have noises with moments."""
     start = first(plant)
-    if not is_linear(plant, sensor):
-        got = f"{type(start).__name__} and {type(first(sensor)).__name__}"
-        raise fail("polynomial filter", "a LinearPlant and a LinearSensor", got)
+    check_linear("polynomial filter", plant, sensor)
     check_link(first(sensor), first(channel), len(start.states))
     if start.inputs:
         expected = "a plant without inputs (take the response to known inputs off the measurements first)"

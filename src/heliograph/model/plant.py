@@ -1,7 +1,7 @@
 """Plants: x+ = f(x, u) + w, nonlinear or linear, with a Gaussian (or other) initial state."""
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime, first
+from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.readable import readable
-from heliograph.numerics.traced import library
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array
 from heliograph.random_affine.noise import (
     AbstractNoise,
     Gaussian,
@@ -24,6 +26,8 @@ from heliograph.random_affine.noise import (
     as_noise,
 )
 
+SAME = 1e-6  # relative: what a full turn of 2 pi, known to rounding, may leave in a steep function
+A = TypeVar("A", jax.Array, np.ndarray)
 NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), from the input u
 
 
@@ -31,7 +35,8 @@ NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), fro
 class AbstractPlant(eqx.Module):
     """A system x+ = f(x, u) + w with w independent over time; x_0 has `initial_mean` and `initial_covariance`.
 
-    x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant.
+    x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant. States that are `circular`
+    are angles in radians: x and x with a full turn more in one of them are the same state.
     """
 
     noise: eqx.AbstractVar[AbstractNoise | NoiseFunction]
@@ -40,6 +45,24 @@ class AbstractPlant(eqx.Module):
     deviation: eqx.AbstractVar[AbstractNoise | None]
     states: eqx.AbstractVar[tuple[str, ...]]
     inputs: eqx.AbstractVar[tuple[str, ...]]
+    circular: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+
+    @property
+    def angles(self) -> Angles:
+        """Which states are angles."""
+        return tuple(self.states.index(name) for name in self.circular)
+
+    def difference(self, x: A, other: A) -> A:
+        """x - other of states (..., n), angles between -pi and pi."""
+        return wrapped(x - other, self.angles)
+
+    def near(self, x: A, other: Array) -> A:
+        """The same state x (..., n), its angles within half a turn of those of `other`: so they can be averaged."""
+        return nearest(x, other, self.angles)
+
+    def moves(self, u: jax.Array, center: jax.Array) -> Callable[[jax.Array], jax.Array]:
+        """x -> f(x, u) with angles continued from those at `center`, as moments are made of it."""
+        return continued(lambda x: self.transition(x, u), center, self.angles, self.angles)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u): shapes (n,), (inputs,) -> (n,)."""
@@ -77,9 +100,11 @@ class Plant(AbstractPlant):
     `noise` is a covariance, a noise law, or a function of u that returns a covariance (zero-mean Gaussian noise).
     `initial_covariance` is a covariance, or a noise law of x_0 - initial_mean where x_0 is not Gaussian.
     An input named "dt" is filled with the time since the previous row when recorded data has no such column.
+    `circular` names the states that are angles, in radians; f must not mind a full turn more in one of them.
 
     Raises:
-        ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite.
+        ValueError: a transition that does not return a state, covariances that are none, numbers that are not finite,
+            circular states that are none or that a full turn changes.
     """
 
     function: Callable[[jax.Array, jax.Array], ArrayLike]
@@ -98,6 +123,7 @@ class Plant(AbstractPlant):
         initial_covariance: AbstractNoise | ArrayLike,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] = (),
+        circular: Sequence[str] = (),
     ):
         self.function = function("transition of a plant", transition, "(x, u)")
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
@@ -111,6 +137,8 @@ class Plant(AbstractPlant):
             self.noise = noise
         else:
             self.noise = as_noise("process noise", noise, n)
+        self.circular = _circular(self.states, circular)
+        check_turns("plant", lambda x: self.transition(x, jnp.asarray(u)), self.initial_mean, self.angles, self.angles)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """f(x, u)."""
@@ -118,12 +146,13 @@ class Plant(AbstractPlant):
 
 
 class LinearPlant(AbstractPlant):
-    """A linear plant x+ = A x + B u + w; noise and initial law are given as for `Plant`.
+    """A linear plant x+ = A x + B u + w; noise, initial law and circular states are given as for `Plant`.
 
     Shapes: matrix (n, n), input_matrix (n, inputs).
 
     Raises:
-        ValueError: wrong shapes, covariances that are none, numbers that are not finite.
+        ValueError: wrong shapes, covariances that are none, numbers that are not finite, circular states that are none
+            or that a full turn changes.
     """
 
     matrix: Square
@@ -144,6 +173,7 @@ class LinearPlant(AbstractPlant):
         input_matrix: ArrayLike | None = None,
         states: Sequence[str] | None = None,
         inputs: Sequence[str] | None = None,
+        circular: Sequence[str] = (),
     ):
         self.initial_mean, self.initial_covariance, self.deviation = _initial(initial_mean, initial_covariance)
         n = self.initial_mean.shape[-1]
@@ -152,6 +182,8 @@ class LinearPlant(AbstractPlant):
         self.noise = as_noise("process noise", noise, n)
         self.states = names("state names", states, n, "x")
         self.inputs = names("input names", inputs, self.input_matrix.shape[-1], "u")
+        self.circular = _circular(self.states, circular)
+        check_turns("plant", lambda x: jnp.asarray(self.matrix) @ x, self.initial_mean, self.angles, self.angles)
 
     def transition(self, x: jax.Array, u: jax.Array) -> jax.Array:
         """A x + B u."""
@@ -182,15 +214,37 @@ def with_bias(plant: LinearPlant, coupling: ArrayLike, bias: LinearPlant) -> Lin
     deviations = [p.deviation or Gaussian(p.initial_covariance) for p in (plant, bias)]
     centers = [p.initial_mean - d.mean for p, d in zip((plant, bias), deviations, strict=True)]
     xp = library(plant.matrix, coupling, bias.matrix, centers, plant.input_matrix)
+    renamed = {name: f"bias_{name}" if name in plant.states else name for name in bias.states}
     return LinearPlant(
         xp.block([[plant.matrix, coupling], [np.zeros((extra, n)), bias.matrix]]),
         Independent(noises),
         xp.concatenate(centers),
         Independent(deviations),
         xp.concatenate([plant.input_matrix, np.zeros((extra, len(plant.inputs)))]),
-        states=(*plant.states, *(f"bias_{name}" if name in plant.states else name for name in bias.states)),
+        states=(*plant.states, *renamed.values()),
         inputs=plant.inputs,
+        circular=(*plant.circular, *(renamed[name] for name in bias.circular)),
     )
+
+
+def _circular(states: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
+    return tuple(states[i] for i in angles_named("circular states", circular, states))
+
+
+def check_turns(
+    name: str, function: Callable[[jax.Array], jax.Array], center: Vector, given: Angles, found: Angles
+) -> None:
+    """Raise ValueError where a full turn of a given angle changes f(center) by more than turns of the angles found."""
+    if not given or is_traced(center):
+        return
+    with jax.enable_x64(True):
+        start = np.asarray(function(jnp.asarray(center)))
+        for i in given:
+            moved = np.asarray(function(jnp.asarray(center + TURN * np.eye(len(center))[i])))
+            change = wrapped(moved - start, found)
+            if np.any(np.abs(change) > SAME * (1 + np.abs(start))):
+                raise fail(f"{name} with circular states", "one that a full turn does not change",
+                           f"a change of {np.abs(change).max():.3g} by a turn of state {i}")  # fmt: skip
 
 
 def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector, Square, AbstractNoise | None]:

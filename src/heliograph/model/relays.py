@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -212,6 +212,7 @@ def _check_linear(plant: Any, sensor: Any) -> None:
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         got = f"{type(plant).__name__} and {type(sensor).__name__}"
         raise fail("relay network", "a LinearPlant and a LinearSensor", got)
+    refuse_angles("relay network", plant, sensor)
     if plant.inputs:
         raise fail("relay network's plant", "no inputs", list(plant.inputs))
     if sensor.matrix.shape[-1] != len(plant.states):

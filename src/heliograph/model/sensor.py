@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
@@ -18,10 +19,19 @@ from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 @readable
 class AbstractSensor(eqx.Module):
-    """A sensor y = h(x) + v with v independent over time and of everything else."""
+    """A sensor y = h(x) + v with v independent over time and of everything else.
+
+    Outputs that are `circular` are angles in radians: y and y with a full turn more in one of them are the same.
+    """
 
     noise: eqx.AbstractVar[AbstractNoise]
     outputs: eqx.AbstractVar[tuple[str, ...]]
+    circular: tuple[str, ...] = eqx.field(static=True, default=(), kw_only=True)
+
+    @property
+    def angles(self) -> Angles:
+        """Which outputs are angles."""
+        return tuple(self.outputs.index(name) for name in self.circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x): shapes (n,) -> (len(outputs),)."""
@@ -32,10 +42,11 @@ class Sensor(AbstractSensor):
     """A nonlinear sensor: `measure(x)` written with jax.numpy; `noise` a covariance, a variance or a noise law.
 
     Say how many outputs there are by naming them, by a covariance matrix, or by a noise law; a single variance and no
-    names mean one output.
+    names mean one output. `circular` names the outputs that are angles, in radians; a channel must leave them as they
+    are (gain 1), but for noise and losses that are told.
 
     Raises:
-        ValueError: names, noise and function that disagree about the number of outputs.
+        ValueError: names, noise and function that disagree about the number of outputs, circular outputs that are none.
     """
 
     function: Callable[[jax.Array], ArrayLike]
@@ -47,11 +58,13 @@ class Sensor(AbstractSensor):
         measure: Callable[[jax.Array], ArrayLike],
         noise: AbstractNoise | ArrayLike,
         outputs: Sequence[str] | None = None,
+        circular: Sequence[str] = (),
     ):
         self.function = function("measure of a sensor", measure, "x")
         dimension = (components(noise) or 1) if outputs is None else len(items("sensor outputs", outputs, "names"))
         self.noise = as_noise("sensor noise", noise, dimension)
         self.outputs = names("sensor outputs", outputs, dimension, "y")
+        self.circular = _circular(self.outputs, circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x)."""
@@ -59,26 +72,38 @@ class Sensor(AbstractSensor):
 
 
 class LinearSensor(AbstractSensor):
-    """A linear sensor y = C x + v.
+    """A linear sensor y = C x + v; circular outputs as for `Sensor`.
 
     Shapes: matrix (m, n).
 
     Raises:
-        ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite.
+        ValueError: wrong shapes, a noise that is no covariance, numbers that are not finite, circular outputs that are
+            none.
     """
 
     matrix: Float[jax.Array | np.ndarray, "m n"]
     noise: AbstractNoise
     outputs: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, matrix: ArrayLike, noise: AbstractNoise | ArrayLike, outputs: Sequence[str] | None = None):
+    def __init__(
+        self,
+        matrix: ArrayLike,
+        noise: AbstractNoise | ArrayLike,
+        outputs: Sequence[str] | None = None,
+        circular: Sequence[str] = (),
+    ):
         self.matrix = array("sensor matrix", matrix, (None, None))
         self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
+        self.circular = _circular(self.outputs, circular)
 
     def measure(self, x: jax.Array) -> jax.Array:
         """C x."""
         return jnp.asarray(self.matrix) @ x
+
+
+def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
+    return tuple(outputs[i] for i in angles_named("circular outputs", circular, outputs))
 
 
 AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
@@ -97,5 +122,20 @@ def check_sensor(sensor: AbstractSensor, states: int) -> None:
 
 
 def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
-    """Whether both are linear, so that means and covariances propagate without approximation."""
+    """Whether both are linear, so that but for angles means and covariances propagate without approximation."""
     return isinstance(first(plant), LinearPlant) and isinstance(first(sensor), LinearSensor)
+
+
+def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
+    """Raise ValueError unless both are linear and nothing in them is an angle."""
+    if not is_linear(plant, sensor):
+        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
+        raise fail(name, "a LinearPlant and a LinearSensor", got)
+    refuse_angles(name, plant, sensor)
+
+
+def refuse_angles(name: str, *parts: AnyPlant | AnySensor) -> None:
+    """Raise ValueError where a state or an output is an angle, for what knows numbers on a line alone."""
+    circular = [one for part in parts for one in first(part).circular]
+    if circular:
+        raise fail(name, "no angles (cubature, extended, mixture and multiple model filters take them)", circular)

@@ -14,7 +14,8 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
 from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
-from heliograph.model.sensor import AnySensor
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import wrapped
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, checksum, draw_key
 from heliograph.simulation.network import OWN, Network
@@ -70,12 +71,17 @@ class OwnChannels(AbstractAir):
 
         def one(antenna: Antenna, memory: PyTree) -> tuple[PyTree, jax.Array]:
             sensor = at(antenna.sensor, k)
-            y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, antenna.checksums, SENSOR))
+            y = sensed(sensor, x, draw_key(key, k, antenna.checksums, SENSOR))
             return deliver(antenna.channel, memory, y, key, k, antenna.checksums, antenna.memories)
 
         both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
         results = [both(antenna, memory) for antenna, memory in zip(self.antennas, state, strict=True)]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
+
+
+def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
+    """y = h(x) + v, angles between -pi and pi."""
+    return wrapped(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
 
 
 class CommonChannel(AbstractAir):
@@ -92,7 +98,7 @@ class CommonChannel(AbstractAir):
     def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
         """The sensor measures x, the channel delivers."""
         sensor, place = at(self.sensor, k), checksum(SENDER)
-        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, place, SENSOR))
+        y = sensed(sensor, x, draw_key(key, k, place, SENSOR))
         state, z = deliver(self.channel, state, y, key, k, place, ())
         return state, tuple(z[rows] for rows in self.rows)
 

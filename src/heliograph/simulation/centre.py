@@ -26,7 +26,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.arrived import arrived
@@ -195,6 +195,7 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Mapping[str, tuple[AnySens
     """
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
+    refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
     uncertain, seen = False, set()
     for name, (sensor, channel, item) in nodes.items():
         where = f"fusion by {rule}: node {name!r}"

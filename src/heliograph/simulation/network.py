@@ -12,6 +12,7 @@ from heliograph.filters.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.schedule import Schedule
+from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first, steps_covered, structure
@@ -94,6 +95,7 @@ class Network(eqx.Module):
             node = self.nodes[names[0]]
             if isinstance(node, Node):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
+                received_angles(plant, node.sensor, node.channel)
         for name, item in self.fused.items():
             if isinstance(item, Fusion):
                 item.check(self.nodes_with(item.filter), len(self.states))
@@ -152,6 +154,7 @@ class Network(eqx.Module):
             ValueError: filters that do not hear all outputs once, a channel that remembers, parts that do not fit.
         """
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
+        received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
         heard = {name: max((item.received for item in own.values()), default=0) for name, own in filters.items()}
         if sum(heard.values()) != first(channel).outputs:

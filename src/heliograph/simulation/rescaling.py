@@ -104,7 +104,7 @@ def _plant(item: AnyPlant, units: Units) -> AnyPlant:
     s, u = units.states, units.inputs
     law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
     center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
-    names = {"states": item.states, "inputs": item.inputs}
+    names = {"states": item.states, "inputs": item.inputs, "circular": item.circular}
     if isinstance(item, LinearPlant):
         assert isinstance(item.noise, AbstractNoise)
         matrix, entry = s[:, None] * item.matrix / s, s[:, None] * item.input_matrix / u
@@ -121,8 +121,8 @@ def _sensor(item: AnySensor, units: Units) -> AnySensor:
         return over_time([_sensor(one, units) for one in unstack(item)])
     s, r = units.states, units.outputs
     if isinstance(item, LinearSensor):
-        return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs)
-    return Sensor(lambda x: r * item.measure(x / s), _noise(item.noise, r), item.outputs)
+        return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs, item.circular)
+    return Sensor(lambda x: r * item.measure(x / s), _noise(item.noise, r), item.outputs, item.circular)
 
 
 def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:

@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, check_count, check_seed, check_times, fail, instance, shown, table
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
@@ -175,10 +177,23 @@ class World(eqx.Module):
         """After step k with the input u, and what there is to see of it: truth (n,), measurements, estimates."""
         (x, air, states), (k, u) = carry, row
         plant = at(self.plant, k)
-        x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
+        x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         air, z = self.air.hear(air, x, key, k)
         states, found = self.filters.step(states, z, u, k)
-        return (x, self.air.told(air, found["estimates"]), states), {"truth": x, "measurements": z, **found}
+        after = x, self.air.told(air, found["estimates"]), states
+        return after, {"truth": x, "measurements": z, **_near(plant, x, found)}
+
+
+def _near(plant: AbstractPlant, x: jax.Array, found: dict[str, PyTree]) -> dict[str, PyTree]:
+    """What was estimated, angles within half a turn of the truth: then x - xhat is the error, whoever subtracts."""
+    if not plant.circular:
+        return found
+
+    def near(one: Estimate) -> Estimate:
+        return Estimate(plant.near(jnp.asarray(one.mean), x), one.covariance, one.claim)
+
+    each = {key: found[key] for key in ("estimates", "fused")}
+    return {**found, **jax.tree.map(near, each, is_leaf=lambda leaf: isinstance(leaf, Estimate))}
 
 
 class _Job(eqx.Module):

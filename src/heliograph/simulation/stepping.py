@@ -15,7 +15,8 @@ from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
-from heliograph.model.over_time import at, stack, structure
+from heliograph.model.over_time import at, first, stack, structure
+from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
@@ -72,6 +73,7 @@ class Fused(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     sources: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True)
     claims: tuple[Claim, ...] = eqx.field(static=True)
+    angles: Angles = eqx.field(static=True)
 
     def init(self, n: int) -> PyTree:
         """States of the quantizers."""
@@ -93,8 +95,10 @@ class Fused(eqx.Module):
             means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
             for i, name in enumerate(self.names):
                 uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
+        means = nearest(means, means[:, :1], self.angles)
         combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
         mean, covariance = combine(self.rules, means, covariances)
+        mean = wrapped(mean, self.angles)
         each = enumerate(zip(self.names, self.claims, strict=True))
         return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in each}, uplinks
 
@@ -237,7 +241,8 @@ def _fused(
         order.append([found[node] for node in mine])
     quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
     rules = stack([item.rule for item in items])
-    return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims))
+    angles = first(network.plant).angles
+    return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
 
 
 def _centres(network: Network) -> tuple[Centre, ...]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from heliograph.examples.demo.recording import PlazaRecording
 
+CALIBRATED = "plaza2"  # the recording on which the constants of `robot` were measured
 WINDOW = 100  # range rows over which odometry drift is measured: 22.6 s and 78 m on average
 
 

@@ -87,15 +87,15 @@ def average_noise(path: AbstractRandomAffine, signals: np.ndarray) -> float:
         return float(second_order(path).spread(jnp.asarray(moments), jnp.array([True]))[0, 0])
 
 
-def networks(extra_variance: float) -> Network:
+def networks(drive: robot.Drive, extra_variance: float) -> Network:
     """The example's node with one more competitor, and a node that hears the ranges without any relay."""
-    count = len(robot.BEACONS)
-    extra = cubature_filter(robot.plant, robot.sensor, hop(1.0, extra_variance, dimension=count))
-    direct = cubature_filter(robot.plant, robot.sensor, perfect(count))
-    relayed = Node(robot.sensor, robot.channel, robot.filters | {"extra_noise": extra})
-    return Network(
-        robot.plant, {"robot": relayed, "direct": Node(robot.sensor, perfect(count), {"perfect_channel": direct})}
-    )
+    network, count = robot.network_of(drive), len(drive.beacons)
+    plant, node = network.plant, network.nodes["robot"]
+    assert isinstance(node, Node)
+    extra = cubature_filter(plant, node.sensor, hop(1.0, extra_variance, dimension=count))
+    direct = cubature_filter(plant, node.sensor, perfect(count))
+    relayed = Node(node.sensor, robot.channel, node.filters | {"extra_noise": extra})
+    return Network(plant, {"robot": relayed, "direct": Node(node.sensor, perfect(count), {"perfect_channel": direct})})
 
 
 def one_trial(recording: PlazaRecording, network: Network, seed: int) -> Trial:
@@ -130,7 +130,7 @@ def score(estimate: Estimate, truth: np.ndarray) -> Score:
 def compute(recording: PlazaRecording, seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
     """Run the trials of SEEDS seeds; `advance` is told what begins."""
     extra_variance = average_noise(robot.relay, recording.ranges)
-    network, trials = networks(extra_variance), []
+    network, trials = networks(robot.DRIVES[recording.name], extra_variance), []
     for s in range(seed, seed + SEEDS):
         advance(f"relay and filters, seed {s}")
         trials.append(one_trial(recording, network, s))

@@ -23,19 +23,21 @@ NAME = "demo"
 STAGES = SEEDS + 1  # of reading and computing
 
 
-def example(out: Path, seed: int = 0) -> None:
+def example(out: Path, seed: int = 0, recording: str = "plaza2") -> None:
     """Run the demonstration, print its table, and write estimates, figures, report and summary to `out`/demo.
 
+    `recording`: the drive, "plaza1" or "plaza2".
+
     Raises:
-        ValueError: a folder that cannot be written, or one that holds something else.
+        ValueError: a folder that cannot be written, or one that holds something else, no recording of this name.
         ModuleNotFoundError: an extra of `recordings`, `report`, `tables` is not installed.
     """
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
-    find_recording()  # a missing extra is told before the work starts
+    find_recording(recording)  # a missing extra is told before the work starts
 
     def work(advance: Advance) -> Outcome:
         advance("reading the recording")
-        return compute(read_recording(), seed, advance)
+        return compute(read_recording(recording), seed, advance)
 
     target = Path(out) / NAME
     print_table(write_results(target, STAGES, work, results, ("pyarrow",)), target)
@@ -52,10 +54,10 @@ def write_data(outcome: Outcome, folder: Path) -> None:
     """Write what arrived with the odometry, and all estimates of the first seed."""
     trial, recording = outcome.trials[0], outcome.recording
     columns = {"time": recording.time}
-    columns |= dict(zip(robot.plant.inputs, recording.odometry.T, strict=True))
-    columns |= dict(zip(robot.sensor.outputs, trial.received.T, strict=True))
+    columns |= dict(zip(robot.network.inputs, recording.odometry.T, strict=True))
+    columns |= dict(zip(robot.network.nodes["robot"].outputs, trial.received.T, strict=True))
     write_table(columns, folder / "measurements.csv")
-    record = Record(recording.time, robot.plant.states, None, {}, {"robot": trial.estimates})
+    record = Record(recording.time, robot.network.states, None, {}, {"robot": trial.estimates})
     write_estimates(record, folder / "estimates.parquet")
 
 
@@ -65,7 +67,8 @@ def summary(outcome: Outcome) -> dict[str, Json]:
     trials = outcome.trials
     spread = {q: {n: [getattr(t.scores[n], q) for t in trials] for n in NAMES} for q in quantities}
     top: dict[str, Json] = {q: {n: values[0] for n, values in by_name.items()} for q, by_name in spread.items()}
-    start: dict[str, Json] = {"recording": "Plaza2", "rows": len(outcome.recording.time), "seed": trials[0].seed}
+    drive = outcome.recording
+    start: dict[str, Json] = {"recording": drive.name.capitalize(), "rows": len(drive.time), "seed": trials[0].seed}
     return {**start, **top, "seeds": {"seed": [t.seed for t in trials], **spread}}
 
 

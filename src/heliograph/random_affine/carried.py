@@ -1,0 +1,65 @@
+"""Which of the numbers that a channel delivers are angles: an angle must come through as it is, or it is none."""
+
+import numpy as np
+
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import is_traced
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import Modes, OneStepLate
+
+ROUNDING = 1e-12  # of a gain of 1 that was computed
+
+
+def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
+    """Which outputs are angles, where those sent are: noise and losses that are told leave an angle one.
+
+    Raises:
+        ValueError: an angle that meets any gain but 1, or something else that is added.
+    """
+    if not sent:
+        return ()
+    match channel:
+        case GainAndNoise():
+            return _through(channel, sent)
+        case Series():
+            for part in channel.maps:
+                sent = carried(part, sent)
+            return sent
+        case Stack():
+            starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
+            each = zip(starts, channel.maps, strict=False)
+            return tuple(int(start) + i for start, part in each for i in carried(part, sent))
+        case Erasure() | OneStepLate():
+            return carried(channel.base, sent)
+        case Mixture() | Modes():
+            found = {carried(part, sent) for part in channel.maps}
+            if len(found) == 1:
+                return found.pop()
+    raise _refused(type(channel).__name__)
+
+
+def _through(channel: GainAndNoise, sent: Angles) -> Angles:
+    matrix = channel.matrix
+    if is_traced(matrix):
+        raise _refused("a gain that is traced")
+    of_angles = np.asarray(matrix)[:, list(sent)]
+    touched = np.flatnonzero(np.any(of_angles != 0, axis=1))
+    if not touched.size:
+        return ()
+    if not isinstance(channel.law, Constant) or is_traced(channel.law.value):
+        raise _refused(f"a gain that is {type(channel.law).__name__}")
+    rows = float(channel.law.value) * np.asarray(matrix)[touched]
+    whole = np.abs(rows - np.round(rows)) <= ROUNDING
+    if not np.all(whole & (np.round(rows) >= 0)) or np.any(np.round(rows).sum(axis=1) != 1):
+        raise _refused(f"the gains {rows[rows != 0].tolist()}")
+    return tuple(int(i) for i in touched)
+
+
+def _refused(got: str) -> ValueError:
+    expected = "gain 1 on circular outputs (behind any other, send sine and cosine, which are no angles)"
+    return fail("channel", expected, got)
