@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retained import AbstractRetained, with_surprise
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
@@ -95,6 +95,10 @@ class AbstractFilter(eqx.Module):
         """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
         return self
 
+    def with_past(self, steps: AbstractRetained) -> "AbstractFilter":
+        """A planned filter that can be smoothed: `steps` retained by the filter that it was planned from, over time."""
+        return self
+
     @property
     def horizon(self) -> int | None:
         """Number of steps that it covers; None if it may go on for ever."""
@@ -112,8 +116,8 @@ def _step_retained(
     item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, AbstractRetained]:
     prior = item.predict(state, u, k)
-    after, _ = item.correct(prior, z, k)
-    return after, item.retain(state, prior, after, z, u, k)
+    after, heard = item.correct(prior, z, k)
+    return after, with_surprise(item.retain(state, prior, after, z, u, k), heard)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:

@@ -119,6 +119,10 @@ class PolynomialFilter(AbstractFilter):
         """The inner filter planned."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
+    def with_past(self, steps: AbstractRetained) -> AbstractFilter:
+        """The inner filter with what the steps retained."""
+        return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
+
 
 def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)

@@ -5,17 +5,19 @@ A sweep starts at the last step with `end`, passes each step with `back`, and re
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.small_matrix import (
     congruence,
     runs_last,
+    squared_distance,
     symmetric,
     times,
     times_vector,
@@ -51,7 +53,8 @@ class AbstractRetained(eqx.Module):
     """A step as a sweep back needs it: the estimate after it, of the filter's own state of N numbers.
 
     The plant's state is want y + shift of the filter's state y, y itself without them. claim: of estimates given later
-    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run.
+    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run. surprise: e' S^-1 e of the
+    step's innovation, expected to be `heard`, the number of components that arrived.
 
     Shapes: mean (N,), covariance (N, N), want (n, N), shift (n,).
     """
@@ -60,6 +63,8 @@ class AbstractRetained(eqx.Module):
     covariance: eqx.AbstractVar[Float[jax.Array, "*time N N"]]
     want: eqx.AbstractVar[Float[jax.Array, "*time n N"] | None]
     shift: eqx.AbstractVar[Float[jax.Array, "*time n"] | None]
+    surprise: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
+    heard: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
     claim: eqx.AbstractVar[Claim]
 
     def end(self) -> PyTree:
@@ -83,6 +88,10 @@ class AbstractRetained(eqx.Module):
         n = self.mean.shape[-1]
         return Point(self.mean, self.covariance, self._link(n))
 
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractRetained":
+        """The same step of other data that arrived in the same places: only means and innovation are others."""
+        raise NotImplementedError
+
     def _link(self, n: int) -> jax.Array:
         raise NotImplementedError
 
@@ -90,7 +99,7 @@ class AbstractRetained(eqx.Module):
         """The plant's state from the filter's."""
         mean, covariance = found.mean, found.covariance
         if self.want is not None:
-            mean, covariance = _wanted(self.want, mean, covariance)
+            mean, covariance = _product(self.want, mean), _congruence(self.want, covariance)
         return Estimate(mean if self.shift is None else mean + self.shift, covariance, self.claim)
 
 
@@ -110,9 +119,11 @@ class RetainedLinear(AbstractRetained):
     weigh: Float[jax.Array, "*time N m"]
     known: Float[jax.Array, "*time N N"]
     innovation: Float[jax.Array, "*time m"]
+    claim: Claim = eqx.field(static=True)
     want: Float[jax.Array, "*time n N"] | None
     shift: Float[jax.Array, "*time n"] | None
-    claim: Claim = eqx.field(static=True)
+    surprise: Float[jax.Array, "*time"] | None
+    heard: Float[jax.Array, "*time"] | None
 
     def end(self) -> Adjoint:
         """Nothing is later."""
@@ -135,6 +146,10 @@ class RetainedLinear(AbstractRetained):
         news = _product(moved, _product(self.weigh, self.innovation))
         return Point(point.mean + news, _less(point.covariance, moved, self.known), _right(moved, self.keep))
 
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
+        """Mean and innovation."""
+        return replace(self, mean=mean, innovation=innovation)
+
     def _link(self, n: int) -> jax.Array:
         return self.covariance
 
@@ -152,9 +167,11 @@ class RetainedMoments(AbstractRetained):
     prior_mean: Float[jax.Array, "*time N"]
     prior_covariance: Float[jax.Array, "*time N N"]
     cross: Float[jax.Array, "*time N N"]
+    claim: Claim = eqx.field(static=True)
     want: Float[jax.Array, "*time n N"] | None
     shift: Float[jax.Array, "*time n"] | None
-    claim: Claim = eqx.field(static=True)
+    surprise: Float[jax.Array, "*time"] | None
+    heard: Float[jax.Array, "*time"] | None
 
     def end(self) -> Moments:
         """The filter's own."""
@@ -175,6 +192,10 @@ class RetainedMoments(AbstractRetained):
         gain = _product_of(point.link, self._gain())
         news = _product(gain, self.mean - self.prior_mean)
         return Point(point.mean + news, _less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
+        """Both means."""
+        return replace(self, mean=mean, prior_mean=prior_mean)
 
     def _link(self, n: int) -> jax.Array:
         return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
@@ -219,8 +240,23 @@ def _right(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 @runs_last
-def _wanted(want: jax.Array, mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
-    return times_vector(want, mean), congruence(want, covariance)
+def _congruence(a: jax.Array, p: jax.Array) -> jax.Array:
+    return congruence(a, p)
+
+
+def with_surprise(step: AbstractRetained, heard: Innovation) -> AbstractRetained:
+    """The step with how much its innovation surprised the filter, in units of what it believes."""
+    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
+    present = ~jnp.isnan(value)
+    both = present[:, None] & present
+    total = jnp.where(both, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
+    surprise = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
+    return replace(step, surprise=surprise, heard=jnp.sum(present).astype(surprise.dtype))
+
+
+@runs_last
+def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
+    return squared_distance(a, x)
 
 
 class HasMoments(Protocol):
@@ -243,9 +279,11 @@ def moments_retained(after: HasMoments, prior: HasMoments, cross: Array, claim: 
         prior_mean=jnp.asarray(prior.mean),
         prior_covariance=jnp.asarray(prior.covariance),
         cross=jnp.asarray(cross),
+        claim=claim,
         want=None,
         shift=None,
-        claim=claim,
+        surprise=None,
+        heard=None,
     )
 
 
@@ -278,7 +316,9 @@ def linear_retained(
         weigh=weigh,
         known=(known + known.T) / 2,
         innovation=jnp.where(present, innovation, 0.0),
+        claim=claim,
         want=None if want is None else jnp.asarray(want),
         shift=None,
-        claim=claim,
+        surprise=None,
+        heard=None,
     )

@@ -10,6 +10,7 @@ from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.sweep import carried_ahead, swept, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -19,23 +20,36 @@ class AbstractSmoothing(eqx.Module):
     """Which states are estimated from which later data, given what a filter retained of a run."""
 
     def estimates(self, steps: AbstractRetained) -> Estimate:
-        """From steps stacked along time: estimates along time, with the claim that is left."""
+        """From steps stacked along time: estimates along time, with the claim that is left.
+
+        Warns where the filter's innovations say that it is not consistent: later data then make estimates worse.
+        """
+        warn_of("smoothing", np.asarray(surprise_sums(steps)))
+        return _swept(self, steps)
+
+    def sweep(self, steps: AbstractRetained) -> Estimate:
+        """The estimates, as `estimates`, of one run inside a compiled computation."""
         raise NotImplementedError
 
     def about(self, values: A) -> A:
-        """Of something along time, such as the true state or the time itself, what the estimates are about."""
+        """Of something along time (..., time, n), such as the true state, what the estimates are about."""
         return values
 
     def check(self, horizon: int) -> None:
         """Raise ValueError if a run of so many steps has no such estimate."""
 
 
+@compiled
+def _swept(smoothing: AbstractSmoothing, steps: AbstractRetained) -> Estimate:
+    return smoothing.sweep(steps)
+
+
 class FixedInterval(AbstractSmoothing):
     """Every state given all data of the run."""
 
-    def estimates(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractRetained) -> Estimate:
         """(time, ...)."""
-        return _interval(steps)
+        return swept(steps)
 
 
 class FixedLag(AbstractSmoothing):
@@ -50,9 +64,9 @@ class FixedLag(AbstractSmoothing):
     def __init__(self, lag: int):
         self.lag = check_count("lag", lag, 0)
 
-    def estimates(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractRetained) -> Estimate:
         """(time, ...)."""
-        return _lag(steps, self)
+        return swept_over_lag(steps, self.lag)
 
 
 class FixedPoint(AbstractSmoothing):
@@ -67,9 +81,9 @@ class FixedPoint(AbstractSmoothing):
     def __init__(self, step: int):
         self.step = check_count("step of a fixed point", step, 0)
 
-    def estimates(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractRetained) -> Estimate:
         """(time from that step on, ...)."""
-        return _point(steps, self)
+        return carried_ahead(steps, self.step)
 
     def about(self, values: A) -> A:
         """That step's, as often as there are estimates of it."""
@@ -80,18 +94,3 @@ class FixedPoint(AbstractSmoothing):
         """One of the run's steps."""
         if self.step >= horizon:
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
-
-
-@compiled
-def _interval(steps: AbstractRetained) -> Estimate:
-    return swept(steps)
-
-
-@compiled
-def _lag(steps: AbstractRetained, smoothing: FixedLag) -> Estimate:
-    return swept_over_lag(steps, smoothing.lag)
-
-
-@compiled
-def _point(steps: AbstractRetained, smoothing: FixedPoint) -> Estimate:
-    return carried_ahead(steps, smoothing.step)

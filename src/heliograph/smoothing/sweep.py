@@ -32,7 +32,8 @@ def retained_steps(
     Raises:
         ValueError: arrays that are not the filter's, a filter that cannot be smoothed.
     """
-    z = array("measurements", measurements, (None, filter.received), missing=True)
+    z = array("measurements", measurements, (None, filter.received or None), missing=True)
+    z = z if filter.received else z[:, :0]
     u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
     return _retained_steps(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
 
@@ -46,6 +47,16 @@ def _retained_steps(
 
     rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
+
+
+def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
+    """The filter planned for these inputs and complete data, with all that a sweep back needs and no data change."""
+    planned = item.planned(inputs)
+    if planned is item:
+        return item
+    start = jax.tree.map(jnp.asarray, item.init())
+    quiet = jnp.zeros((len(inputs), item.received))
+    return planned.with_past(_retained_steps(item, quiet, jnp.asarray(inputs), start, jnp.asarray(0))[1])
 
 
 def swept(steps: AbstractRetained) -> Estimate:
