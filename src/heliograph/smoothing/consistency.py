@@ -11,8 +11,8 @@ from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 
 BLOCKS = 10  # parts of a run whose scatter tells how much of the surprise is chance
-DEVIATIONS = 5.0  # of the mean surprise: fewer may be chance
-EXCESS = 1.5  # times what is expected: less does little harm
+DEVIATIONS = 3.5  # of the mean surprise: fewer may be chance
+EXCESS = 1.05  # times what is expected: less does little harm
 
 
 @in_float64
@@ -40,7 +40,7 @@ def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
     ratio, error = surprise(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
         warnings.warn(
-            f"{name}: squared innovations are {ratio:.3g} times what the filter believes, so that it is not consistent "
-            "and smoothing may make its estimates worse",
+            f"{name}: squared innovations are {ratio:.3g} +- {error:.1g} times what the filter believes; of a filter "
+            "that is not consistent later data make the claims worse, and perhaps the estimates",
             stacklevel=3,
         )

@@ -59,7 +59,7 @@ class FixedLag(AbstractSmoothing):
         ValueError: a lag that is no whole number from 0.
     """
 
-    lag: int = eqx.field(static=True)
+    lag: int
 
     def __init__(self, lag: int):
         self.lag = check_count("lag", lag, 0)

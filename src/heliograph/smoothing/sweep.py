@@ -11,7 +11,7 @@ from heliograph.filters.retained import AbstractRetained, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
 
 T = TypeVar("T")
 
@@ -74,24 +74,23 @@ def swept(steps: AbstractRetained) -> Estimate:
     return _told(steps, later)
 
 
-def swept_over_lag(steps: AbstractRetained, lag: int) -> Estimate:
+def swept_over_lag(steps: AbstractRetained, lag: int | Int[Array, ""]) -> Estimate:
     """Each step's state given the data of up to `lag` later steps: as many short sweeps, side by side."""
     last = len(steps.mean) - 1
     each = jnp.arange(last + 1)
-    later = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(each + lag, last)))
+    newest = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(each + lag, last)))
 
-    def body(later: PyTree, ahead: jax.Array) -> tuple[PyTree, None]:
-        """From after step each + ahead to after the one before it, unless the data end before."""
-        place = jnp.minimum(each + ahead, last)
+    def body(done: jax.Array, later: PyTree) -> PyTree:
+        """From after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
+        ahead = each + lag - done
+        place = jnp.minimum(ahead, last)
         before = jnp.maximum(place - 1, 0)
         earlier = jax.vmap(lambda step, *rest: step.back(*rest))(
             rows_of(steps, place), later, steps.mean[before], steps.covariance[before]
         )
-        there = each + ahead <= last
-        return jax.tree.map(lambda a, b: jnp.where(_column(there, a), a, b), earlier, later), None
+        return jax.tree.map(lambda a, b: jnp.where(_column(ahead <= last, a), a, b), earlier, later)
 
-    later, _ = jax.lax.scan(body, later, jnp.arange(lag, 0, -1))
-    return _told(steps, later)
+    return _told(steps, jax.lax.fori_loop(0, lag, body, newest))
 
 
 def carried_ahead(steps: AbstractRetained, step: int) -> Estimate:
