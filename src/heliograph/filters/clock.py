@@ -15,7 +15,7 @@ from heliograph.filters.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import at
+from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest, wrapped

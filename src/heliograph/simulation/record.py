@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
 from heliograph.numerics.readable import readable
 from heliograph.simulation.frames import record_frame, record_of_frame
@@ -60,6 +60,7 @@ class Record:
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
     (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
     time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
+    smoothed: the same of estimates given later data too, where these were asked for: a record of its own to save.
     """
 
     time: np.ndarray
@@ -69,6 +70,7 @@ class Record:
     estimates: dict[str, dict[str, Estimate]]
     uplinks: dict[str, Uplink] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
+    smoothed: "Record | None" = None
 
     @property
     def runs(self) -> int | None:
@@ -83,7 +85,8 @@ class Record:
         Raises:
             ValueError: a name that is no state.
         """
-        return replace(self, units=checked_units(units, self.states))
+        smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
+        return replace(self, units=checked_units(units, self.states), smoothed=smoothed)
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
@@ -247,6 +250,14 @@ class AbstractReducer(eqx.Module, Generic[Result]):
         """Make the result; collected parts are joined along the run axis, without padding."""
         raise NotImplementedError
 
+    def beside(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
+        """The result with the one made of smoothed estimates, whose claims these are, beside it.
+
+        Raises:
+            ValueError: a reducer that keeps nothing of smoothed estimates.
+        """
+        raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
+
 
 class Trajectories(AbstractReducer[Record]):
     """Keep everything; memory grows with the number of runs."""
@@ -263,6 +274,15 @@ class Trajectories(AbstractReducer[Record]):
         """Make the record; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
+
+    def beside(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
+        """As `Record.smoothed`, for the last steps if there are fewer."""
+        estimates = {
+            node: {name: replace(found, claim=claims[node][name]) for name, found in filters.items()}
+            for node, filters in smoothed.estimates.items()
+        }
+        time = result.time[-len(smoothed.time) :]
+        return replace(result, smoothed=replace(smoothed, time=time, estimates=estimates))
 
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:

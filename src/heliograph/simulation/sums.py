@@ -35,7 +35,12 @@ if TYPE_CHECKING:  # extras
 
 @readable
 class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
-    """Statistics by node and filter; fused ones under "fused". They know the states' names, and units if given."""
+    """Statistics by node and filter; fused ones under "fused". They know the states' names, and units if given.
+
+    smoothed: of estimates given later data too, where these were asked for: statistics of their own to save.
+    """
+
+    smoothed: "StatisticsByName | None" = None
 
     def __init__(
         self,
@@ -52,7 +57,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
         Raises:
             ValueError: a name that is no state.
         """
-        return StatisticsByName(self, self.states, checked_units(units, self.states))
+        result = StatisticsByName(self, self.states, checked_units(units, self.states))
+        result.smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
+        return result
 
     def to_xarray(self) -> "xr.Dataset":
         """Labelled arrays: RMSE, claimed deviation and NEES over time, and the sums that they are made from.
@@ -220,6 +227,17 @@ class Statistics(AbstractReducer[StatisticsByName]):
             fused = result[FUSED][name]
             means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
             result[FUSED][name] = replace(fused, uplink=means)
+        return result
+
+    def beside(
+        self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
+    ) -> StatisticsByName:
+        """As `StatisticsByName.smoothed`."""
+        found = {
+            node: {name: replace(one, claim=claims[node][name]) for name, one in filters.items()}
+            for node, filters in smoothed.items()
+        }
+        result.smoothed = StatisticsByName(found, smoothed.states)
         return result
 
 
