@@ -22,6 +22,7 @@ ORDER = [
     ["filters"],
     ["fusion"],
     ["simulation"],
+    ["live"],
     ["testing"],
     ["files"],
     ["report"],
