@@ -7,6 +7,7 @@ from . import (
     relays as relays,
     h_infinity as h_infinity,
     filters as filters,
+    smoothing as smoothing,
     fusion as fusion,
     simulation as simulation,
     campaign as campaign,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.retained import AbstractRetained, with_surprise
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
@@ -65,12 +66,37 @@ class AbstractFilter(eqx.Module):
         z, u = measured(self, z), given(self, u)
         return _step(self, state, z, u, step_number(self, k))
 
+    def step_retained(
+        self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
+    ) -> tuple[PyTree, AbstractRetained]:
+        """As `step`, with what a sweep back over it needs in place of the estimate.
+
+        Raises:
+            ValueError: what `step` refuses; a filter that cannot be smoothed.
+        """
+        z, u = measured(self, z), given(self, u)
+        return _step_retained(self, state, z, u, step_number(self, k))
+
+    def retain(
+        self, before: PyTree, prior: PyTree, after: PyTree, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """What a sweep back over step k needs, from the states before it, after `predict`, and after `correct`.
+
+        Raises:
+            ValueError: a filter that keeps no covariance of its own, or does not say how its state moves.
+        """
+        raise fail("smoothing", "a filter that keeps its covariance and says how its state moves", type(self).__name__)
+
     def after_step(self, state: PyTree, k: Step) -> Estimate:
         """`estimate(state)` after the correction of step k, for a filter that looks its covariance up by the step."""
         return self.estimate(state)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> "AbstractFilter":
         """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
+        return self
+
+    def with_past(self, steps: AbstractRetained) -> "AbstractFilter":
+        """A planned filter that can be smoothed: `steps` retained by the filter that it was planned from, over time."""
         return self
 
     @property
@@ -83,6 +109,15 @@ class AbstractFilter(eqx.Module):
 def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     after, _ = item.correct(item.predict(state, u, k), z, k)
     return after, item.after_step(after, k)
+
+
+@compiled
+def _step_retained(
+    item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
+) -> tuple[PyTree, AbstractRetained]:
+    prior = item.predict(state, u, k)
+    after, heard = item.correct(prior, z, k)
+    return after, with_surprise(item.retain(state, prior, after, z, u, k), heard)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:

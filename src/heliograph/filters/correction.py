@@ -74,13 +74,26 @@ def young_correction(
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
-        return gain_and_bound(prior, cross, channel.spread.middle(w, present) + absent(present) + mean_part)
+        return gain_and_bound(prior, cross, _of_known_gain(channel, w, present) + mean_part)
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
     beta = smallest_scalars(young_sweep, scalars, (base, shift, mean_part, power, trace(prior)))
     gain, bound = gain_and_bound(prior, cross, young_omega(beta, base, shift, mean_part))
     return gain, bound + beta[0] * prior
+
+
+@runs_last
+def known_gain_covariance(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
+    """Omega of a channel whose mean gain is known: the covariance of z, or what dominates it, that gives the gain."""
+    both = present[:, None] & present[None, :]
+    mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
+    return _of_known_gain(channel, homogeneous(signal.second, signal.mean, 1.0), present) + mean_part
+
+
+def _of_known_gain(channel: SecondOrder, w: jax.Array, present: jax.Array) -> jax.Array:
+    spread = channel.spread(w, present) if channel.uncertain else channel.spread.middle(w, present)
+    return spread + absent(present)
 
 
 @runs_last

@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import Signal
+from heliograph.filters.correction import Signal, known_gain_covariance
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
-from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
+from heliograph.filters.retained import AbstractRetained, linear_retained, moments_retained
+from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, Transformed, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.channel import Channel, check_link, mean_gain
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -68,7 +69,7 @@ class GaussianFilter(AbstractFilter):
     @predicts
     def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
         """Mean and covariance of f(x, u) + w."""
-        return predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))
+        return Belief(*predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))[:2])
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
@@ -81,18 +82,37 @@ class GaussianFilter(AbstractFilter):
         """The belief."""
         return Estimate(state.mean, state.covariance, self.claim)
 
+    def retain(
+        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The update itself where it is linear, else the moments around it."""
+        plant, sensor, channel, z = at(self.plant, k), at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        if not self.linear:
+            cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
+            return moments_retained(after, prior, cross, "nominal")
+        y = signal_of(sensor, self.transform, prior)
+        return linear_retained(
+            after,
+            prior,
+            plant.matrix,
+            channel.mean_gain @ sensor.matrix,
+            z - channel.mean_gain @ y.mean - channel.offset,
+            known_gain_covariance(y, channel, ~jnp.isnan(z)),
+            self.claim,
+        )
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
 
 
-def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Belief:
-    """Mean and covariance of f(x, u) + w."""
+def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
+    """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
     if isinstance(plant, LinearPlant):
         moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
     else:
         moved = transform.apply(lambda x: plant.transition(x, u), *state)
-    return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
+    return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)
 
 
 def signal_of(sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, describe
+from heliograph.filters.correction import Signal, known_gain_covariance
+from heliograph.filters.gaussian import Belief, describe, predicted
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.modal import ModalFilter, modal_filter
 from heliograph.filters.plan import plan
+from heliograph.filters.retained import AbstractRetained, linear_retained, moments_retained
 from heliograph.filters.told import ToldFilter, told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.uncertain import UncertainModalFilter, uncertain_modal_filter
@@ -28,7 +29,7 @@ from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.second_moments import SecondOrder
+from heliograph.random_affine.second_moments import SecondOrder, has_known_mean
 
 
 class LinearBelief(NamedTuple):
@@ -47,6 +48,9 @@ class LinearFilter(AbstractFilter):
     instead of being read off the estimate. Then the claim is exact; where probabilities are uncertain, an upper bound.
     The innovation has the nominal law's covariance; it is not Gaussian, so its Gaussian likelihood is nominal.
 
+    `mean_known`: E[G] is. Given later data too the claim is then the filter's: with the gains fixed, what dominates
+    each step's noise dominates the error. With E[G] uncertain nothing is proved of it, and it is nominal.
+
     Source: De Koning, Optimal estimation of linear discrete-time systems with stochastic parameters (1984).
     """
 
@@ -54,6 +58,7 @@ class LinearFilter(AbstractFilter):
     sensor: AnySensor
     channel: SecondOrder | OverTime
     update: Polytope
+    mean_known: bool = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -98,6 +103,27 @@ class LinearFilter(AbstractFilter):
     def estimate(self, state: LinearBelief) -> Estimate:
         """The estimate's mean and covariance."""
         return Estimate(state.mean, state.covariance, self.claim)
+
+    def retain(
+        self, before: LinearBelief, prior: LinearBelief, after: LinearBelief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The update itself, or the moments around it where E[G] is uncertain."""
+        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        transition = jnp.asarray(at(self.plant, k).matrix)
+        if not self.mean_known:
+            cross = before.covariance @ transition.T
+            return moments_retained(after, prior, cross, "nominal")
+        y = signal(prior, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+        expected = channel.mean_gain @ (sensor.matrix @ prior.mean + sensor.noise.mean) + channel.offset
+        return linear_retained(
+            after,
+            prior,
+            transition,
+            channel.mean_gain @ sensor.matrix,
+            z - expected,
+            known_gain_covariance(y, channel, ~jnp.isnan(z)),
+            self.claim,
+        )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
@@ -167,14 +193,15 @@ def linear_filter(
         return modal_filter(plant, sensor, channel)
     rule = Polytope() if update is None else update
     described = describe(channel, rule)
-    uncertain = described.values.uncertain if isinstance(described, OverTime) else described.uncertain
+    whole = described.values if isinstance(described, OverTime) else described
     start = first(plant)
     return LinearFilter(
         plant=plant,
         sensor=sensor,
         channel=described,
         update=rule,
-        claim="upper" if uncertain else "exact",
+        mean_known=not whole.uncertain or has_known_mean(whole),
+        claim="upper" if whole.uncertain else "exact",
         states=start.states,
         inputs=start.inputs,
         received=first(channel).outputs,
@@ -231,6 +258,13 @@ class OpenLoop(AbstractFilter):
     def estimate(self, state: Belief) -> Estimate:
         """The prediction."""
         return Estimate(state.mean, state.covariance, self.claim)
+
+    def retain(
+        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The prediction, of which nothing more is ever heard."""
+        cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
+        return moments_retained(after, prior, cross, self.claim)
 
 
 def open_loop_filter(

@@ -10,6 +10,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.innovation import log_density, mixed_innovation
+from heliograph.filters.retained import AbstractRetained, moments_retained
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -128,6 +129,13 @@ class MixtureFilter(AbstractFilter):
     def estimate(self, state: MixtureBelief) -> Estimate:
         """The belief."""
         return Estimate(state.mean, state.covariance, self.claim)
+
+    def retain(
+        self, before: MixtureBelief, prior: MixtureBelief, after: MixtureBelief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The moments around the update."""
+        cross = before.covariance @ at(self.plant, k).matrix.T
+        return moments_retained(after, prior, cross, "nominal")
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

@@ -16,6 +16,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import absent, gain_and_bound
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
+from heliograph.filters.retained import AbstractRetained, linear_retained
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -90,16 +91,13 @@ class ModalFilter(AbstractFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        channel = at(self.channel, k)
-        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
+        step, move, noise, rows = self._moves(state, u, k)
         modes, size = len(state.moments), len(move)
-        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         carried = move @ state.moments @ move.T
         added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
         moments = jnp.einsum("ij,iab->jab", rows, carried) + added
         chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
         fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
-        step = jnp.kron(rows.T, move)
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
         return ModalBelief(step @ state.mean, covariance, moments, jnp.asarray(True))
 
@@ -109,21 +107,48 @@ class ModalFilter(AbstractFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
-        sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
-        heard = jnp.concatenate(list(gains @ measure), axis=1)
+        heard, added = self._hears(state, k)
+        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, jnp.asarray(z))
+        return state._replace(mean=mean, covariance=covariance), innovation
+
+    def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
+        """F, the plant's A~ and Q~, and the rows of the chain."""
+        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
+        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
+        return jnp.kron(rows.T, move), move, noise, rows
+
+    def _hears(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array]:
+        """What is heard of zeta, and Cov(z - E[z | zeta])."""
+        channel = at(self.channel, k)
+        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(at(self.sensor, k))
         law = state.moments[:, -1, -1]
         second = measure @ state.moments @ measure.T + law[:, None, None] * noise
         added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
         added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
-        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, z)
-        return state._replace(mean=mean, covariance=covariance), innovation
+        return jnp.concatenate(list(gains @ measure), axis=1), added
 
     @in_float64
     def estimate(self, state: ModalBelief) -> Estimate:
         """x = sum_j zeta^j."""
         want = sum_of_modes(len(self.states), len(self.initial))
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def retain(
+        self, before: ModalBelief, prior: ModalBelief, after: ModalBelief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The update of zeta itself."""
+        heard, added = self._hears(prior, k)
+        total = heard @ prior.covariance @ heard.T + added
+        return linear_retained(
+            after,
+            prior,
+            self._moves(before, u, k)[0],
+            heard,
+            jnp.asarray(z) - heard @ prior.mean,
+            total,
+            self.claim,
+            sum_of_modes(len(self.states), len(self.initial)),
+        )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""

@@ -133,7 +133,7 @@ class MultipleModelFilter(AbstractFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
-        mean, spread = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
         return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
 
     @corrects

@@ -72,7 +72,7 @@ class ParticleFilter(AbstractFilter):
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        mean, spread = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
         mode = jnp.where(state.moved, drawn, state.mode)
         return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
 

@@ -1,6 +1,7 @@
 """A linear filter computed before any data: where nothing but its mean depends on what arrives."""
 
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -43,6 +45,8 @@ class PlannedFilter(AbstractFilter):
     For the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built by
     `planned` of a filter whose gains do not depend on data.
 
+    `past`: what each step retains for a sweep back, all of it that no data change; None where nobody asks for one.
+
     Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); xhat = want m.
     """
 
@@ -54,6 +58,7 @@ class PlannedFilter(AbstractFilter):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
+    past: OverTime | None = None
 
     @in_float64
     def init(self) -> PlannedMean:
@@ -82,6 +87,20 @@ class PlannedFilter(AbstractFilter):
     def after_step(self, state: PlannedMean, k: Step) -> Estimate:
         """The same, its place taken from the step: it is then common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
+
+    def retain(
+        self, before: PlannedMean, prior: PlannedMean, after: PlannedMean, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """What was planned, with the mean and the innovation of these data."""
+        if self.past is None:
+            return super().retain(before, prior, after, z, u, k)
+        p, planned = at(self.steps, k), cast(AbstractRetained, at(self.past, k))
+        innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
+        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
+
+    def with_past(self, steps: AbstractRetained) -> AbstractFilter:
+        """With what the steps retained, whatever the data were."""
+        return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
         told = mean if self.want is None else _affine(self.want, mean, jnp.zeros(len(self.want)))

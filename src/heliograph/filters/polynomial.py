@@ -1,5 +1,6 @@
 """Filters that use powers and products of what they hear: a lift of the measurement before a linear filter."""
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.centre import Centre, centre_of, without_mean
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modal import claim_of_modes
+from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.memory import memory_system
@@ -104,9 +106,22 @@ class PolynomialFilter(AbstractFilter):
         """The inner filter's, about the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
+    def retain(
+        self, before: Centred, prior: Centred, after: Centred, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The inner filter's, on the lifted system, about the mean."""
+        z = jnp.asarray(z)
+        z = z if self.centre is None else z - at(self.centre, k).heard @ prior.mean
+        inner = prior.inner, after.inner, monomials(z, self.degree)[:-1]
+        return replace(self.inner.retain(before.inner, *inner, u, k), shift=jnp.asarray(after.mean))
+
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """The inner filter planned."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
+
+    def with_past(self, steps: AbstractRetained) -> AbstractFilter:
+        """The inner filter with what the steps retained."""
+        return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
 
 def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:

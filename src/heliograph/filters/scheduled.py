@@ -12,6 +12,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
+from heliograph.filters.retained import AbstractRetained, linear_retained
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
@@ -182,6 +183,17 @@ class LinearSystemFilter(AbstractFilter):
         """What is to be known of the belief."""
         want = jnp.asarray(self.want)
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def retain(
+        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The update itself."""
+        s: Steps = at(self.steps, k)
+        innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
+        total = s.output @ prior.covariance @ s.output.T + s.noise
+        return linear_retained(
+            after, prior, s.transition, s.output, innovation, total, self.claim, self.want, pseudo_solve
+        )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""

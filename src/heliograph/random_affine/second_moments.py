@@ -81,6 +81,12 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
     return bool(np.any(block > 0)) and not has_known_gain(channel)
 
 
+def has_known_mean(described: SecondOrder) -> bool:
+    """Whether E[G] and E[n] are the same under every possible law; with traced parameters that is not known."""
+    shift = described.shift
+    return not is_traced(shift) and not np.any(shift.center) and not np.any(shift.radius)
+
+
 def has_known_gain(channel: AbstractRandomAffine) -> bool:
     """Whether z = G y + n with one G that never varies."""
     match channel:

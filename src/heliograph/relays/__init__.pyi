@@ -19,6 +19,7 @@ from .periodic_tuning import (
 )
 from .receiver import (
     receiver_behind_relays as receiver_behind_relays,
+    receiver_system as receiver_system,
 )
 from .receiver_error import (
     receiver_error_design as receiver_error_design,

@@ -29,6 +29,18 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     Raises:
         ValueError: gains of the wrong shape, a relay without gains.
     """
+    return lmmse(receiver_system(network, gains))
+
+
+def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem:
+    """Relays with their gains as the receiver has to do with them: a linear system of (x, e_1, ..., e_relays, z).
+
+    z reads the state before the step and shares the step's noise, so it is a component. A `LinearSystemFilter` of it is
+    `receiver_behind_relays` with its covariance carried along: for data with gaps, and for smoothing.
+
+    Raises:
+        ValueError: what `receiver_behind_relays` refuses.
+    """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
@@ -48,7 +60,7 @@ def receiver_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Sched
     )
     mean, covariance = np.zeros(d + r), np.zeros((d + r, d + r))
     mean[:n], covariance[:d, :d] = network.initial()[0], start_moments(network)[:d, :d]
-    return lmmse(LinearSystem(system, mean, covariance, np.eye(n, d + r)))
+    return LinearSystem(system, mean, covariance, np.eye(n, d + r))
 
 
 def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:

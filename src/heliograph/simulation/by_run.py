@@ -63,6 +63,30 @@ def trajectories(
     return jax.tree.unflatten(jax.tree.structure(shape[1]), told)
 
 
+def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
+    """A function of one run's values for all runs: (run, ...), or (1, ...) where they share it, given and told.
+
+    A result of which no run's own value has a part is computed once.
+    """
+    leaves, tree = jax.tree.flatten(values)
+    runs = max(len(leaf) for leaf in leaves)
+    varies = [len(leaf) == runs for leaf in leaves]
+    one = [leaf[0] for leaf in leaves]
+    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*one)
+    wanted = range(len(traced.jaxpr.outvars))
+    tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in wanted])[1]) for i in wanted]
+    over = jax.vmap(
+        jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(tells), axis_size=runs
+    )  # runs last, as everywhere
+    given = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
+    told = [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(over(*given), tells, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(shape), told)
+
+
+def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
+    return any(v and u for v, u in zip(varies, used, strict=True))
+
+
 def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], Any]:
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _dependent(traced, [True])

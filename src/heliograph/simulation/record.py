@@ -1,7 +1,7 @@
 """What a run leaves behind: trajectories with their claims, or running statistics of the errors."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.fusion.rules import Fusion
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
 from heliograph.simulation.network import FUSED, Network
 
@@ -44,7 +44,8 @@ class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
-    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
+    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
+    smoothed: the same of estimates given later data too, where these were asked for.
     """
 
     time: np.ndarray
@@ -53,6 +54,7 @@ class Record:
     measurements: dict[str, np.ndarray]
     estimates: dict[str, dict[str, Estimate]]
     uplinks: dict[str, Uplink] = field(default_factory=dict)
+    smoothed: "Record | None" = None
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
@@ -124,6 +126,14 @@ class AbstractReducer(eqx.Module, Generic[Result]):
         """Make the result; collected parts are joined along the run axis, without padding."""
         raise NotImplementedError
 
+    def beside(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
+        """The result with the one made of smoothed estimates, whose claims these are, beside it.
+
+        Raises:
+            ValueError: a reducer that keeps nothing of smoothed estimates.
+        """
+        raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
+
 
 class Trajectories(AbstractReducer[Record]):
     """Keep everything; memory grows with the number of runs."""
@@ -140,6 +150,15 @@ class Trajectories(AbstractReducer[Record]):
         """Make the record; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
+
+    def beside(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
+        """As `Record.smoothed`, for the last steps if there are fewer."""
+        estimates = {
+            node: {name: replace(found, claim=claims[node][name]) for name, found in filters.items()}
+            for node, filters in smoothed.estimates.items()
+        }
+        time = result.time[-len(smoothed.time) :]
+        return replace(result, smoothed=replace(smoothed, time=time, estimates=estimates))
 
 
 def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:

@@ -21,8 +21,10 @@ from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.lanes import BLOCK, Lanes
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
+from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories
+from heliograph.simulation.smoothed import Beside, Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
+from heliograph.smoothing.modes import AbstractSmoothing
 
 Progress = Callable[[int, int], None]
 
@@ -41,6 +43,7 @@ def monte_carlo(
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
+    smooth: AbstractSmoothing | None = None,
 ) -> Record: ...
 @overload
 def monte_carlo(
@@ -54,6 +57,7 @@ def monte_carlo(
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
+    smooth: AbstractSmoothing | None = None,
 ) -> Result: ...
 
 
@@ -68,6 +72,7 @@ def monte_carlo(
     progress: Progress | None = None,
     first_run: int = 0,
     precision: Precision = "float64",
+    smooth: AbstractSmoothing | None = None,
 ) -> Record | Result:
     """Simulate the network `runs` times over `horizon` steps and run every filter on the same data.
 
@@ -80,11 +85,14 @@ def monte_carlo(
     All cores are used, and all devices where JAX sees others than a processor. `precision` "float32" simulates and
     filters in single precision, with other draws; what is kept is summed in double precision either way.
 
+    `smooth`, such as `hg.smoothing.FixedInterval()`, estimates earlier states from later data too; what is kept of
+    these estimates stands in the result's `smoothed`. Warns of filters that their own innovations contradict.
+
     Returns a `Record` for trajectories, else what the reducer makes.
 
     Raises:
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
-            that is no multiple of 32, an unknown precision.
+            that is no multiple of 32, an unknown precision, a filter or fusion that cannot be smoothed.
     """
     instance("network", network, Network, "a Network")
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
@@ -98,9 +106,13 @@ def monte_carlo(
     base = _key(key)
     if not isinstance(precision, str) or precision not in get_args(Precision):
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
-    filters = AllFilters(network)
+    part = None if smooth is None else smoothed_part(network, smooth, horizon)
+    filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
-    job = _Job(world, u, base, np.asarray(first_run + runs), reducer, precision == "float32")
+    later = part and part.smoother(filters)
+    both: Beside[Any] = Beside(reducer)
+    keeper = reducer if part is None else both
+    job = _Job(world, later, u, base, np.asarray(first_run + runs), keeper, precision == "float32")
     parts = []
     with jax.enable_x64(True):
         lanes = Lanes(
@@ -115,7 +127,8 @@ def monte_carlo(
             parts.append(jax.tree.map(lambda leaf: leaf[: done - begun], lanes.advance(start, blocks)))  # noqa: B023
             if progress is not None:
                 progress(done, runs)
-    return reducer.finish(lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts), network)
+    kept = lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
+    return reducer.finish(*kept, network) if part is None else both.finished(*kept, network, part)
 
 
 def run(
@@ -123,15 +136,18 @@ def run(
     measurements: Mapping[str, ArrayLike],
     inputs: ArrayLike | None = None,
     time: ArrayLike | None = None,
+    smooth: AbstractSmoothing | None = None,
 ) -> Record:
     """Run every filter of the network over recorded measurements.
 
     measurements: for each node an array (steps, received), NaN where a component did not arrive; what relays heard may
     be left out, and with it their own filters. inputs: (steps,
-    inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given.
+    inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given. smooth: as of
+    `monte_carlo`.
 
     Raises:
-        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
+        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
+            filter or fusion that cannot be smoothed.
     """
     instance("network", network, Network, "a Network")
     network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
@@ -145,18 +161,21 @@ def run(
     u = _check_inputs(network, inputs, steps)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
+    part = None if smooth is None else smoothed_part(network, smooth, steps)
+    filters = AllFilters(network, part and part.kinds)
     with jax.enable_x64(True):
-        found = to_numpy(_run_filters(AllFilters(network), grouped, u))
-    return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)
+        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u))
+    return found_record(network, part, found, clock)
 
 
 @large_program
-def _run_filters(filters: AllFilters, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
+def _run_filters(filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
     def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k = row
         return filters.step(states, z_k, u_k, k)
 
-    return jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z))[1]
+    found = {"measurements": z, **jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z))[1]}
+    return found if later is None else one_run(later.both, found)
 
 
 class World(eqx.Module):
@@ -182,9 +201,10 @@ class World(eqx.Module):
 
 
 class _Job(eqx.Module):
-    """What is simulated, up to which run, what is kept of it, and whether in single precision."""
+    """What is simulated and smoothed, up to which run, what is kept of it, and whether in single precision."""
 
     world: World
+    later: Smoother | None
     inputs: Any
     key: jax.Array
     stop: np.ndarray
@@ -222,10 +242,10 @@ def _all_lanes(job: _Job, blocks: Any, carries: PyTree) -> tuple[PyTree, PyTree]
 def _block(job: _Job, runs: jax.Array) -> PyTree:
     """Trajectories (run, time, ...) of one block of runs; (1, time, ...) of what all runs share."""
     if not job.single:
-        return _trajectories(job.world, job.inputs, job.key, runs)
+        return _trajectories(job.world, job.later, job.inputs, job.key, runs)
     with jax.enable_x64(False):
-        world, inputs = jax.tree.map(_single, (job.world, job.inputs))
-        found = _trajectories(world, inputs, job.key, runs)
+        world, later, inputs = jax.tree.map(_single, (job.world, job.later, job.inputs))
+        found = _trajectories(world, later, inputs, job.key, runs)
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
 
 
@@ -233,9 +253,10 @@ def _single(leaf: Any) -> Any:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _trajectories(world: World, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
+def _trajectories(world: World, later: Smoother | None, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
-    return trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
+    found = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
+    return found if later is None else later.both(found)
 
 
 def _key(key: object) -> jax.Array:

@@ -1,7 +1,9 @@
 """Filters of one kind run side by side: stacked along axes of filters and nodes, vmapped, under the scan over time."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import cast
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -11,6 +13,7 @@ from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plan import Plan, linear_step
+from heliograph.filters.retained import AbstractRetained
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
@@ -22,32 +25,52 @@ from heliograph.numerics.types import Array, Float
 from heliograph.simulation.centre import AbstractHears, Apart, Centre, CentreState, Together, described, listening
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
+from heliograph.smoothing.sweep import planned_with_past
+
+
+class Told(NamedTuple):
+    """What a filter tells of a step: its estimate, and what it retains of the step if that is asked for."""
+
+    estimate: Estimate
+    retained: AbstractRetained | None
+
+
+def _step(
+    item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, retains: bool
+) -> tuple[PyTree, Told]:
+    if not retains:
+        after, estimate = item.step(state, z, u, k)
+        return after, Told(estimate, None)
+    after, retained = item.step_retained(state, z, u, k)
+    return after, Told(item.after_step(after, k), retained)
 
 
 class Alike(eqx.Module):
     """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
 
-    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes.
+    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `retains`: each step tells what
+    a sweep back over it needs.
     """
 
     filters: AbstractFilter
     group: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
+    retains: bool = eqx.field(static=True, default=False)
 
     def init(self) -> PyTree:
         """States before the first step, (filter and node, ...)."""
         return _each(_initial, self.count * self.nodes)(self.filters)
 
-    def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Estimate]:
-        """One step of each from the nodes' measurements (node, received); estimates (filter, node, ...)."""
+    def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Told]:
+        """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...)."""
 
-        def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Estimate]:
-            return item.step(state, z, u, k)
+        def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Told]:
+            return _step(item, state, z, u, k, self.retains)
 
         both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
-        after, estimate = both(self.filters, states, jnp.tile(z, (self.count, 1)))
-        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), estimate)
+        after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)))
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
 
     def matrices(self, states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array) -> Plan:
         """Matrices of this step of filter f at each node, from the states before it; (node, ...)."""
@@ -109,7 +132,8 @@ class Fused(eqx.Module):
 class AllFilters(eqx.Module):
     """Every filter of a network: those of the nodes by kind, fusion rules, centres that know more, central filters.
 
-    `order` brings the groups' measurements, joined, into the order of the nodes.
+    `order` brings the groups' measurements, joined, into the order of the nodes. `retains`: central filters tell what a
+    sweep back needs, and those of the kinds that do.
     """
 
     alike: tuple[Alike, ...]
@@ -119,16 +143,20 @@ class AllFilters(eqx.Module):
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
     n: int = eqx.field(static=True)
+    retains: bool = eqx.field(static=True)
 
-    def __init__(self, network: Network):
+    def __init__(self, network: Network, retaining: Collection[int] | None = None):
+        """`retaining`: which kinds are to be smoothed, and the central filters with them; None if nothing is."""
+        self.retains = retaining is not None
         self.alike = tuple(
             Alike(
                 stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
                 g,
                 len(names),
                 len(network.groups[g]),
+                retaining is not None and kind in retaining,
             )
-            for g, names in network.kinds
+            for kind, (g, names) in enumerate(network.kinds)
         )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
         self.fusions, self.centres = _fusions(network), _centres(network)
@@ -155,15 +183,16 @@ class AllFilters(eqx.Module):
     ) -> tuple[PyTree, dict[str, PyTree]]:
         """One step of all filters from the measurements of each group.
 
-        Gives "estimates" by kind, (filter, node, ...), "fused" by name, and "uplinks" of what has quantizers.
+        Gives "estimates" by kind, (filter, node, ...), "fused" by name, and "uplinks" of what has quantizers; and what
+        is retained where that is asked for, "retained" by kind and "retained_centrally" by name.
         """
         own, central, sent, known = states
         results = [item.step(state, z[item.group], u, k) for item, state in zip(self.alike, own, strict=True)]
-        estimates = tuple(estimate for _, estimate in results)
+        estimates = tuple(one.estimate for _, one in results)
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
-        heard = {name: item.step(central[name], joined, u, k) for name, item in self.central.items()}
-        fused = {name: estimate for name, (_, estimate) in heard.items()}
+        heard = {name: _step(item, central[name], joined, u, k, self.retains) for name, item in self.central.items()}
+        fused = {name: one.estimate for name, (_, one) in heard.items()}
         uplinks: dict[str, PyTree] = {}
         after = []
         for item, state in zip(self.fusions, sent, strict=True):
@@ -179,7 +208,11 @@ class AllFilters(eqx.Module):
             fused |= found
         own, central = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}
         following = own, central, tuple(after), tuple(learned)
-        return following, {"estimates": estimates, "fused": fused, "uplinks": uplinks}
+        told: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks}
+        if self.retains:
+            told["retained"] = tuple(one.retained for _, one in results)
+            told["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
+        return following, told
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
@@ -190,16 +223,18 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
 
 @large_program
 def _plan(filters: AllFilters, u: jax.Array) -> AllFilters:
-    def one(item: AbstractFilter) -> AbstractFilter:
-        return item.planned(u)
+    def one(item: AbstractFilter, retains: bool) -> AbstractFilter:
+        return planned_with_past(item, u) if retains else item.planned(u)
 
     alike = tuple(
-        Alike(_each(one, item.count * item.nodes)(item.filters), item.group, item.count, item.nodes)
+        replace(item, filters=_each(partial(one, retains=item.retains), item.count * item.nodes)(item.filters))
         if filters.complete[item.group]
         else item
         for item in filters.alike
     )
-    central = {name: one(item) if all(filters.complete) else item for name, item in filters.central.items()}
+    central = {
+        name: one(item, filters.retains) if all(filters.complete) else item for name, item in filters.central.items()
+    }
     result: AllFilters = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, central))
     return result
 

@@ -1,6 +1,6 @@
 """The sums from which statistics of errors are made, run by run in bounded memory, or from kept trajectories."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
 from typing import Any
@@ -22,7 +22,9 @@ from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
 
 class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
-    """Statistics by node and filter; fused ones under "fused"."""
+    """Statistics by node and filter; fused ones under "fused". smoothed: of estimates given later data too."""
+
+    smoothed: "StatisticsByName | None" = None
 
     def failures(self) -> list[str]:
         """One line for each filter whose estimate was no number, or its covariance none, in some run, as of a record.
@@ -128,6 +130,16 @@ class Statistics(AbstractReducer[StatisticsByName]):
             fused = result[FUSED][name]
             means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
             result[FUSED][name] = replace(fused, uplink=means)
+        return result
+
+    def beside(
+        self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
+    ) -> StatisticsByName:
+        """As `StatisticsByName.smoothed`."""
+        result.smoothed = StatisticsByName(
+            (node, {name: replace(found, claim=claims[node][name]) for name, found in filters.items()})
+            for node, filters in smoothed.items()
+        )
         return result
 
 

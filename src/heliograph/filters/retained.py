@@ -1,0 +1,324 @@
+"""What a filter's step leaves behind for a sweep back, and how what later data say passes back over it.
+
+A sweep starts at the last step with `end`, passes each step with `back`, and reads the estimates given all data with
+`told`; `ahead` carries one earlier state forward instead.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple, Protocol
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.numerics.linalg import psd_solve
+from heliograph.numerics.small_matrix import (
+    congruence,
+    runs_last,
+    squared_distance,
+    symmetric,
+    times,
+    times_vector,
+    transpose,
+    with_rounding,
+)
+from heliograph.numerics.types import Array, Float, PyTree
+
+
+class Adjoint(NamedTuple):
+    """What later data say of the state after a step: given them it is x - P vector, of covariance P - P matrix P."""
+
+    vector: Float[jax.Array, "*time N"]
+    matrix: Float[jax.Array, "*time N N"]
+
+
+class Moments(NamedTuple):
+    """Mean (N,) and covariance (N, N) of the state after a step, given later data too."""
+
+    mean: Float[jax.Array, "*time N"]
+    covariance: Float[jax.Array, "*time N N"]
+
+
+class Point(NamedTuple):
+    """An earlier state x_j given the data so far: mean and covariance; `link` tells how news of x now reach it."""
+
+    mean: Float[jax.Array, " N"]
+    covariance: Float[jax.Array, "N N"]
+    link: Float[jax.Array, "N N"]
+
+
+class AbstractRetained(eqx.Module):
+    """A step as a sweep back needs it: the estimate after it, of the filter's own state of N numbers.
+
+    The plant's state is want y + shift of the filter's state y, y itself without them. claim: of estimates given later
+    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run. surprise: e' S^-1 e of the
+    step's innovation, expected to be `heard`, the number of components that arrived.
+
+    Shapes: mean (N,), covariance (N, N), want (n, N), shift (n,).
+    """
+
+    mean: eqx.AbstractVar[Float[jax.Array, "*time N"]]
+    covariance: eqx.AbstractVar[Float[jax.Array, "*time N N"]]
+    want: eqx.AbstractVar[Float[jax.Array, "*time n N"] | None]
+    shift: eqx.AbstractVar[Float[jax.Array, "*time n"] | None]
+    surprise: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
+    heard: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
+    claim: eqx.AbstractVar[Claim]
+
+    def end(self) -> PyTree:
+        """At this step, if it is the last."""
+        raise NotImplementedError
+
+    def back(self, later: PyTree, mean: jax.Array, covariance: jax.Array) -> PyTree:
+        """From after this step to before it, where the filter had this mean and covariance."""
+        raise NotImplementedError
+
+    def smoothed(self, later: PyTree) -> Moments:
+        """The filter's state after this step, given later data."""
+        raise NotImplementedError
+
+    def ahead(self, point: Point) -> Point:
+        """An earlier state given this step's data too."""
+        raise NotImplementedError
+
+    def start(self) -> Point:
+        """The state after this step as one to be carried ahead."""
+        n = self.mean.shape[-1]
+        return Point(self.mean, self.covariance, self._link(n))
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractRetained":
+        """The same step of other data that arrived in the same places: only means and innovation are others."""
+        raise NotImplementedError
+
+    def _link(self, n: int) -> jax.Array:
+        raise NotImplementedError
+
+    def told(self, found: Moments | Point) -> Estimate:
+        """The plant's state from the filter's."""
+        mean, covariance = found.mean, found.covariance
+        if self.want is not None:
+            mean, covariance = _product(self.want, mean), _congruence(self.want, covariance)
+        return Estimate(mean if self.shift is None else mean + self.shift, covariance, self.claim)
+
+
+class RetainedLinear(AbstractRetained):
+    """A linear update: y- = A y + ..., y = y- + K e, e = z - H y- - ..., K = P- H' S^-1, nothing else inverted.
+
+    transition A, keep B = I - K H, weigh H' S^-1, known H' S^-1 H, innovation e; of what did not arrive nothing.
+    lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both through A'.
+
+    Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
+    """
+
+    mean: Float[jax.Array, "*time N"]
+    covariance: Float[jax.Array, "*time N N"]
+    transition: Float[jax.Array, "*time N N"]
+    keep: Float[jax.Array, "*time N N"]
+    weigh: Float[jax.Array, "*time N m"]
+    known: Float[jax.Array, "*time N N"]
+    innovation: Float[jax.Array, "*time m"]
+    claim: Claim = eqx.field(static=True)
+    want: Float[jax.Array, "*time n N"] | None
+    shift: Float[jax.Array, "*time n"] | None
+    surprise: Float[jax.Array, "*time"] | None
+    heard: Float[jax.Array, "*time"] | None
+
+    def end(self) -> Adjoint:
+        """Nothing is later."""
+        return Adjoint(jnp.zeros_like(self.mean), jnp.zeros_like(self.covariance))
+
+    def back(self, later: Adjoint, mean: jax.Array, covariance: jax.Array) -> Adjoint:
+        """Through the update, then through the transition."""
+        vector = _vector_back(later.vector, self.transition, self.keep, self.weigh, self.innovation)
+        return Adjoint(vector, _matrix_back(later.matrix, self.transition, self.keep, self.known))
+
+    def smoothed(self, later: Adjoint) -> Moments:
+        """x - P lambda and P - P Lambda P."""
+        return Moments(
+            self.mean - _product(self.covariance, later.vector), _less(self.covariance, self.covariance, later.matrix)
+        )
+
+    def ahead(self, point: Point) -> Point:
+        """Pi- = Pi A', g = Pi- H' S^-1: x_j + g e, P_j - g H Pi-', and Pi = Pi- B'; Pi is Cov(y_j, y)."""
+        moved = _right(point.link, self.transition)
+        news = _product(moved, _product(self.weigh, self.innovation))
+        return Point(point.mean + news, _less(point.covariance, moved, self.known), _right(moved, self.keep))
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
+        """Mean and innovation."""
+        return replace(self, mean=mean, innovation=innovation)
+
+    def _link(self, n: int) -> jax.Array:
+        return self.covariance
+
+
+class RetainedMoments(AbstractRetained):
+    """Any update: mean and covariance before it too, and cross = Cov(y before the step, y after its prediction).
+
+    J = cross (P-)^+: y_s = y + J (y_s+ - y-), P_s = P + J (P_s+ - P-) J'. Exact where the covariances are.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+
+    mean: Float[jax.Array, "*time N"]
+    covariance: Float[jax.Array, "*time N N"]
+    prior_mean: Float[jax.Array, "*time N"]
+    prior_covariance: Float[jax.Array, "*time N N"]
+    cross: Float[jax.Array, "*time N N"]
+    claim: Claim = eqx.field(static=True)
+    want: Float[jax.Array, "*time n N"] | None
+    shift: Float[jax.Array, "*time n"] | None
+    surprise: Float[jax.Array, "*time"] | None
+    heard: Float[jax.Array, "*time"] | None
+
+    def end(self) -> Moments:
+        """The filter's own."""
+        return Moments(self.mean, self.covariance)
+
+    def back(self, later: Moments, mean: jax.Array, covariance: jax.Array) -> Moments:
+        """What was not expected of the state after the step, through J."""
+        gain = self._gain()
+        news = _product(gain, later.mean - self.prior_mean)
+        return Moments(mean + news, _less(covariance, gain, self.prior_covariance - later.covariance))
+
+    def smoothed(self, later: Moments) -> Moments:
+        """As it is."""
+        return later
+
+    def ahead(self, point: Point) -> Point:
+        """x_j + M (y - y-) and P_j - M (P- - P) M', M the product of all J since j."""
+        gain = _product_of(point.link, self._gain())
+        news = _product(gain, self.mean - self.prior_mean)
+        return Point(point.mean + news, _less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
+        """Both means."""
+        return replace(self, mean=mean, prior_mean=prior_mean)
+
+    def _link(self, n: int) -> jax.Array:
+        return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
+
+    def _gain(self) -> jax.Array:
+        return jnp.swapaxes(psd_solve(self.prior_covariance, jnp.swapaxes(self.cross, -1, -2)), -1, -2)
+
+
+@runs_last
+def _vector_back(
+    vector: jax.Array, transition: jax.Array, keep: jax.Array, weigh: jax.Array, innovation: jax.Array
+) -> jax.Array:
+    before = times_vector(transpose(keep), vector) - times_vector(weigh, innovation)
+    return times_vector(transpose(transition), before)
+
+
+@runs_last
+def _matrix_back(matrix: jax.Array, transition: jax.Array, keep: jax.Array, known: jax.Array) -> jax.Array:
+    return symmetric(congruence(transpose(transition), congruence(transpose(keep), matrix) + known))
+
+
+@runs_last
+def _less(p: jax.Array, factor: jax.Array, inner: jax.Array) -> jax.Array:
+    """P - F M F', known to rounding of P alone, which is added."""
+    return symmetric(with_rounding(p, len(p)) - congruence(factor, inner))
+
+
+@runs_last
+def _product(a: jax.Array, x: jax.Array) -> jax.Array:
+    return times_vector(a, x)
+
+
+@runs_last
+def _product_of(a: jax.Array, b: jax.Array) -> jax.Array:
+    return times(a, b)
+
+
+@runs_last
+def _right(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B'."""
+    return times(a, transpose(b))
+
+
+@runs_last
+def _congruence(a: jax.Array, p: jax.Array) -> jax.Array:
+    return congruence(a, p)
+
+
+def with_surprise(step: AbstractRetained, heard: Innovation) -> AbstractRetained:
+    """The step with how much its innovation surprised the filter, in units of what it believes."""
+    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
+    present = ~jnp.isnan(value)
+    both = present[:, None] & present
+    total = jnp.where(both, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
+    surprise = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
+    return replace(step, surprise=surprise, heard=jnp.sum(present).astype(surprise.dtype))
+
+
+@runs_last
+def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
+    return squared_distance(a, x)
+
+
+class HasMoments(Protocol):
+    """A state of a filter: what it says of the mean (N,) and the covariance (N, N)."""
+
+    @property
+    def mean(self) -> Float[jax.Array, " N"]:
+        """Mean."""
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """Covariance."""
+
+
+def moments_retained(after: HasMoments, prior: HasMoments, cross: Array, claim: Claim) -> RetainedMoments:
+    """From the states after and before a correction, and Cov(x before the step, x after its prediction)."""
+    return RetainedMoments(
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
+        prior_mean=jnp.asarray(prior.mean),
+        prior_covariance=jnp.asarray(prior.covariance),
+        cross=jnp.asarray(cross),
+        claim=claim,
+        want=None,
+        shift=None,
+        surprise=None,
+        heard=None,
+    )
+
+
+def linear_retained(
+    after: HasMoments,
+    prior: HasMoments,
+    transition: Array,
+    output: Array,
+    innovation: Array,
+    total: Array,
+    claim: Claim,
+    want: Array | None = None,
+    solve: Callable[[jax.Array, jax.Array], jax.Array] = psd_solve,
+) -> RetainedLinear:
+    """From the states after and before a correction, A, H, e, and the S that the gain was made for.
+
+    Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular.
+    """
+    present = ~jnp.isnan(innovation)
+    heard = jnp.where(present[:, None], output, 0.0)
+    both = present[:, None] & present
+    weigh = solve(jnp.where(both, total, jnp.diag(jnp.where(present, 0.0, 1.0))), heard).T
+    known = weigh @ heard
+    mean, covariance = jnp.asarray(after.mean), jnp.asarray(after.covariance)
+    return RetainedLinear(
+        mean=mean,
+        covariance=covariance,
+        transition=jnp.asarray(transition),
+        keep=jnp.eye(len(mean)) - prior.covariance @ known,
+        weigh=weigh,
+        known=(known + known.T) / 2,
+        innovation=jnp.where(present, innovation, 0.0),
+        claim=claim,
+        want=None if want is None else jnp.asarray(want),
+        shift=None,
+        surprise=None,
+        heard=None,
+    )

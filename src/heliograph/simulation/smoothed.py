@@ -1,0 +1,185 @@
+"""A network's estimates given later data too, from what its filters retained of each step."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.fusion.informed import AbstractInformedFusion
+from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.relays import RECEIVER
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.by_run import each_run
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
+from heliograph.simulation.stepping import AllFilters, Fused
+from heliograph.smoothing.consistency import surprise_sums, warn_of
+from heliograph.smoothing.modes import AbstractSmoothing
+
+Claims = dict[str, dict[str, Claim]]
+
+
+class Smoother(eqx.Module):
+    """What of a network's filters is smoothed, and how: `kinds` of them and `groups` of measurements, by their places.
+
+    `fusions`: of smoothed estimates at the same time.
+    """
+
+    smoothing: AbstractSmoothing
+    fusions: tuple[Fused, ...]
+    kinds: tuple[int, ...] = eqx.field(static=True)
+    groups: tuple[int, ...] = eqx.field(static=True)
+
+    def both(self, found: PyTree) -> PyTree:
+        """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
+        retained = [found["retained"][k] for k in self.kinds]
+        filtered = {name: part for name, part in found.items() if name not in ("retained", "retained_centrally")}
+        each = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
+        surprised = jax.vmap(jax.vmap(surprise_sums, in_axes=1), in_axes=1)
+        estimates = tuple(each_run(each, steps) for steps in retained)
+        fused = {name: each_run(self.smoothing.sweep, steps) for name, steps in found["retained_centrally"].items()}
+        for item in self.fusions:
+            fused |= each_run(partial(_combined, item), estimates)
+        length = jax.tree.leaves((estimates, fused))[0].shape[1]
+        smoothed = {
+            "measurements": tuple(found["measurements"][g][:, -length:] for g in self.groups),
+            "estimates": estimates,
+            "fused": fused,
+            "uplinks": {},
+        }
+        if "truth" in found:
+            smoothed["truth"] = self.smoothing.about(found["truth"])
+        surprise = tuple(each_run(surprised, steps) for steps in retained)
+        centrally = {name: each_run(surprise_sums, steps) for name, steps in found["retained_centrally"].items()}
+        return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": surprise, "fused": centrally}}
+
+
+def _combined(item: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:
+    """Fusions at each time of estimates (time, filter, node, ...)."""
+    result: dict[str, Estimate] = jax.vmap(lambda parts: item.step((), parts, jnp.asarray(0))[1])(estimates)
+    return result
+
+
+class Part(NamedTuple):
+    """The part of a network that is smoothed: places of its kinds and groups among the network's, and the claims."""
+
+    network: Network
+    smoothing: AbstractSmoothing
+    kinds: tuple[int, ...]
+    groups: tuple[int, ...]
+    claims: Claims
+
+    def smoother(self, filters: AllFilters) -> Smoother:
+        """For these filters of the whole network."""
+        return Smoother(self.smoothing, filters.fusions, self.kinds, self.groups)
+
+
+def smoothed_part(network: Network, smoothing: AbstractSmoothing, horizon: int) -> Part:
+    """What of a network is smoothed: all its estimates; where relays run schedules, the receiver's.
+
+    Raises:
+        ValueError: a filter or a fusion that cannot be smoothed, a horizon too short for the smoothing.
+    """
+    instance("smooth", smoothing, AbstractSmoothing, "one such as hg.smoothing.FixedInterval()")
+    smoothing.check(horizon)
+    part = network
+    if network.relays is not None:
+        part = Network(network.plant, {RECEIVER: network.nodes[RECEIVER]}, relays=network.relays)
+    claims: Claims = {
+        name: {f: _smoothed_claim(item) for f, item in node.filters.items()} for name, node in part.nodes.items()
+    }
+    if part.fused:
+        claims[FUSED] = {name: _fused_claim(part, name, item, claims) for name, item in part.fused.items()}
+    groups = tuple(g for g, names in enumerate(network.groups) if set(names) & set(part.names))
+    kinds = tuple(k for k, kind in enumerate(network.kinds) if kind.group in groups)
+    return Part(part, smoothing, kinds, groups, claims)
+
+
+def _smoothed_claim(item: AbstractFilter) -> Claim:
+    u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
+    with jax.enable_x64(True):
+        state = jax.tree.map(jnp.asarray, item.init())
+        _, step = eqx.filter_eval_shape(lambda one, state: one.step_retained(state, z, u, 0), item, state)
+    claim: Claim = step.claim
+    return claim
+
+
+def _fused_claim(network: Network, name: str, item: Fusion | AbstractFilter, claims: Claims) -> Claim:
+    if isinstance(item, AbstractFilter):
+        return _smoothed_claim(item)
+    if isinstance(item.rule, AbstractInformedFusion):
+        got = f"{type(item.rule).__name__}, which knows errors as they are before later data"
+        raise fail(f"smoothing of {FUSED}/{name}", "a rule that needs no joint covariance", got)
+    if item.quantizer is not None:
+        raise fail(f"smoothing of {FUSED}/{name}", "estimates that arrive as they are", "a quantizer")
+    return item.claim([claims[node][item.filter] for node in network.nodes_with(item.filter)])
+
+
+def _warn_of_surprise(network: Network, surprise: PyTree) -> None:
+    """Warn of filters whose innovations are larger than they believe, from sums over blocks and runs."""
+    for (group, names), sums in zip(network.kinds, surprise["estimates"], strict=True):
+        for f, name in enumerate(names):
+            for i, node in enumerate(network.groups[group]):
+                warn_of(f"{node}/{name}", np.asarray(sums[f, i]))
+    for name, sums in surprise["fused"].items():
+        warn_of(f"{FUSED}/{name}", np.asarray(sums))
+
+
+def one_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
+    """A function of runs (run, ...) for one without an axis of runs."""
+    return jax.tree.map(lambda leaf: leaf[0], function(jax.tree.map(lambda leaf: leaf[None], values)))
+
+
+def found_record(network: Network, part: Part | None, found: PyTree, time: np.ndarray) -> Record:
+    """The record of a recording, with what was smoothed beside it."""
+    if part is None:
+        return trajectories_record(network, {"truth": None, **found}, time)
+    _warn_of_surprise(part.network, found["surprise"])
+    filtered = trajectories_record(network, {"truth": None, **found["filtered"]}, time)
+    length = found["smoothed"]["measurements"][0].shape[0]
+    smoothed = trajectories_record(part.network, {"truth": None, **found["smoothed"]}, time[-length:])
+    return Trajectories().beside(filtered, smoothed, part.claims)
+
+
+class Beside(AbstractReducer[Result]):
+    """What is kept of filtered estimates, the same of smoothed ones, and sums of surprise.
+
+    A block is {"filtered", "smoothed", "surprise"}; the first two are such as the reducer takes.
+    """
+
+    reducer: AbstractReducer[Result]
+
+    def initial(self, shapes: PyTree) -> PyTree:
+        """Both carries, and no surprise."""
+        surprise = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["surprise"])
+        return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), surprise
+
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
+        """Both."""
+        filtered, smoothed, surprise = carry
+        filtered, kept = self.reducer.reduce(filtered, batch["filtered"], runs, valid)
+        smoothed, kept_later = self.reducer.reduce(smoothed, batch["smoothed"], runs, valid)
+
+        def added(total: jax.Array, part: jax.Array) -> jax.Array:
+            each = jnp.broadcast_to(part, (len(valid), *part.shape[1:]))
+            return total + jnp.sum(jnp.where(valid.reshape(-1, *[1] * (each.ndim - 1)), each, 0.0), axis=0)
+
+        surprise = jax.tree.map(added, surprise, batch["surprise"])
+        return (filtered, smoothed, surprise), (kept, kept_later)
+
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
+        """The filtered one alone; `finished` makes both."""
+        return self.reducer.finish(carry[0], collected[0], network)
+
+    def finished(self, carry: PyTree, collected: PyTree, network: Network, part: Part) -> Result:
+        """The result of the network with that of its smoothed part beside it; warns of filters not worth smoothing."""
+        _warn_of_surprise(part.network, carry[2])
+        smoothed = self.reducer.finish(carry[1], collected[1], part.network)
+        return self.reducer.beside(self.finish(carry, collected, network), smoothed, part.claims)

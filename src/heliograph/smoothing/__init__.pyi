@@ -1,0 +1,11 @@
+"""Public names of the room; the package loads them when first used."""
+
+from .modes import (
+    AbstractSmoothing as AbstractSmoothing,
+    FixedInterval as FixedInterval,
+    FixedLag as FixedLag,
+    FixedPoint as FixedPoint,
+)
+from .sweep import (
+    retained_steps as retained_steps,
+)

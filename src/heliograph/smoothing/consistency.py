@@ -1,0 +1,46 @@
+"""Whether a filter is consistent, by its own innovations: smoothing one that is not makes it worse."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.retained import AbstractRetained
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, Float
+
+BLOCKS = 10  # parts of a run whose scatter tells how much of the surprise is chance
+DEVIATIONS = 5.0  # of the mean surprise: fewer may be chance
+EXCESS = 1.5  # times what is expected: less does little harm
+
+
+@in_float64
+def surprise_sums(steps: AbstractRetained) -> Float[Array, "5"]:
+    """Of the blocks of one run, with surprise s = sum e' S^-1 e and h components: sums of s, h, s^2, s h, h^2."""
+    time = len(steps.mean)
+    block = np.arange(time) * min(BLOCKS, time) // time
+    if steps.surprise is None or steps.heard is None:
+        return jnp.zeros(5)
+    s, h = (jax.ops.segment_sum(part, block, min(BLOCKS, time)) for part in (steps.surprise, steps.heard))
+    return jnp.stack([jnp.sum(part) for part in (s, h, s * s, s * h, h * h)])
+
+
+def surprise(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
+    """Mean surprise of a component, 1 if the filter is consistent, and its standard error from the blocks' scatter."""
+    s, h, ss, sh, hh = (float(part) for part in sums)
+    if not h:
+        return 1.0, 0.0
+    ratio = s / h
+    return ratio, float(np.sqrt(max(ss - 2 * ratio * sh + ratio**2 * hh, 0.0))) / h
+
+
+def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
+    """Warn if a filter's innovations are larger than it believes, by more than chance."""
+    ratio, error = surprise(sums)
+    if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
+        warnings.warn(
+            f"{name}: squared innovations are {ratio:.3g} times what the filter believes, so that it is not consistent "
+            "and smoothing may make its estimates worse",
+            stacklevel=3,
+        )

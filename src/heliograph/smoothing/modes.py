@@ -1,0 +1,96 @@
+"""Which states are estimated anew, and from which data."""
+
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from heliograph.filters.retained import AbstractRetained
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.smoothing.consistency import surprise_sums, warn_of
+from heliograph.smoothing.sweep import carried_ahead, swept, swept_over_lag
+
+A = TypeVar("A", jax.Array, np.ndarray)
+
+
+class AbstractSmoothing(eqx.Module):
+    """Which states are estimated from which later data, given what a filter retained of a run."""
+
+    def estimates(self, steps: AbstractRetained) -> Estimate:
+        """From steps stacked along time: estimates along time, with the claim that is left.
+
+        Warns where the filter's innovations say that it is not consistent: later data then make estimates worse.
+        """
+        warn_of("smoothing", np.asarray(surprise_sums(steps)))
+        return _swept(self, steps)
+
+    def sweep(self, steps: AbstractRetained) -> Estimate:
+        """The estimates, as `estimates`, of one run inside a compiled computation."""
+        raise NotImplementedError
+
+    def about(self, values: A) -> A:
+        """Of something along time (..., time, n), such as the true state, what the estimates are about."""
+        return values
+
+    def check(self, horizon: int) -> None:
+        """Raise ValueError if a run of so many steps has no such estimate."""
+
+
+@compiled
+def _swept(smoothing: AbstractSmoothing, steps: AbstractRetained) -> Estimate:
+    return smoothing.sweep(steps)
+
+
+class FixedInterval(AbstractSmoothing):
+    """Every state given all data of the run."""
+
+    def sweep(self, steps: AbstractRetained) -> Estimate:
+        """(time, ...)."""
+        return swept(steps)
+
+
+class FixedLag(AbstractSmoothing):
+    """Every state given the data of up to `lag` later steps; at the end of a run there are fewer.
+
+    Raises:
+        ValueError: a lag that is no whole number from 0.
+    """
+
+    lag: int = eqx.field(static=True)
+
+    def __init__(self, lag: int):
+        self.lag = check_count("lag", lag, 0)
+
+    def sweep(self, steps: AbstractRetained) -> Estimate:
+        """(time, ...)."""
+        return swept_over_lag(steps, self.lag)
+
+
+class FixedPoint(AbstractSmoothing):
+    """The state after one step, counted from 0, given the data up to it and then up to each later step.
+
+    Raises:
+        ValueError: a step that is no whole number from 0.
+    """
+
+    step: int = eqx.field(static=True)
+
+    def __init__(self, step: int):
+        self.step = check_count("step of a fixed point", step, 0)
+
+    def sweep(self, steps: AbstractRetained) -> Estimate:
+        """(time from that step on, ...)."""
+        return carried_ahead(steps, self.step)
+
+    def about(self, values: A) -> A:
+        """That step's, as often as there are estimates of it."""
+        result: A = values[..., [self.step] * (values.shape[-2] - self.step), :]
+        return result
+
+    def check(self, horizon: int) -> None:
+        """One of the run's steps."""
+        if self.step >= horizon:
+            raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)

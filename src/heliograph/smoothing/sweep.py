@@ -1,0 +1,130 @@
+"""Sweeps over what a filter retained of one run: back from its end, back over a lag, or ahead with one state."""
+
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.retained import AbstractRetained, Moments, Point
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import array
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+
+T = TypeVar("T")
+
+
+def retained_steps(
+    filter: AbstractFilter,
+    measurements: ArrayLike,
+    inputs: ArrayLike | None = None,
+    state: PyTree | None = None,
+    first_step: int = 0,
+) -> tuple[PyTree, AbstractRetained]:
+    """Step a filter over rows of data: its state after them, and what it retained of each, stacked along time.
+
+    From `state`, the filter's start unless given, at the step number `first_step`.
+
+    Shapes: measurements (steps, received), NaN for what did not arrive; inputs (steps, inputs).
+
+    Raises:
+        ValueError: arrays that are not the filter's, a filter that cannot be smoothed.
+    """
+    z = array("measurements", measurements, (None, filter.received or None), missing=True)
+    z = z if filter.received else z[:, :0]
+    u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
+    return _retained_steps(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
+
+
+@compiled
+def _retained_steps(
+    item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
+) -> tuple[PyTree, AbstractRetained]:
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractRetained]:
+        return item.step_retained(state, *row)
+
+    rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
+    return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
+
+
+def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
+    """The filter planned for these inputs and complete data, with all that a sweep back needs and no data change."""
+    planned = item.planned(inputs)
+    if planned is item:
+        return item
+    start = jax.tree.map(jnp.asarray, item.init())
+    quiet = jnp.zeros((len(inputs), item.received))
+    return planned.with_past(_retained_steps(item, quiet, jnp.asarray(inputs), start, jnp.asarray(0))[1])
+
+
+def swept(steps: AbstractRetained) -> Estimate:
+    """Each step's state given all data: one sweep back."""
+
+    def body(later: PyTree, item: tuple[AbstractRetained, jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        step, mean, covariance = item
+        earlier = step.back(later, mean, covariance)
+        return earlier, earlier
+
+    end = row(steps, -1).end()
+    rows = rows_of(steps, slice(1, None)), steps.mean[:-1], steps.covariance[:-1]
+    _, earlier = jax.lax.scan(body, end, rows, reverse=True)
+    later = jax.tree.map(lambda some, last: jnp.concatenate([some, last[None]]), earlier, end)
+    return _told(steps, later)
+
+
+def swept_over_lag(steps: AbstractRetained, lag: int) -> Estimate:
+    """Each step's state given the data of up to `lag` later steps: as many short sweeps, side by side."""
+    last = len(steps.mean) - 1
+    each = jnp.arange(last + 1)
+    later = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(each + lag, last)))
+
+    def body(later: PyTree, ahead: jax.Array) -> tuple[PyTree, None]:
+        """From after step each + ahead to after the one before it, unless the data end before."""
+        place = jnp.minimum(each + ahead, last)
+        before = jnp.maximum(place - 1, 0)
+        earlier = jax.vmap(lambda step, *rest: step.back(*rest))(
+            rows_of(steps, place), later, steps.mean[before], steps.covariance[before]
+        )
+        there = each + ahead <= last
+        return jax.tree.map(lambda a, b: jnp.where(_column(there, a), a, b), earlier, later), None
+
+    later, _ = jax.lax.scan(body, later, jnp.arange(lag, 0, -1))
+    return _told(steps, later)
+
+
+def carried_ahead(steps: AbstractRetained, step: int) -> Estimate:
+    """The state after one step given the data up to it, and up to each later one."""
+    start = row(steps, step)
+
+    def body(point: Point, item: Any) -> tuple[Point, Moments]:
+        after = item.ahead(point)
+        return after, Moments(after.mean, after.covariance)
+
+    _, found = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
+    first = Moments(start.mean, start.covariance)
+    whole = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), first, found)
+    result: Estimate = jax.vmap(start.told)(whole)
+    return result
+
+
+def _told(steps: AbstractRetained, later: PyTree) -> Estimate:
+    result: Estimate = jax.vmap(lambda step, later: step.told(step.smoothed(later)))(steps, later)
+    return result
+
+
+def row(steps: T, k: int) -> T:
+    """One step of what is stacked along time."""
+    result: T = jax.tree.map(lambda leaf: leaf[k], steps)
+    return result
+
+
+def rows_of(steps: T, which: slice | jax.Array) -> T:
+    """Some steps of what is stacked along time."""
+    result: T = jax.tree.map(lambda leaf: leaf[which], steps)
+    return result
+
+
+def _column(marks: jax.Array, like: jax.Array) -> jax.Array:
+    return marks.reshape(-1, *[1] * (like.ndim - 1))

@@ -1,0 +1,87 @@
+"""Smoothing beside the filters: in Monte Carlo, in bounded memory, and of recordings."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+
+PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
+SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.02)
+FADING = hg.hop(hg.Discrete([0.5, 1.0, 1.4], [0.2, 0.5, 0.3]), 0.02)
+FILTERS = {"linear": hg.linear_filter(PLANT, SENSOR, FADING), "mixture": hg.mixture_filter(PLANT, SENSOR, FADING)}
+GAPS = hg.Network(
+    PLANT,
+    {f"node {arrival}": hg.Node(SENSOR, hg.erasure(FADING, arrival), FILTERS) for arrival in (0.6, 0.9)},
+    {"both": hg.Fusion("linear", hg.CovarianceIntersection())},
+)
+WHOLE = hg.Network(PLANT, {"node": hg.Node(SENSOR, FADING, {"linear": FILTERS["linear"]})})
+HORIZON, RUNS, LAG = 12, 40, 2
+CLAIMS = {"linear": "exact", "mixture": "nominal", "both": "upper"}
+
+
+@pytest.fixture(scope="module")
+def record():
+    return hg.monte_carlo(GAPS, HORIZON, RUNS, 3, smooth=hg.smoothing.FixedLag(LAG))
+
+
+def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
+    found = record.smoothed
+    assert found.failures() == [] and np.array_equal(found.truth, record.truth)
+    for node in GAPS.names:
+        for name, item in FILTERS.items():
+            told = found.estimates[node][name]
+            assert told.claim == CLAIMS[name]
+            for run in (0, RUNS - 1):
+                _, steps = hg.smoothing.retained_steps(item, record.measurements[node][run])
+                alone = hg.smoothing.FixedLag(LAG).estimates(steps)
+                np.testing.assert_allclose(told.mean[run], alone.mean, rtol=0, atol=1e-14)  # rounding of another order
+                np.testing.assert_allclose(told.covariance[run], alone.covariance, rtol=0, atol=1e-14)
+
+
+def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
+    found = record.smoothed.estimates
+    parts = [found[node]["linear"] for node in GAPS.names]
+    fused = hg.fusion.fuse(hg.CovarianceIntersection(), parts)
+    assert found["fused"]["both"].claim == fused.claim == "upper"
+    np.testing.assert_allclose(found["fused"]["both"].mean, fused.mean, rtol=0, atol=1e-12)
+    assert np.all(np.trace(fused.covariance, axis1=2, axis2=3)[:, :-1] < 0.5)  # of about 1 without measurements
+
+
+def test_statistics_of_the_record_and_its_smoothed_part(record):
+    for node in GAPS.names:
+        for name in FILTERS:
+            both = [hg.simulation.error_statistics(part, node, name) for part in (record, record.smoothed)]
+            assert both[1].rmse()[0] < 0.97 * both[0].rmse()[0]
+
+
+def test_in_bounded_memory_with_gains_known_before_data():
+    smooth = hg.smoothing.FixedInterval()
+    statistics = hg.monte_carlo(WHOLE, HORIZON, 4 * RUNS, 3, keep=hg.Statistics(), smooth=smooth)
+    found = statistics.smoothed["node"]["linear"]
+    _, steps = hg.smoothing.retained_steps(FILTERS["linear"], np.zeros((HORIZON, 1)))
+    claimed = smooth.estimates(steps).covariance  # no data change it
+    np.testing.assert_allclose(found.claimed(), claimed, rtol=0, atol=1e-13)
+    _, low, high = found.nees_per_dimension(0.9999)
+    assert found.claim == "exact" and low < 1 < high
+    assert found.rmse()[0] < 0.97 * statistics["node"]["linear"].rmse()[0]
+
+
+def test_a_recording_is_smoothed_from_a_fixed_point_on():
+    z = np.sin(np.arange(HORIZON))
+    found = hg.run(WHOLE, {"node": z}, time=np.arange(HORIZON) / 10, smooth=hg.smoothing.FixedPoint(4)).smoothed
+    assert np.array_equal(found.time, np.arange(4, HORIZON) / 10)
+    assert np.array_equal(found.measurements["node"][:, 0], z[4:])
+    _, steps = hg.smoothing.retained_steps(FILTERS["linear"], z[:, None])
+    alone = hg.smoothing.FixedPoint(4).estimates(steps)
+    np.testing.assert_allclose(found.estimates["node"]["linear"].mean, alone.mean, rtol=0, atol=1e-13)
+
+
+def test_what_cannot_be_smoothed_is_refused_in_one_line():
+    particle = hg.filters.particle_filter(PLANT, SENSOR, FADING, particles=10)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, FADING, {"one": particle})})
+    with pytest.raises(ValueError, match=r"smoothing: expected .* got ParticleFilter"):
+        hg.monte_carlo(network, 4, 2, 0, smooth=hg.smoothing.FixedInterval())
+    with pytest.raises(ValueError, match=r"smooth: expected one such as .*, got 'interval'"):
+        hg.monte_carlo(WHOLE, 4, 2, 0, smooth="interval")
+    with pytest.raises(ValueError, match="step of a fixed point: expected one of the run's 4"):
+        hg.monte_carlo(WHOLE, 4, 2, 0, smooth=hg.smoothing.FixedPoint(4))

@@ -1,0 +1,53 @@
+"""Smoothers of linear filters against the best linear estimate of the whole trajectory, by brute force."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from tests.oracles.stacked_estimate import Step, estimate, stacked
+
+N, M, TIME, LAG, POINT = 3, 2, 9, 3, 2
+VALUES = np.array([0.2, 1.1, 1.4])
+CLOSE = 1e-11  # of numbers of size one; the worst of 60 such problems is 4e-12, in one where P- is nearly singular
+
+
+def of_rank(rng, n, rank):
+    root = rng.normal(size=(n, rank))
+    return root @ root.T
+
+
+def problem(seed):
+    """Everything varies: gains random, A, Q and P0 singular, a third of the components missing."""
+    rng = np.random.default_rng(seed)
+    mean, covariance = rng.normal(size=N), of_rank(rng, N, 2)
+    plants, sensors, channels, steps = [], [], [], []
+    for _ in range(TIME):
+        a, c, chances = 0.6 * rng.normal(size=(N, N)), rng.normal(size=(M, N)), rng.dirichlet(np.ones(3))
+        a[:, 0] = a[:, 1]
+        q, r, n = of_rank(rng, N, 1), 0.1 * of_rank(rng, M, 2), 0.1 * of_rank(rng, M, 2)
+        plants.append(hg.LinearPlant(a, q, mean, covariance))
+        sensors.append(hg.LinearSensor(c, r))
+        channels.append(hg.hop(hg.Discrete(VALUES, chances), n))
+        gains = VALUES[:, None, None] * np.eye(M)
+        steps.append(Step(a, np.zeros(N), q, c, np.zeros(M), r, gains, chances, np.zeros(M), n))
+    z = 2 * rng.normal(size=(TIME, M))
+    z[rng.random((TIME, M)) < 0.3] = np.nan
+    item = hg.linear_filter(hg.over_time(plants), hg.over_time(sensors), hg.over_time(channels))
+    return item, stacked(mean, covariance, steps), z
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_smoothers_are_the_stacked_linear_estimate(seed):
+    item, whole, z = problem(seed)
+    _, steps = hg.smoothing.retained_steps(item, z)
+    given = {upto: estimate(whole, z, upto) for upto in range(1, TIME + 1)}
+    interval = hg.smoothing.FixedInterval().estimates(steps)
+    lagged = hg.smoothing.FixedLag(LAG).estimates(steps)
+    point = hg.smoothing.FixedPoint(POINT).estimates(steps)
+    assert {e.claim for e in (interval, lagged, point)} == {"exact"}
+    for k in range(TIME):
+        compared = [(interval, k, k, TIME), (lagged, k, k, min(k + 1 + LAG, TIME))]
+        for found, at, about, upto in [*compared, (point, k - POINT, POINT, k + 1)][: 2 + (k >= POINT)]:
+            mean, covariance = given[upto]
+            np.testing.assert_allclose(found.mean[at], mean[about], atol=CLOSE, rtol=0)
+            np.testing.assert_allclose(found.covariance[at], covariance[about], atol=CLOSE, rtol=0)
