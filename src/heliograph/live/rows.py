@@ -47,6 +47,10 @@ class Rows:
         """Where the newest row older than the watermark stands: the base, once this is the watermark."""
         return max(bisect_left(self.keys, (watermark,)) - 1, 0)
 
+    def after(self, time: float) -> int:
+        """Where the first row after a time stands."""
+        return bisect_left(self.keys, (time, np.inf))
+
     def verdict(self, event: Known, watermark: float, ahead: float) -> Verdict:
         """The verdict on an event, once this is the watermark."""
         if event.time > event.arrival + ahead:

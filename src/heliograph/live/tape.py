@@ -3,15 +3,13 @@
 from collections.abc import Callable
 from functools import lru_cache
 from typing import NamedTuple
-from weakref import WeakValueDictionary
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.live.clock import time_input
-from heliograph.live.mould import Mould, cast
+from heliograph.live.mould import Mould
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
@@ -50,15 +48,19 @@ class Ears(eqx.Module):
     filters: AllFilters
     places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
 
-    def __init__(self, network: Network):
+    def __init__(self, network: Network, filters: AllFilters):
         rows = network.rows()
-        self.filters = AllFilters(network)
+        self.filters = filters
         self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
         """One step of all; what they tell is "estimates" by kind and "fused" by name."""
-        after, found = self.filters.step(state, [heard[np.array(place)] for place in self.places], u, k)
+        after, found = self.filters.step(state, self.groups(heard), u, k)
         return after, {"estimates": found["estimates"], "fused": found["fused"]}
+
+    def groups(self, heard: jax.Array) -> list[jax.Array]:
+        """What each group's nodes heard, (node, received)."""
+        return [heard[np.array(place)] for place in self.places]
 
 
 Replay = Callable[..., tuple[Tape, list[jax.Array]]]
@@ -103,29 +105,43 @@ def _over_time(dt: int) -> Callable[[Ears, Tape, jax.Array, jax.Array], Moved]:
     """One step over the time between two rows, with the inputs held in between."""
 
     def move(item: Ears, tape: Tape, before: jax.Array, now: jax.Array) -> Moved:
-        heard, given, time = tape.parts(now)
-        held, step = tape.held[before], tape.step[before] + 1
-        u = jnp.insert(held, dt, time - tape.parts(before)[2])
-        state, told = item.step(tape.known(before), heard, u, step)
-        return state, jnp.where(jnp.isnan(given), held, given), step, jax.tree.leaves(told)
+        step, u = tape.step[before] + 1, interval(tape, before, now, dt)
+        state, told = item.step(tape.known(before), tape.parts(now)[0], u, step)
+        return state, held_after(tape, before, now), step, jax.tree.leaves(told)
 
     return move
 
 
+def interval(tape: Tape, before: jax.Array, now: jax.Array, dt: int) -> jax.Array:
+    """The inputs of a plant of continuous time from one row to another."""
+    return jnp.insert(tape.held[before], dt, tape.parts(now)[2] - tape.parts(before)[2])
+
+
 def _by_steps(item: Ears, tape: Tape, before: jax.Array, now: jax.Array) -> Moved:
     """The steps between two rows with nothing heard, and that of the row, to which its own inputs lead."""
-    heard, given, time = tape.parts(now)
-    held = jnp.where(jnp.isnan(given), tape.held[before], given)
-    last = time.astype(tape.step.dtype)
+    last = tape.parts(now)[2].astype(tape.step.dtype)
 
     def one(k: jax.Array, carry: tuple[PyTree, list[jax.Array]]) -> tuple[PyTree, list[jax.Array]]:
-        z, u = jnp.where(k == last, heard, jnp.nan), jnp.where(k == last, held, tape.held[before])
-        state, told = item.step(carry[0], z, u, k)
+        state, told = item.step(carry[0], *at_step(tape, before, now, k), k)
         return state, jax.tree.leaves(told)
 
     begun = tape.known(before), [leaf[now] for leaf in tape.told]
     state, told = jax.lax.fori_loop(tape.step[before] + 1, last + 1, one, begun)
-    return state, held, last, told
+    return state, held_after(tape, before, now), last, told
+
+
+def held_after(tape: Tape, before: jax.Array, now: jax.Array) -> jax.Array:
+    """The inputs held after a row."""
+    given = tape.parts(now)[1]
+    return jnp.where(jnp.isnan(given), tape.held[before], given)
+
+
+def at_step(tape: Tape, before: jax.Array, now: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What is heard and given at step k, which is the row's or one between it and the row before."""
+    heard, _, last = tape.parts(now)
+    there = k == last.astype(tape.step.dtype)
+    u = jnp.where(there, held_after(tape, before, now), tape.held[before])
+    return jnp.where(there, heard, jnp.nan), u
 
 
 @jax.jit
@@ -137,59 +153,3 @@ def read(told: list[jax.Array], slots: jax.Array) -> list[jax.Array]:
 def copied(tape: Tape) -> list[np.ndarray]:
     """The leaves of a tape, which goes on to be used."""
     return [np.asarray(jnp.copy(leaf)) for leaf in jax.tree.leaves(tape)]
-
-
-class Player:
-    """A network's filters compiled, their numbers where the program finds them: what all its timelines share.
-
-    `structure` of what is told. A tape's rows have `received` numbers and `given` inputs.
-    """
-
-    def __init__(self, network: Network):
-        self.network, self.dt = network, time_input(network)
-        self.claims, inputs = network.claims(), len(network.inputs)
-        self.received = sum(node.received for node in network.nodes.values())
-        self.given = inputs - (self.dt is not None)
-        with jax.enable_x64(True):
-            ears = Ears(network)
-            self.numbers, mould = cast(ears)
-            self._start: PyTree = jax.tree.map(jnp.asarray, ears.filters.init())
-            data = self.numbers, self._start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
-            told = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).step(*row)[1], *data)
-        self._like, self.structure = jax.tree.leaves(told), jax.tree.structure(told)
-        self.replay = replay(mould, self.dt)
-
-    def blank(self, slots: int, time: float) -> Tape:
-        """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
-        rows = np.full((slots, self.received + self.given + 1), np.nan)
-        rows[0, -1] = time
-        with jax.enable_x64(True):
-            return Tape(
-                rows=jnp.array(rows),
-                state=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], slots, axis=0), self._start),
-                held=jnp.zeros((slots, self.given)),
-                step=jnp.full(slots, -1),
-                told=[jnp.zeros((slots, *leaf.shape), leaf.dtype) for leaf in self._like],
-            )
-
-    def filled(self, slots: int, some: Tape) -> Tape:
-        """A tape with these rows in its first slots."""
-
-        def copied(all_: jax.Array, first: np.ndarray) -> jax.Array:
-            found = np.zeros(all_.shape, all_.dtype)
-            found[: len(first)] = first
-            return jnp.array(found)  # never the array itself: a tape is given away
-
-        with jax.enable_x64(True):
-            return Tape(*jax.tree.map(copied, tuple(self.blank(slots, 0.0)), tuple(some)))
-
-
-_SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id of a network, which its entry keeps
-
-
-def player(network: Network) -> Player:
-    """The one of this network."""
-    found = _SHARED.get(id(network))
-    if found is None:
-        found = _SHARED[id(network)] = Player(network)
-    return found

@@ -11,9 +11,10 @@ import numpy as np
 from heliograph.live.clock import uneven
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
+from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
-from heliograph.live.tape import READ, Tape, copied, player, read
+from heliograph.live.tape import READ, Tape, copied, read
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import first, steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
@@ -111,13 +112,44 @@ class Timeline:
         """
         newest, now = self._rows.keys[-1][0], self.now
         if self._dt is None:
-            now = np.floor(now) if self._horizon is None else min(np.floor(now), self._horizon - 1)
+            now = np.floor(min(now, self._end()))
         if self._latest is not None and now <= newest:
             return self._named(self._latest)
-        end = len(self._rows.held)
-        self._order[end] = len(self._order) - 1
-        ahead = HeldRow((float(now), 0, 0), len(self._order) - 1, self._size)
-        return self._named(self._replayed(ahead, end, end + 1))
+        return self._named(self._look(now, len(self._rows.held)))
+
+    def _end(self) -> float:
+        """The last step that the network covers."""
+        return np.inf if self._horizon is None else self._horizon - 1
+
+    def _look(self, time: float, place: int) -> list[np.ndarray]:
+        """What the filters tell at a time after the row before `place`; it stands in a slot that no row has."""
+        kept, self._order[place] = self._order[place], len(self._order) - 1
+        told = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
+        self._order[place] = kept
+        return told
+
+    def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
+        """Estimates at `now` - `lag` given all that is held, by node and filter: smoothed over the rows since then.
+
+        Where time counts steps, at the first step from there on. Filters that cannot be smoothed are left out, and
+        fusions that take quantized estimates or know of errors before later data.
+
+        Raises:
+            ValueError: a lag beyond the window, or to before the start; no filter that can be smoothed.
+        """
+        if not 0 <= moment("lag", lag) <= self.window:
+            raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
+        time = self.now - lag if self._dt is not None else np.ceil(min(self.now, self._end()) - lag)
+        if time <= self._rows.keys[0][0] if self._dt is None else time < self._rows.keys[0][0]:
+            raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
+        place = self._rows.after(time)
+        order, stop = self._order, len(self._rows.held)
+        if self._dt is not None or self._rows.keys[place - 1][0] < time:
+            self._look(time, place)
+            order, stop = np.insert(order, place, len(order) - 1)[:-1], stop + 1
+        else:
+            place -= 1
+        return self._player.sweeper.estimates(self._tape, order, place, stop)
 
     def final(self) -> Record:
         """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
