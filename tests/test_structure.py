@@ -31,6 +31,7 @@ ORDER = [
     ["smoothing"],
     ["fusion"],
     ["simulation"],
+    ["live"],
     ["testing"],
     ["files"],
     ["report"],

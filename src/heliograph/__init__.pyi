@@ -103,14 +103,17 @@ from .simulation.likelihood import (
 from .simulation.whiteness import (
     memory_test as memory_test,
 )
-from .simulation.stream import (
-    Stream as Stream,
-)
 from .simulation.record import (
     Record as Record,
 )
 from .simulation.sums import (
     Statistics as Statistics,
+)
+from .live.stream import (
+    Stream as Stream,
+)
+from .live.timeline import (
+    Timeline as Timeline,
 )
 from .report.progress import (
     show_progress as show_progress,

@@ -1,16 +1,16 @@
 """One filter on live data: push a measurement, read the estimate."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 from weakref import WeakValueDictionary
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.live.mould import Mould, cast
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import to_numpy
@@ -69,10 +69,9 @@ class _Placed:
 
     def __init__(self, filter_: AbstractFilter):
         self.filter, self.horizon = filter_, filter_.horizon
-        leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, filter_))
-        self.run = _program(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
         with jax.enable_x64(True):
-            self.numbers = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+            self.numbers, mould = cast(filter_)
+            self.run = _program(mould)
             self.start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
         self.estimate: Any = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
 
@@ -88,22 +87,14 @@ def _place(filter_: AbstractFilter) -> _Placed:
 
 
 @lru_cache
-def _program(tree: Any, parts: tuple[Hashable, ...]) -> Program:
-    """One step of every filter that differs in numbers alone; None among its `parts` stands for an array.
-
-    Called with arrays only: telling apart what is none costs more than all the rest of a step.
-    """
+def _program(mould: Mould) -> Program:
+    """One step of every filter that differs in numbers alone."""
 
     def step(
         numbers: list[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
     ) -> tuple[PyTree, list[jax.Array]]:
-        rest = iter(numbers)
-        item: AbstractFilter = tree.unflatten([next(rest) if part is None else part for part in parts])
+        item: AbstractFilter = mould.filled(numbers)
         after, estimate = item.step(state, z, u, k)
         return after, jax.tree.leaves(estimate)
 
     return jax.jit(step)
-
-
-def _as_array(leaf: object) -> object:
-    return np.asarray(leaf) if isinstance(leaf, int | float) else leaf

@@ -1,0 +1,1 @@
+"""Filters on data as they arrive: in order, late, twice."""

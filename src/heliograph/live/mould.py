@@ -1,0 +1,35 @@
+"""What objects that differ in numbers alone share: so they share compiled programs, called with arrays only."""
+
+from collections.abc import Hashable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+
+class Mould(NamedTuple):
+    """The structure of an object, and its leaves: None stands for an array. Hashable, so a program may depend on it.
+
+    A program is called with arrays only, since telling apart what is none costs more than all the rest of a step.
+    """
+
+    tree: Any
+    parts: tuple[Hashable, ...]
+
+    def filled(self, numbers: Sequence[jax.Array]) -> Any:
+        """The object with these arrays."""
+        rest = iter(numbers)
+        return self.tree.unflatten([next(rest) if part is None else part for part in self.parts])
+
+
+def cast(item: object) -> tuple[list[jax.Array], Mould]:
+    """An object's arrays, where a program finds them, and the rest of it. Call it in the float64 scope."""
+    leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, item))
+    numbers = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+    return numbers, Mould(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
+
+
+def _as_array(leaf: object) -> object:
+    return np.asarray(leaf) if isinstance(leaf, int | float) else leaf

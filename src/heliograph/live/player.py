@@ -1,0 +1,81 @@
+"""What the timelines of one network share: compiled programs, and the numbers of the filters where these find them."""
+
+from functools import cached_property
+from weakref import WeakValueDictionary
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.live.clock import time_input
+from heliograph.live.later import Sweeper
+from heliograph.live.mould import cast
+from heliograph.live.tape import Ears, Tape, replay
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters
+
+
+class Player:
+    """A network's filters compiled, their numbers where the program finds them: what all its timelines share.
+
+    `structure` of what is told. A tape's rows have `received` numbers and `given` inputs.
+    """
+
+    def __init__(self, network: Network):
+        self.network, self.dt = network, time_input(network)
+        self.claims, inputs = network.claims(), len(network.inputs)
+        self.received = sum(node.received for node in network.nodes.values())
+        self.given = inputs - (self.dt is not None)
+        with jax.enable_x64(True):
+            ears = Ears(network, AllFilters(network))
+            self.numbers, mould = cast(ears)
+            self._start: PyTree = jax.tree.map(jnp.asarray, ears.filters.init())
+            data = self.numbers, self._start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
+            told = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).step(*row)[1], *data)
+        self._like, self.structure = jax.tree.leaves(told), jax.tree.structure(told)
+        self.replay = replay(mould, self.dt)
+
+    @cached_property
+    def sweeper(self) -> Sweeper:
+        """What smooths these filters; made when it is first asked for.
+
+        Raises:
+            ValueError: no filter that can be smoothed.
+        """
+        return Sweeper(self.network, self.dt)
+
+    def blank(self, slots: int, time: float) -> Tape:
+        """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
+        rows = np.full((slots, self.received + self.given + 1), np.nan)
+        rows[0, -1] = time
+        with jax.enable_x64(True):
+            return Tape(
+                rows=jnp.array(rows),
+                state=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], slots, axis=0), self._start),
+                held=jnp.zeros((slots, self.given)),
+                step=jnp.full(slots, -1),
+                told=[jnp.zeros((slots, *leaf.shape), leaf.dtype) for leaf in self._like],
+            )
+
+    def filled(self, slots: int, some: Tape) -> Tape:
+        """A tape with these rows in its first slots."""
+
+        def copied(all_: jax.Array, first: np.ndarray) -> jax.Array:
+            found = np.zeros(all_.shape, all_.dtype)
+            found[: len(first)] = first
+            return jnp.array(found)  # never the array itself: a tape is given away
+
+        with jax.enable_x64(True):
+            return Tape(*jax.tree.map(copied, tuple(self.blank(slots, 0.0)), tuple(some)))
+
+
+_SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id of a network, which its entry keeps
+
+
+def player(network: Network) -> Player:
+    """The one of this network."""
+    found = _SHARED.get(id(network))
+    if found is None:
+        found = _SHARED[id(network)] = Player(network)
+    return found

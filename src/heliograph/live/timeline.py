@@ -1,0 +1,271 @@
+"""Events in any order: each gets a verdict and its place in time; estimates are those of all that was accepted."""
+
+import json
+import warnings
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.live.clock import uneven
+from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
+from heliograph.live.finals import Finals
+from heliograph.live.player import player
+from heliograph.live.rows import BEFORE, HeldRow, Rows
+from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
+from heliograph.live.tape import READ, Tape, copied, read
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import first, steps_covered
+from heliograph.numerics.check import check_count, fail, instance, scalar, shown
+from heliograph.numerics.types import ArrayLike
+from heliograph.simulation.network import Network
+from heliograph.simulation.record import Record, by_name
+
+
+class Timeline:
+    """A network's filters on events that come late, out of order and twice.
+
+    Pushed in whatever order, the events that are accepted give the estimates of filters that had them in the order of
+    their times. What is older than now - `window` is final, now being the largest arrival; the newest final event is
+    the base, from which later ones are replayed. Each push gets one verdict, the first that holds:
+
+    - "future": its time is later than its arrival by more than `ahead`;
+    - "late": it is before the base, in the order (time, node, sequence);
+    - "duplicate": the same node, sequence and time are held with the same values; "conflict": with others, and the
+      first stay;
+    - "used".
+
+    An event that is refused changes nothing. A plant with an input "dt" has continuous time, which starts at `start`;
+    its other inputs are held from their event to the next, 0 before the first. Any other plant's time counts steps,
+    from 0, and inputs lead to the step of their time. Where time counts steps, and where nodes share a channel, one
+    row is made of all events of a time, and what is heard there twice is a conflict; else every event is a row.
+
+    At most `capacity` rows are held; beyond it the oldest become final, counted in `forced`. `counts` has the number
+    of each verdict by node, and under "inputs".
+
+    Raises:
+        ValueError: no network, a negative window, a node called "inputs", continuous time where parts go by steps.
+    """
+
+    def __init__(self, network: Network, window: float, start: float = 0.0, ahead: float = 0.0, capacity: int = 1000):
+        self.network = instance("network", network, Network, "a Network")
+        self.window, self.ahead = float(scalar("window", window, 0)), float(scalar("ahead", ahead, 0))
+        self.now, self.capacity = float(scalar("start", start)), check_count("capacity", capacity)
+        if INPUTS in network.nodes:
+            names = list(network.nodes)
+            raise fail("node names", f"none called {INPUTS!r}, which stands for the plant's inputs", names)
+        self._player, self._horizon = player(network), steps_covered(network)
+        self._dt = self._player.dt
+        if self._dt is None and start != 0:
+            raise fail("start", "0 where time counts steps", start)
+        if self._dt is not None and (what := uneven(first(network.plant), self._dt)):
+            warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
+        self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
+        self._sizes[INPUTS] = -1, self._player.given
+        self.counts = {name: dict.fromkeys(VERDICTS, 0) for name in self._sizes}
+        self.forced = 0
+        slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
+        begun = self.now if self._dt is not None else -1.0
+        self._tape, self._finals = self._player.blank(slots, begun), Finals(self.capacity)
+        ends = np.cumsum([size for _, size in self._sizes.values()])
+        places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
+        self._size = int(ends[-1])
+        joint = self._dt is None or network.common is not None
+        self._rows = Rows(HeldRow((begun, BEFORE, 0), 0, self._size), joint, places, self.capacity)
+        self._order, self._free = np.zeros(slots, dtype=np.int32), list(range(slots - 2, 0, -1))
+        self._unread, self._left = list[HeldRow](), list[int]()  # final rows, and slots to free when these were read
+        self._latest: list[np.ndarray] | None = None
+
+    def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
+        """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
+
+        It costs one call of one compiled program, over the steps from the event's on.
+
+        Raises:
+            ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
+                is counted, and everything stays as it was.
+        """
+        event = self._known(node, sequence, time, values, arrival)
+        now = max(self.now, event.arrival)
+        verdict = self._rows.verdict(event, now - self.window, self.ahead)
+        if verdict == "used":
+            self._use(event)
+            self.now = now
+            self._settle()
+        self.counts[node][verdict] += 1
+        return verdict
+
+    def advance(self, now: float) -> None:
+        """Let time pass: what is older than the window becomes final.
+
+        Raises:
+            ValueError: no finite number.
+        """
+        self.now = max(self.now, moment("now", now))
+        self._settle()
+
+    def estimates(self) -> dict[str, dict[str, Estimate]]:
+        """Estimates at `now` from all that is held, by node and filter; those of several nodes stand under "fused".
+
+        Where time counts steps, at the last whole step, and at the last that the network covers.
+        """
+        newest, now = self._rows.keys[-1][0], self.now
+        if self._dt is None:
+            now = np.floor(min(now, self._end()))
+        if self._latest is not None and now <= newest:
+            return self._named(self._latest)
+        return self._named(self._look(now, len(self._rows.held)))
+
+    def _end(self) -> float:
+        """The last step that the network covers."""
+        return np.inf if self._horizon is None else self._horizon - 1
+
+    def _look(self, time: float, place: int) -> list[np.ndarray]:
+        """What the filters tell at a time after the row before `place`; it stands in a slot that no row has."""
+        kept, self._order[place] = self._order[place], len(self._order) - 1
+        told = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
+        self._order[place] = kept
+        return told
+
+    def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
+        """Estimates at `now` - `lag` given all that is held, by node and filter: smoothed over the rows since then.
+
+        Where time counts steps, at the first step from there on. Filters that cannot be smoothed are left out, and
+        fusions that take quantized estimates or know of errors before later data.
+
+        Raises:
+            ValueError: a lag beyond the window, or to before the start; no filter that can be smoothed.
+        """
+        if not 0 <= moment("lag", lag) <= self.window:
+            raise fail("lag", f"a number from 0 to the window, {self.window:g}", lag)
+        time = self.now - lag if self._dt is not None else np.ceil(min(self.now, self._end()) - lag)
+        if time <= self._rows.keys[0][0] if self._dt is None else time < self._rows.keys[0][0]:
+            raise fail("lag", "one to a moment after what is final", f"{lag:g}, to {time:g}")
+        place = self._rows.after(time)
+        order, stop = self._order, len(self._rows.held)
+        if self._dt is not None or self._rows.keys[place - 1][0] < time:
+            self._look(time, place)
+            order, stop = np.insert(order, place, len(order) - 1)[:-1], stop + 1
+        else:
+            place -= 1
+        return self._player.sweeper.estimates(self._tape, order, place, stop)
+
+    def final(self) -> Record:
+        """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
+
+        They are the filters' own after the row, in the order of time. Unless somebody asks the last `capacity` stay.
+        """
+        self._collect()
+        time, told = self._finals.take(self._tape.told)
+        return Record(time, self.network.states, None, {}, self._named(told))
+
+    def save(self) -> bytes:
+        """All that is held, for `restore`: after it, the same pushes give the same bits."""
+        self._collect()
+        time, told = self._finals.take(self._tape.told)
+        self._finals.add(time, told)
+        slots = [row.slot for row in self._rows.held]
+        held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._tape))}
+        final = {f"final.{i}": leaf for i, leaf in enumerate(told)}
+        head = {"now": self.now, "forced": self.forced, "counts": self.counts, "sizes": self._sizes, "dt": self._dt}
+        head |= {"options": [self.window, self.ahead, self.capacity]}
+        return packed(head, {**row_arrays(self._rows.held), **held, **final, "final.time": time})
+
+    @classmethod
+    def restore(cls, network: Network, data: bytes) -> "Timeline":
+        """The timeline that was saved, of the same network.
+
+        Raises:
+            ValueError: bytes that `save` did not return, or that belong to a network of other nodes or filters.
+        """
+        head, arrays = unpacked(data)
+        window, ahead, capacity = head["options"]
+        with warnings.catch_warnings():  # it was told when the timeline was made
+            warnings.simplefilter("ignore")
+            new = cls(network, window, ahead=ahead, capacity=capacity)
+        leaves, structure = jax.tree.flatten(new._tape)
+        saved = [arrays.get(f"tape.{i}", np.zeros(0)) for i in range(len(leaves))]
+        fits = all(old.shape[1:] == leaf.shape[1:] for old, leaf in zip(saved, leaves, strict=True))
+        if json.loads(json.dumps([new._sizes, new._dt])) != [head["sizes"], head["dt"]] or not fits:
+            raise fail("snapshot", "one of this network", f"one of nodes {list(head['sizes'])}, or of other filters")
+        new._resume(head, arrays, jax.tree.unflatten(structure, saved))
+        return new
+
+    def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: Tape) -> None:
+        """Hold what was saved."""
+        self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
+        slots, count = len(self._order), len(arrays["row.time"])
+        self._tape = self._player.filled(slots, saved)
+        self._rows.hold(rows_from(arrays, np.asarray(saved.rows), dict(self._sizes.values())))
+        self._order[:count], self._free = np.arange(count), list(range(slots - 2, count - 1, -1))
+        self._finals.add(arrays["final.time"], [arrays[f"final.{i}"] for i in range(len(saved.told))])
+        begun = self._rows.keys[-1][1] != BEFORE
+        self._latest = [np.asarray(leaf)[-1] for leaf in saved.told] if begun else None
+
+    def _known(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
+        """An event as numbers."""
+        if not isinstance(node, str) or node not in self._sizes:
+            raise fail("node of an event", f"one of {', '.join(self._sizes)}", shown(node))
+        place, size = self._sizes[node]
+        name = f"event of {node!r}"
+        at = moment(f"{name}, time", time)
+        if self._dt is None and (at < 0 or at != int(at) or (self._horizon is not None and at >= self._horizon)):
+            end = "" if self._horizon is None else f" to {self._horizon - 1}"
+            raise fail(f"{name}, time", f"a step, a whole number from 0{end}", time)
+        came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
+        return Known(place, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
+
+    def _use(self, event: Known) -> None:
+        """Put the event into its row, and replay from there."""
+        place, row = self._rows.find(event)
+        if row is None:
+            if not self._free:
+                self._collect()
+            row = HeldRow(self._rows.key(event), self._free.pop(), self._size)
+            self._order[place + 1 : len(self._rows.held) + 1] = self._order[place : len(self._rows.held)].copy()
+            self._order[place] = row.slot
+            self._rows.insert(place, row)
+        self._rows.fill(row, event)
+        self._latest = self._replayed(row, place, len(self._rows.held))
+
+    def _replayed(self, row: HeldRow, start: int, stop: int) -> list[np.ndarray]:
+        """Write a row and step over those of the order from `start` to `stop`; what is told after the last."""
+        place = np.array([row.slot, start, stop], dtype=np.int32)
+        with jax.enable_x64(True):
+            self._tape, told = self._player.replay(self._player.numbers, self._tape, row.numbers, self._order, place)
+        return [np.asarray(leaf) for leaf in told]
+
+    def _settle(self) -> None:
+        """Move the base to where it belongs."""
+        base, forced = self._rows.settle(self.now - self.window)
+        if not base:
+            return
+        self.forced += forced
+        final, left = self._rows.drop(base)
+        count = len(self._rows.held)
+        self._order[:count] = self._order[base : base + count].copy()
+        self._unread += [row for row in final if row.hears()]
+        self._left += [row.slot for row in left]
+
+    def _collect(self) -> None:
+        """Read what became final off the tape, and free the slots that nothing needs any more."""
+        for begin in range(0, len(self._unread), READ):
+            rows = self._unread[begin : begin + READ]
+            slots = np.zeros(READ, dtype=np.int32)
+            slots[: len(rows)] = [row.slot for row in rows]
+            with jax.enable_x64(True):
+                told = [np.asarray(leaf)[: len(rows)] for leaf in read(self._tape.told, slots)]
+            self._finals.add(np.array([row.key[0] for row in rows]), told)
+        self._free += self._left
+        self._unread, self._left = [], []
+
+    def _named(self, told: list[np.ndarray]) -> dict[str, dict[str, Estimate]]:
+        """What was told, by node and filter."""
+        found = jax.tree.unflatten(self._player.structure, told)
+        mean = by_name(self.network, found, lambda part: np.asarray(part.mean), -3)
+        covariance = by_name(self.network, found, lambda part: np.asarray(part.covariance), -4)
+        return {
+            node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
+            for node, claims in self._player.claims.items()
+        }
