@@ -13,15 +13,8 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph import campaign, cli, examples, filters, fusion, linear, model, random_affine, relays, simulation
+from tests.junk import COIN, ESCAPE, EYE, HOP, KALMAN, NODE, PLANT, SCALAR, SENSOR, check, name_of
 
-EYE = np.eye(2)
-PLANT = hg.LinearPlant(0.9 * EYE, 0.1, [0.0, 0.0], 1.0)
-SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.1)
-HOP = hg.hop(1.0, 0.1)
-KALMAN = hg.kalman_filter(PLANT, SENSOR)
-NODE = hg.Node(SENSOR, hg.perfect(), {"f": KALMAN})
-SCALAR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
-COIN = random_affine.FiniteSupport([[-1.0], [1.0]], [0.5, 0.5])
 COINS = hg.LinearPlant([[0.9]], COIN, [0.0], 1.0), hg.LinearSensor([[1.0]], COIN)
 RECEIVER = {"receiver": {"s": HOP}}, {"receiver": {"r": HOP}}
 SLOTS = [{"r": {"sensor": HOP}, **RECEIVER[0]}, {"s": {"sensor": HOP}, **RECEIVER[1]}]
@@ -30,7 +23,6 @@ ONE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
 LINK = {"plant": PLANT, "sensor": SENSOR, "channel": HOP}
 SYSTEM = linear.lifted_system(*SCALAR, HOP, 1, 3)
 SCHEDULE = linear.lmmse(SYSTEM)
-ESCAPE = fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)
 PRIOR = {"initial_mean": [0.0, 0.0], "initial_covariance": EYE}
 
 NETWORK = hg.Network(PLANT, {"a": NODE})
@@ -132,42 +124,13 @@ CALLS = [  # what is called, and arguments with which it works
     (campaign.run_campaign, {"campaign": None, "out": "nothing"}),
 ]  # fmt: skip
 
-ARRAYS = st.builds(
-    lambda shape, fill: np.full(shape, fill),
-    st.lists(st.integers(0, 3), max_size=3).map(tuple),
-    st.sampled_from([0.0, 1.0, -1.0, np.nan, np.inf, 1e300]),
-)
-EDGES = [2**40, 10**30, -(10**30), 5e-324, np.nan, -np.inf, 1j]
-# No size that could be built and would fill the memory, and nothing whose double is what overflows.
-NUMBERS = st.one_of(st.integers(-4, 4), st.floats(-1e300, 1e300), st.booleans(), st.sampled_from(EDGES))
-LISTS = st.recursive(
-    st.one_of(NUMBERS, st.none(), st.text(max_size=3)), lambda x: st.lists(x, max_size=3), max_leaves=6
-)
-THINGS = st.sampled_from(
-    [None, b"x", object(), set(), {}, {"a": 1}, {1: 2}, lambda x: x, lambda: 0, np.array([None]), range(2), iter([1]),
-     int,      PLANT, SENSOR, HOP, KALMAN, NODE, hg.Rayleigh(1.0), COIN, ESCAPE, "exact", np.array("x")]
-)  # fmt: skip
-JUNK = st.one_of(NUMBERS, st.text(max_size=4), ARRAYS, LISTS, THINGS)
-LENGTH = 500  # of a line that somebody reads
-
-
-def name_of(call):
-    return getattr(call, "__qualname__", type(call).__name__)
-
 
 @pytest.mark.filterwarnings("ignore:A JAX array is being set as static")  # before it is refused
 @pytest.mark.parametrize(("call", "arguments"), CALLS, ids=[name_of(call) for call, _ in CALLS])
 @settings(max_examples=25, derandomize=True)
 @given(data=st.data())
 def test_it_works_or_says_what_is_wrong(call, arguments, data):
-    name = data.draw(st.sampled_from(sorted(arguments)), label="argument")
-    value = data.draw(JUNK, label="value")
-    try:
-        call(**{**arguments, name: value})
-    except (ValueError, TypeError) as error:
-        message = str(error)
-        assert "\n" not in message and len(message) < LENGTH
-        assert ": expected " in message and ", got " in message, message
+    check(call, arguments, data)
 
 
 WORDS = [

@@ -1,6 +1,7 @@
 """A network: one plant, and nodes that hear something of it, with the filters that listen there."""
 
 from collections.abc import Iterable, Mapping
+from copy import copy
 from typing import NamedTuple
 from zlib import crc32
 
@@ -24,6 +25,8 @@ from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import informed_claim
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_type
+
+Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
 OWN = "own"  # a relay's one filter
@@ -60,6 +63,7 @@ class Network(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)  # in the given order: compiled code sorts dictionaries
     groups: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     kinds: tuple[Kind, ...] = eqx.field(static=True)
+    single: bool = eqx.field(static=True)
 
     def __init__(
         self,
@@ -69,7 +73,7 @@ class Network(eqx.Module):
         relays: RelayNetwork | None = None,
         common: Common | None = None,
     ):
-        self.plant, self.relays, self.common = plant, relays, common
+        self.plant, self.relays, self.common, self.single = plant, relays, common, False
         self.nodes = table("nodes", nodes, "nodes")
         self.fused = {} if fused is None else table("fused", fused, "fusions and central filters")
         self.names = tuple(self.nodes)
@@ -219,12 +223,18 @@ class Network(eqx.Module):
         names: tuple[str, ...] = first(self.plant).inputs
         return names
 
-    def claims(self) -> dict[str, dict[str, Claim]]:
+    def claims(self) -> Claims:
         """What every estimate claims, by node and filter; fused ones last, under "fused"."""
         claims = {name: {f: item.claim for f, item in node.filters.items()} for name, node in self.nodes.items()}
         if self.fused:
             claims[FUSED] = {name: self._fused_claim(item) for name, item in self.fused.items()}
-        return claims
+        return lowered(claims) if self.single else claims
+
+    def in_single_precision(self) -> "Network":
+        """The same network computed in single precision: nobody counts the digits lost, so that no claim is proved."""
+        result = copy(self)
+        object.__setattr__(result, "single", True)
+        return result
 
     def _fused_claim(self, item: Fusion | AbstractFilter) -> Claim:
         if isinstance(item, AbstractFilter):
@@ -255,6 +265,14 @@ def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], input
 def _world(node: Node | Listener) -> object:
     """What decides how a node hears."""
     return (node.sensor, anonymous(node.channel)) if isinstance(node, Node) else (node.received, node.complete)
+
+
+def lowered(claims: Claims) -> Claims:
+    """Nominal, whatever is claimed more."""
+    return {
+        node: {name: "none" if claim == "none" else "nominal" for name, claim in each.items()}
+        for node, each in claims.items()
+    }
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:

@@ -23,7 +23,7 @@ from heliograph.simulation.air import AbstractAir, air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.lanes import BLOCK, Lanes
-from heliograph.simulation.network import Network
+from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories
 from heliograph.simulation.smoothed import Beside, Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
@@ -86,7 +86,8 @@ def monte_carlo(
     larger simulation, bit for bit; it starts at a multiple of 32, since so many are simulated side by side.
 
     All cores are used, and all devices where JAX sees others than a processor. `precision` "float32" simulates and
-    filters in single precision, with other draws; what is kept is summed in double precision either way.
+    filters in single precision, with other draws; what is kept is summed in double precision either way, and what is
+    claimed is "nominal", since the digits that are lost are not counted.
 
     `smooth`, such as `hg.smoothing.FixedInterval()`, estimates earlier states from later data too; what is kept of
     these estimates stands in the result's `smoothed`. Warns of filters that their own innovations contradict.
@@ -110,13 +111,14 @@ def monte_carlo(
     base = _key(key)
     if not isinstance(precision, str) or precision not in get_args(Precision):
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
+    single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
     later = part and part.smoother(filters)
     both: Beside[Any] = Beside(reducer)
     keeper = reducer if part is None else both
-    job = _Job(world, later, u, base, np.asarray(first_run + runs), keeper, precision == "float32")
+    job = _Job(world, later, u, base, np.asarray(first_run + runs), keeper, single)
     parts = []
     with jax.enable_x64(True):
         lanes = Lanes(
@@ -132,7 +134,12 @@ def monte_carlo(
             if progress is not None:
                 progress(done, runs)
     kept = lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    return reducer.finish(*kept, network) if part is None else both.finished(*kept, network, part)
+    told = network.in_single_precision() if single else network
+    if part is not None:
+        claims = lowered(part.claims) if single else part.claims
+        result: Record | Result = both.finished(*kept, told, part._replace(claims=claims))
+        return result
+    return reducer.finish(*kept, told)
 
 
 def run(

@@ -17,13 +17,11 @@ from heliograph.model.relays import RECEIVER
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_run import each_run
-from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
 from heliograph.simulation.stepping import AllFilters, Fused
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing
-
-Claims = dict[str, dict[str, Claim]]
 
 
 class Smoother(eqx.Module):

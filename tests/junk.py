@@ -1,0 +1,51 @@
+"""Anything in place of anything, and what a public function may do with it: work, or say in one line what is wrong."""
+
+import numpy as np
+from hypothesis import strategies as st
+
+import heliograph as hg
+from heliograph import fusion, random_affine
+
+EYE = np.eye(2)
+PLANT = hg.LinearPlant(0.9 * EYE, 0.1, [0.0, 0.0], 1.0)
+SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.1)
+HOP = hg.hop(1.0, 0.1)
+KALMAN = hg.kalman_filter(PLANT, SENSOR)
+NODE = hg.Node(SENSOR, hg.perfect(), {"f": KALMAN})
+SCALAR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+COIN = random_affine.FiniteSupport([[-1.0], [1.0]], [0.5, 0.5])
+ESCAPE = fusion.EscapeQuantizer(9, 1.0, 0.5, 0.1, 1e-3)
+
+ARRAYS = st.builds(
+    lambda shape, fill: np.full(shape, fill),
+    st.lists(st.integers(0, 3), max_size=3).map(tuple),
+    st.sampled_from([0.0, 1.0, -1.0, np.nan, np.inf, 1e300]),
+)
+EDGES = [2**40, 10**30, -(10**30), 5e-324, np.nan, -np.inf, 1j]
+# No size that could be built and would fill the memory, and nothing whose double is what overflows.
+NUMBERS = st.one_of(st.integers(-4, 4), st.floats(-1e300, 1e300), st.booleans(), st.sampled_from(EDGES))
+LISTS = st.recursive(
+    st.one_of(NUMBERS, st.none(), st.text(max_size=3)), lambda x: st.lists(x, max_size=3), max_leaves=6
+)
+THINGS = st.sampled_from(
+    [None, b"x", object(), set(), {}, {"a": 1}, {1: 2}, lambda x: x, lambda: 0, np.array([None]), range(2), iter([1]),
+     int,      PLANT, SENSOR, HOP, KALMAN, NODE, hg.Rayleigh(1.0), COIN, ESCAPE, "exact", np.array("x")]
+)  # fmt: skip
+JUNK = st.one_of(NUMBERS, st.text(max_size=4), ARRAYS, LISTS, THINGS)
+LENGTH = 500  # of a line that somebody reads
+
+
+def name_of(call):
+    return getattr(call, "__qualname__", type(call).__name__)
+
+
+def check(call, arguments, data):
+    """Call it with one argument replaced by anything."""
+    name = data.draw(st.sampled_from(sorted(arguments)), label="argument")
+    value = data.draw(JUNK, label="value")
+    try:
+        call(**{**arguments, name: value})
+    except (ValueError, TypeError) as error:
+        message = str(error)
+        assert "\n" not in message and len(message) < LENGTH
+        assert ": expected " in message and ", got " in message, message
