@@ -92,10 +92,10 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
     """A chain of hops through relays that amplify what they hear, noise included: z = H_N ... H_2 H_1 y.
 
     Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
-    be late by a constant, the first by chance too; the delays add up.
+    be late, and the delays add up; a relay that is late by chance may forward one value twice, with one noise m.
 
     Raises:
-        ValueError: no hop, hops whose dimensions do not fit, a relay that holds what it hears for a random time.
+        ValueError: no hop, hops whose dimensions do not fit, delays told on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
     return in_series(hops)
