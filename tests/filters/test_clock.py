@@ -16,7 +16,7 @@ with_clocks, clock_filter = hg.model.with_clocks, hg.filters.clock_filter
 
 
 def seen_by(nodes, speed=1.0, clocks=CLOCKS, noise=Q, spread=(1.0, 0.01)):
-    """Plant, sensors, and what a centre hears."""
+    """Plant, sensors of the nodes and of all of them, and a centre's channel."""
     plant = hg.LinearPlant(F, noise, [0.0, speed], np.diag(spread))
     plant, sensors = with_clocks(plant, dict.fromkeys(nodes, POSITION), clocks, MOTION, DT)
     return plant, sensors, hg.model.joint_sensor(sensors), hg.parallel([hg.perfect()] * len(nodes))
@@ -26,16 +26,16 @@ def plain(plant, sensor, channel):
     return hg.filters.gaussian_filter(plant, sensor, channel, hg.filters.PolynomialMoments(2))
 
 
-def at_the_end(world, sensors, filters):
+def at_the_end(world, joint, filters):
     """Of each filter: errors and covariances of (position, speed, first offset, drift) after 300 steps."""
-    nodes = {name: hg.Node(sensor, hg.perfect(), {}) for name, sensor in sensors.items()}
-    record = hg.monte_carlo(hg.Network(world, nodes, filters), STEPS, RUNS, key=0)
+    centre = hg.Node(joint, hg.perfect(2), filters)
+    record = hg.monte_carlo(hg.Network(world, {"centre": centre}), STEPS, RUNS, key=0)
     back = np.eye(4)
     back[2, 3] = -STEPS * DT  # the offset at the start
     result = {}
-    for name, estimate in record.estimates["fused"].items():
+    for name, estimate in record.estimates["centre"].items():
         covariance = np.broadcast_to(estimate.covariance[..., -1, :, :], (RUNS, 4, 4))
-        result[name] = record.errors("fused", name)[:, -1] @ back.T, back @ covariance @ back.T
+        result[name] = record.errors("centre", name)[:, -1] @ back.T, back @ covariance @ back.T
     return result
 
 
@@ -51,8 +51,8 @@ def nees(found, part):
 
 
 def listening(speed, spread):
-    """Sensors of a node with a true clock and of one without; filters that hear both, or the second alone."""
-    plant, sensors, joint, channel = seen_by("ab", speed, spread=spread)
+    """The sensors of a node with a true clock and of one without; filters that hear both, or the second alone."""
+    plant, _, joint, channel = seen_by("ab", speed, spread=spread)
     alone = hg.parallel([hg.model.silent(1, 1, 1.0), hg.perfect()])
     blind = hg.LinearSensor(np.tile(np.eye(1, 4), (2, 1)), 0.04 * np.eye(2))
     filters = {
@@ -62,7 +62,7 @@ def listening(speed, spread):
         "plain, alone": plain(plant, joint, alone),
         "guarded, alone": clock_filter(plant, joint, alone, ["b"]),
     }
-    return plant, sensors, filters
+    return plant, joint, filters
 
 
 @pytest.fixture(scope="module")
