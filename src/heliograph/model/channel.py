@@ -143,7 +143,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = as_maps("relayed and direct link", [relayed, direct])
+    both = as_maps("stack", [relayed, direct])
     past = max(c.past for c in both)
     return Stack([c if c.past == past else of_part(c, sent(c), 0, past) for c in both])
 
