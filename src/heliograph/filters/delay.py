@@ -25,7 +25,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.delay import Delayed, Relayed, of_line, sent
+from heliograph.random_affine.delay import Delayed, of_line, sent
+from heliograph.random_affine.in_line import Relayed
 from heliograph.random_affine.second_moments import SecondOrder, second_order
 
 

@@ -21,7 +21,8 @@ from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.random_affine.base import check_forgets
-from heliograph.random_affine.delay import Relayed, of_line
+from heliograph.random_affine.delay import of_line
+from heliograph.random_affine.in_line import Relayed
 from heliograph.random_affine.noise import Gaussian, Independent
 from heliograph.random_affine.second_moments import SecondOrder, second_order
 

@@ -13,8 +13,9 @@ from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Mixture, Stack
-from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
+from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
 from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.in_line import in_series
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
