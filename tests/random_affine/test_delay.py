@@ -15,8 +15,8 @@ delayed = hg.model.delayed
 @pytest.mark.parametrize(
     "channel",
     [
-        hg.dropout(hg.with_direct_link(delayed(LINK, LAW, told=True), hg.hop(1.0, 0.1)), 0.8),
-        hg.parallel([hg.hop(0.5, 0.1, delay=CHAIN), LINK]),
+        hg.with_direct_link(hg.hop(0.5, 0.1, delay=LAW), LINK),
+        delayed(LINK, CHAIN, told=True),
     ],
     ids=["random", "chain"],
 )
@@ -36,6 +36,19 @@ def test_what_is_late_stands_where_it_was_sent():
     np.testing.assert_array_equal(told.sample(jax.random.key(0))[:-1, -1], [0, 1])
 
 
+def test_a_relay_holds_what_it_drew():
+    """Draws of relays that are late by chance: what was drawn a step before stands one place further on."""
+    channel = hg.amplify_and_forward([LINK, hg.hop(1.0, 0.0, delay=hg.Discrete([0, 1], [0.5, 0.5]))])
+    assert (channel.past, channel.inputs, channel.remembers) == (1, 2, True)
+    assert check_random_affine(channel, samples=10) == 0
+    held = channel.line.maps[0]
+    (inner, before), now = held.draw(held.init(jax.random.key(0)), jax.random.key(1))
+    _, later = held.draw((inner, before), jax.random.key(2))
+    assert now.shape == later.shape == (3, 3)
+    np.testing.assert_array_equal(now[1], np.zeros(3))
+    np.testing.assert_array_equal(later[1], [0.0, now[0, 0], now[0, 2]])
+
+
 def test_delays_in_series_add_up():
     hops = [hg.hop(0.5, 0.1, delay=LAW), hg.hop(hg.Rayleigh(0.8), 0.2, delay=1), LINK, hg.hop(2.0, 0.1, delay=2)]
     chain = hg.amplify_and_forward(hops)
@@ -47,7 +60,10 @@ def test_delays_in_series_add_up():
 
 
 REFUSED = {
-    "delay of a relay: expected a constant": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW)]),
+    "delays told: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, told=True)]),
+    "series: expected links that are late each": lambda: hg.amplify_and_forward(
+        [LINK, hg.with_direct_link(delayed(LINK, 1), LINK)]
+    ),
     "delays told: expected those of one link": lambda: hg.amplify_and_forward(
         [delayed(LINK, LAW, told=True), delayed(LINK, 1)]
     ),

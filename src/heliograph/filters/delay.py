@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.held import HeldFilter, relayed_filter, with_relays
 from heliograph.filters.plan import PlannedFilter
 from heliograph.filters.told import with_flag
 from heliograph.model.channel import Channel, check_link
@@ -22,9 +23,10 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 from heliograph.random_affine.atoms import known
-from heliograph.random_affine.base import as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.delay import Delayed, of_line, sent
+from heliograph.random_affine.in_line import Relayed
 from heliograph.random_affine.second_moments import SecondOrder, second_order
 
 
@@ -220,9 +222,7 @@ class ToldDelayFilter(AbstractFilter):
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
 
 
-def behind_delays(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make
-) -> PartFilter | LateFilter | ToldDelayFilter:
+def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
     """The filter that `make` makes of links that are not late, behind those that are."""
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
@@ -230,7 +230,16 @@ def behind_delays(
         return _told(plant, sensor, channel, make)
     if isinstance(channel, Delayed) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
+    if isinstance(start, Relayed):
+        return _behind_relays(plant, sensor, channel, make)
     return PartFilter(make(*with_past(plant, sensor, channel)), n)
+
+
+def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
+    if not isinstance(channel, Relayed):
+        raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
+    larger, last, link, lines = with_relays(plant, sensor, channel)
+    return relayed_filter(plant, channel, make(larger, last, link), lines)
 
 
 def _told(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> ToldDelayFilter:
@@ -254,6 +263,10 @@ def as_current(channel: Channel) -> Channel:
     """The channel for those who take what is late as current: all that its line holds is y_k."""
     if isinstance(channel, OverTime):
         return over_time([as_current(one) for one in unstack(channel)])
-    (one,) = as_maps("channel", [channel])
-    same = known(np.tile(np.eye(sent(one)), (1 + one.past, 1)))
-    return Series([same, of_line(one)])
+    return _at_once(as_maps("channel", [channel])[0])
+
+
+def _at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    if isinstance(channel, Relayed):
+        return Series([_at_once(stage) for stage in channel.stages])
+    return Series([known(np.tile(np.eye(sent(channel)), (1 + channel.past, 1))), of_line(channel)])

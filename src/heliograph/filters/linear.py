@@ -11,15 +11,15 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal, known_gain_covariance
-from heliograph.filters.delay import LateFilter, PartFilter, ToldDelayFilter, as_current, behind_delays
+from heliograph.filters.delay import as_current, behind_delays
 from heliograph.filters.gaussian import Belief, describe, predicted
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
-from heliograph.filters.modal import ModalFilter, modal_filter
+from heliograph.filters.modal import modal_filter
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained, linear_retained, moments_retained
-from heliograph.filters.told import ToldFilter, told_filter
+from heliograph.filters.told import told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
-from heliograph.filters.uncertain import UncertainModalFilter, uncertain_modal_filter
+from heliograph.filters.uncertain import uncertain_modal_filter
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -172,7 +172,7 @@ def used(
 
 def linear_filter(
     plant: AnyPlant, sensor: AnySensor, channel: Channel, update: Polytope | None = None
-) -> LinearFilter | ModalFilter | UncertainModalFilter | ToldFilter | PartFilter | LateFilter | ToldDelayFilter:
+) -> AbstractFilter:
     """The best linear filter for a linear plant and sensor behind any channel.
 
     Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
@@ -237,10 +237,10 @@ def as_current_filter(
     Claim: "nominal" where anything can be late; `true_error` says before any data how wrong it is then.
 
     Raises:
-        ValueError: what `linear_filter` refuses, a channel that remembers.
+        ValueError: what `linear_filter` refuses, losses.
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
-    item = linear_filter(plant, sensor, as_current(without_memory(channel)), update)
+    item = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
     assert isinstance(item, LinearFilter)  # what is neither late nor remembers has no other
     return replace(item, claim="nominal") if first(channel).past else item
 

@@ -30,3 +30,6 @@ from .plant import (
 from .relays import (
     RelayNetwork as RelayNetwork,
 )
+from .sensor import (
+    AbstractSensor as AbstractSensor,
+)

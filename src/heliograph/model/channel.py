@@ -13,8 +13,9 @@ from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Mixture, Stack
-from heliograph.random_affine.delay import Delay, Delayed, in_series, of_part, sent
+from heliograph.random_affine.delay import Delay, Delayed, of_part, sent
 from heliograph.random_affine.erasure import Erasure
+from heliograph.random_affine.in_line import in_series
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
@@ -92,10 +93,10 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
     """A chain of hops through relays that amplify what they hear, noise included: z = H_N ... H_2 H_1 y.
 
     Two hops (sensor to relay, relay to filter) give z = a sqrt(E_l E_r) xi gamma y + a sqrt(E_r) xi m + n. Each hop may
-    be late by a constant, the first by chance too; the delays add up.
+    be late, and the delays add up; a relay that is late by chance may forward one value twice, with one noise m.
 
     Raises:
-        ValueError: no hop, hops whose dimensions do not fit, a relay that holds what it hears for a random time.
+        ValueError: no hop, hops whose dimensions do not fit, delays told on the way, memory before a delay.
     Source: cubature fusion under amplify-and-forward relays, equations (3) to (6).
     """
     return in_series(hops)
@@ -143,7 +144,7 @@ def with_direct_link(relayed: AbstractRandomAffine, direct: AbstractRandomAffine
     Raises:
         ValueError: channels that take different numbers of inputs.
     """
-    both = as_maps("relayed and direct link", [relayed, direct])
+    both = as_maps("stack", [relayed, direct])
     past = max(c.past for c in both)
     return Stack([c if c.past == past else of_part(c, sent(c), 0, past) for c in both])
 

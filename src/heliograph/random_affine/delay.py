@@ -1,6 +1,5 @@
 """Links that hear late: at step k what was sent d steps before, with d known or drawn, told or not."""
 
-from collections.abc import Sequence
 from typing import TypeVar
 
 import equinox as eqx
@@ -181,44 +180,3 @@ def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) ->
     rows = np.concatenate([t * total + start + np.arange(size) for t in range(own + 1)])
     chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if own else channel])
     return OfLine(chosen, past) if past else chosen
-
-
-def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
-    """One link after another, each late by its own; constant delays, and a first random one, add up at the sensor.
-
-    A relay that forgets and holds what it heard for d steps is one that hears it d steps later: its gains and noises
-    are independent over time. One that holds it for a random time would forward one noise twice.
-
-    Raises:
-        ValueError: no links, a random delay after the first link, delays told on the way, memory before a delay.
-    """
-    links = as_maps("series", links)
-    if not any(link.past for link in links):
-        return Series(links)
-    late = [link for link in links if link.past]
-    if not all(isinstance(link, Delayed) for link in late):
-        raise fail("series", "links that are late each by itself", "a combination of late links")
-    delays = [link for link in late if isinstance(link, Delayed)]
-    start, added = (delays[0], delays[1:]) if links[0].past else (None, delays)
-    if not all(link.constant for link in added):
-        raise fail("delay of a relay", "a constant (only what the sensor sends may be late by chance)", "a random one")
-    last = max(i for i, link in enumerate(links) if link.past)
-    if any(link.told for link in delays[:-1]) or (delays[-1].told and start is not None and len(delays) > 1):
-        raise fail("delays told", "those of one link", "those of several in series")
-    for link in links[:last] if added else ():
-        if link.remembers:
-            raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
-    chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
-    told, more = any(link.told for link in delays), sum(link.times[0] for link in added)
-    return Delayed(chain, more if start is None else _longer(start, more), told)
-
-
-def _longer(link: Delayed, more: int) -> Delay:
-    """The link's delay and so many steps, none after a chain."""
-    match link.delay:
-        case Mixture():
-            times = np.array(link.times, dtype=float) + more
-            return Discrete(times, link.delay.choice.probabilities, link.delay.choice.radius)
-        case Modes():
-            return link.delay.memory
-    return link.times[0] + more

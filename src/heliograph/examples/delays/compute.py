@@ -17,7 +17,6 @@ from heliograph.examples.delays.setting import (
     listeners,
     moving,
 )
-from heliograph.model.sensor import AbstractSensor
 
 RUNS = {"delays": 4096, "clocks": 1024}
 STAGES = 4
@@ -100,7 +99,7 @@ def _before(simulated: Mapping[str, Score]) -> dict[str, Score]:
 
 def _clocks(
     plant: hg.LinearPlant,
-    sensors: Mapping[str, AbstractSensor],
+    sensors: Mapping[str, hg.model.AbstractSensor],
     filters: Mapping[str, hg.AbstractFilter],
     seed: int,
 ) -> dict[str, dict[str, Score]]:

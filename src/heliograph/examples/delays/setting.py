@@ -5,7 +5,6 @@ from collections.abc import Mapping
 import numpy as np
 
 import heliograph as hg
-from heliograph.model.sensor import AbstractSensor
 
 STEPS = 60
 LAW = hg.Discrete([0, 1, 2], [0.4, 0.35, 0.25])
@@ -28,7 +27,7 @@ POSITION = hg.LinearSensor([[1.0, 0.0]], 0.04)
 
 def moving(
     speed: float, noise: float = 1.0, spread: tuple[float, float] = (1.0, 0.01)
-) -> tuple[hg.LinearPlant, dict[str, AbstractSensor]]:
+) -> tuple[hg.LinearPlant, dict[str, hg.model.AbstractSensor]]:
     """A plant that moves along a line, seen by a node with a true clock and by one without."""
     plant = hg.LinearPlant([[1.0, STEP], [0.0, 1.0]], noise * SPEED_NOISE, [0.0, speed], np.diag(spread))
     nodes = {"true": POSITION, "wrong": POSITION}
@@ -37,7 +36,7 @@ def moving(
     return larger, dict(sensors)
 
 
-def listeners(plant: hg.LinearPlant, sensors: Mapping[str, AbstractSensor]) -> dict[str, hg.AbstractFilter]:
+def listeners(plant: hg.LinearPlant, sensors: Mapping[str, hg.model.AbstractSensor]) -> dict[str, hg.AbstractFilter]:
     """Filters that hear both nodes, and two that hear the wrong clock alone."""
     joint, both = hg.model.joint_sensor(sensors), hg.parallel([hg.perfect(), hg.perfect()])
     alone = hg.parallel([hg.model.silent(1, 1, 1.0), hg.perfect()])

@@ -1,0 +1,150 @@
+"""Links in series that hear late: delays add up, and relays that are late by chance hold what they heard."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.numerics.check import fail
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.combine import Mixture, Series
+from heliograph.random_affine.delay import AbstractOfLine, Delay, Delayed, of_line, sent
+from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.modes import Modes
+
+
+class Held(AbstractRandomAffine):
+    """What a relay heard at this step and at `steps` before, (r_k, ..., r_{k-steps}), of the line of what was sent.
+
+    It remembers what was drawn: forwarded twice, a value has its gain and noise twice. Before the first step it holds
+    zeros.
+    """
+
+    base: AbstractRandomAffine
+    size: int = eqx.field(static=True)  # numbers that are sent at each step
+    steps: int = eqx.field(static=True)
+
+    @property
+    def past(self) -> int:
+        """Steps back that the line reaches."""
+        return self.base.inputs // self.size - 1 + self.steps
+
+    @property
+    def outputs(self) -> int:
+        """All that is held."""
+        return self.base.outputs * (1 + self.steps)
+
+    @property
+    def inputs(self) -> int:
+        """Length of the line."""
+        return self.base.inputs + self.size * self.steps
+
+    @property
+    def erases(self) -> bool:
+        """Whether what the relay hears can be lost."""
+        return self.base.erases
+
+    @property
+    def remembers(self) -> bool:
+        """It does."""
+        return True
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the map, and nothing heard."""
+        return self.base.init(key), jnp.zeros((self.steps, self.base.outputs, self.base.inputs + 1))
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw what is heard now, and put it before what was."""
+        inner, before = state
+        inner, h = self.base.draw(inner, key)
+        each = jnp.concatenate([h[None, :-1], before])
+        rows = [
+            jnp.pad(one[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size))) for t, one in enumerate(each)
+        ]
+        top = jnp.concatenate([jnp.concatenate(rows), each[..., -1].reshape(-1, 1)], axis=1)
+        return (inner, each[:-1]), jnp.concatenate([top, jnp.eye(1, self.inputs + 1, self.inputs)])
+
+
+class Relayed(AbstractOfLine):
+    """Links in series of which each but the first hears late, by chance, what the one before delivered."""
+
+    stages: tuple[AbstractRandomAffine, ...]
+
+    @property
+    def remembers(self) -> bool:
+        """It does: what the relays hold."""
+        return True
+
+    @property
+    def line(self) -> AbstractRandomAffine:
+        """Each stage of what the one before holds."""
+        size, result = sent(self.stages[0]), of_line(self.stages[0])
+        for stage in self.stages[1:]:
+            result = Series([Held(result, size, stage.past), of_line(stage)])
+        return result
+
+    @property
+    def past(self) -> int:
+        """The longest delay of all together."""
+        return sum(stage.past for stage in self.stages)
+
+
+def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+    """One link after another, each late by its own; constant delays add up.
+
+    A relay that forgets and holds what it heard for d steps is one that hears it d steps later: its gains and noises
+    are independent over time. One that holds it for a random time may forward one value twice, with one noise.
+
+    Raises:
+        ValueError: no links, delays told on the way, memory before a delay.
+    """
+    links = as_maps("series", links)
+    if not any(link.past for link in links):
+        return Series(links)
+    stages: list[list[AbstractRandomAffine]] = [[links[0]]]
+    for link in links[1:]:
+        if link.past and not isinstance(link, Delayed):
+            raise fail("series", "links that are late each by itself", "a combination of late links")
+        if isinstance(link, Delayed) and not link.constant:
+            stages.append([link])
+        else:
+            stages[-1].append(link)
+    if len(stages) == 1:
+        return _stage(stages[0])
+    if any(isinstance(link, Delayed) and link.told for link in links):
+        raise fail("delays told", "those of one link", "those of several in series")
+    return Relayed(tuple(_stage(stage) for stage in stages))
+
+
+def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
+    """Links in series of which only the first may be late by chance."""
+    delays = [link for link in links if isinstance(link, Delayed)]
+    if not delays:
+        return Series(links)
+    if links[0].past and not isinstance(links[0], Delayed):
+        raise fail("series", "links that are late each by itself", "a combination of late links")
+    start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
+    told = [link.told for link in delays]
+    if any(told[:-1]) or (told[-1] and len(delays) > 1 and start is not None):
+        raise fail("delays told", "those of one link", "those of several in series")
+    last = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
+    for link in links[:last]:
+        if link.remembers:
+            raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
+    chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
+    more = sum(link.times[0] for link in added)
+    return Delayed(chain, more if start is None else _longer(start, more), any(told))
+
+
+def _longer(link: Delayed, more: int) -> Delay:
+    """The link's delay and so many steps, none after a chain."""
+    match link.delay:
+        case Mixture():
+            times = np.array(link.times, dtype=float) + more
+            return Discrete(times, link.delay.choice.probabilities, link.delay.choice.radius)
+        case Modes():
+            return link.delay.memory
+    return link.times[0] + more
