@@ -91,7 +91,7 @@ def range_bearing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
                 "**What does not.** Repeating the update from where it led (iterated posterior linearisation), the "
                 "logarithm of what arrives, and a mixture over the gain: each leaves the tail (measured on this case), "
                 "for none of them sees the bend.",
-                "**What to look at.** A claimed deviation of the place above a third of the estimated distance.",
+                "**What to look at.** A claimed deviation of the place above three tenths of the estimated distance.",
             ]),
         ]),
     ]  # fmt: skip
