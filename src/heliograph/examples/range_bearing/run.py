@@ -1,0 +1,50 @@
+"""The example as a folder of results."""
+
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+
+from heliograph.examples.range_bearing.compute import FADING_RUNS, RUNS, STAGES, Outcome, compute
+from heliograph.numerics.check import check_seed
+from heliograph.report.results import Json, Results, write_results
+
+NAME = "range-bearing"
+
+
+def example(out: Path, seed: int = 0) -> None:
+    """Compute every case and write figures, report and summary to `out`/range-bearing.
+
+    Raises:
+        ValueError: a folder that cannot be written, or one that holds something else.
+        ModuleNotFoundError: the extra `report` is not installed.
+    """
+    target = Path(out) / NAME
+    write_results(target, STAGES, partial(compute, check_seed("seed", seed)), results)
+    print(f"Report: {target / 'report.html'}")
+
+
+def results(outcome: Outcome) -> Results:
+    """Everything that the folder holds."""
+    from heliograph.examples.range_bearing.page import range_bearing_figures, range_bearing_page
+
+    figures = range_bearing_figures(outcome)
+    return Results(figures, partial(range_bearing_page, outcome), summary(outcome), lambda folder: None)
+
+
+def summary(outcome: Outcome) -> dict[str, Json]:
+    """Scores by case and filter, and tails by filter."""
+    cases: dict[str, Json] = {
+        case: {name: asdict(one) for name, one in found.items()} for case, found in outcome.scores.items()
+    }
+    fading: dict[str, Json] = {
+        name: {
+            **asdict(one.score),
+            "closest_pass": one.closest.tolist(),
+            "rmse_by_closest_pass": one.rmse.tolist(),
+            "worst_hundredth": one.worst,
+            "broken": one.broken,
+            "broken_at_closest_pass": one.at_closest,
+        }
+        for name, one in outcome.tails.items()
+    }
+    return {"runs": RUNS, "fading_runs": FADING_RUNS, **cases, "fading": fading}
