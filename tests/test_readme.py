@@ -11,6 +11,7 @@ import matplotlib
 import pytest
 
 from heliograph import cli
+from heliograph.papers import METHODS
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -80,6 +81,20 @@ def run(words: list[str]) -> int:
     else:
         assert words[0] == "heliograph" and cli.main(words[1:]) == 0, words
     return 1
+
+
+class BegunError(Exception):
+    """The work would begin now: all that it needs is there."""
+
+
+def test_every_method_finds_what_it_needs(after_make_demo, monkeypatch):
+    def begin(target):
+        raise BegunError
+
+    monkeypatch.setattr("heliograph.report.results.whole_folder", begin)
+    for method in METHODS:
+        with pytest.raises(BegunError):
+            cli.main(["reproduce", method, "--out", "out"])
 
 
 def test_its_network_is_as_short_as_it_says():
