@@ -1,5 +1,6 @@
 """What users try in their first hour, in their words, with public names alone: it works, and its claims are true."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -67,3 +68,51 @@ def test_a_skewed_sensor_with_a_bias():
     assert better["rmse of level"] < 0.97 * linear["rmse of level"] and np.isfinite(better["rmse of leak"])
     for one in (better, linear):
         assert one["rmse"] == pytest.approx(np.hypot(one["claimed of level"], one["claimed of leak"]), rel=0.05)
+
+
+def test_a_drone_with_range_bearing_stations_over_a_lossy_relay():
+    """A drone circles two ground stations that measure its distance and bearing; a relay forwards their packets, adds a
+    little noise and loses one in five. Where is the drone, also when the bearing jumps from pi to -pi?"""
+    dt, turn = 0.5, 0.15  # s, rad/s
+
+    def fly(x, u):
+        away = x[2:] + dt * turn * jnp.stack([-x[3], x[2]])  # turns left all the time
+        return jnp.concatenate([x[:2] + dt * x[2:], away])
+
+    def look(x):
+        return jnp.concatenate(
+            [jnp.stack([jnp.hypot(*d), jnp.arctan2(d[1], d[0])]) for d in (x[:2] - s for s in STATIONS)]
+        )
+
+    drone = hg.Plant(
+        fly,
+        np.diag([0.01, 0.01, 0.02, 0.02]),
+        [60.0, 0.0, 0.0, 9.0],
+        np.diag([25.0, 25.0, 1.0, 1.0]),
+        states=["east", "north", "speed east", "speed north"],
+    )
+    names = [f"{what} from {station}" for station in ("south", "north") for what in ("distance", "bearing")]
+    noise = np.diag([1.0, 0.02**2] * 2)  # m^2, rad^2
+    stations = hg.Sensor(look, noise, outputs=names, circular=[names[1], names[3]])
+    relay = hg.amplify_and_forward(
+        [hg.hop(1.0, noise=noise / 4, dimension=4), hg.hop(1.0, noise=noise / 4, dimension=4)]
+    )
+    filters = {"aware": hg.cubature_filter(drone, stations, relay)}
+    network = hg.Network(drone, {"tablet": hg.Node(stations, hg.erasure(relay, arrival=0.8), filters)})
+
+    record = hg.monte_carlo(network, 100, runs=96, key=5).with_units({"east": "m", "north": "m"})
+    away = record.truth[..., :2] - STATIONS[0]
+    jumps = np.abs(np.diff(np.arctan2(away[..., 1], away[..., 0]), axis=1)) > np.pi
+    assert np.mean(jumps.any(axis=1)) > 0.9  # nearly every flight goes behind the station
+    assert abs(np.mean(np.isnan(record.measurements["tablet"][..., 1])) - 0.2) < 0.03  # 7 standard errors
+    found = hg.simulation.error_statistics(record, "tablet", "aware")
+    nees, low, high = found.nees_per_dimension()
+    assert low - 0.05 < 1 < high + 0.05, (nees, low, high)  # the measurement is curved: claims are nominal
+    error = record.rmse("tablet", "aware")
+    assert error["east"] < 2.0 and error["north"] < 2.0  # m, at 60 m and more
+    assert not record.failures()
+    with pytest.raises(ValueError, match="sine and cosine"):
+        hg.cubature_filter(drone, stations, hg.hop(hg.Rayleigh(0.8), noise=noise, dimension=4))
+
+
+STATIONS = np.array([[0.0, -20.0], [10.0, 30.0]])  # m
