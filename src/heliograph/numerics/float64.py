@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import PyTree
 
 P = ParamSpec("P")
@@ -37,6 +38,7 @@ def in_float64(function: Callable[P, R]) -> Callable[P, R]:
     def scoped(*args: P.args, **kwargs: P.kwargs) -> R:
         if _traced((args, kwargs)):
             return function(*args, **kwargs)
+        check_process()
         with jax.enable_x64(True):
             result: R = to_numpy(function(*args, **kwargs))
         return result
@@ -56,6 +58,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         if _traced((args, kwargs)):
             return function(*args, **kwargs)
+        check_process()
         with jax.enable_x64(True):
             result: R = to_numpy(jitted(*jax.tree.map(_as_array, args), **jax.tree.map(_as_array, kwargs)))
         return result

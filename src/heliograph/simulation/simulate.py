@@ -18,6 +18,7 @@ from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, check_count, check_seed, check_times, fail, instance, shown, table
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.forked import check_process
 from heliograph.simulation.air import AbstractAir, air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
@@ -96,6 +97,7 @@ def monte_carlo(
         ValueError: a horizon beyond what varies over time, inputs of the wrong shape, counts below one, a first run
             that is no multiple of 32, an unknown precision, a filter or fusion that cannot be smoothed.
     """
+    check_process()
     instance("network", network, Network, "a Network")
     for name, count in (("horizon", horizon), ("runs", runs), ("chunk", chunk)):
         check_count(name, count)
@@ -151,6 +153,7 @@ def run(
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
             filter or fusion that cannot be smoothed.
     """
+    check_process()
     instance("network", network, Network, "a Network")
     network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
     steps = len(np.asarray(next(iter(measurements.values()))))

@@ -53,7 +53,8 @@ def memory_test(
     Shapes: data (steps, received), inputs (steps, inputs).
 
     Raises:
-        ValueError: data or inputs of the wrong shape, a filter that claims no covariance, too few steps for the lags.
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance, too few steps for the lags,
+            innovations that are all zero or missing.
     Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
     """
     check_count("lags", lags)
@@ -65,10 +66,12 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
     """What whitened innovations say; of their power alone where they are in units of what a filter claims.
 
     Raises:
-        ValueError: too few steps for the lags.
+        ValueError: too few steps for the lags, nothing but zeros.
     """
     if len(white) < 10 * lags:
         raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
+    if not np.any(np.nan_to_num(white)):
+        raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
     size, size_error = _mean(_by_step(white**2))
     parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
     correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
@@ -82,7 +85,9 @@ def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Innovations of unknown covariance, each component in units of its deviation."""
     found = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
     value = found[:, None] if found.ndim == 1 else found
-    deviation = np.sqrt(np.nanmean(value**2, axis=0))
+    largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
+    value = value / np.where(largest > 0, largest, 1.0)
+    deviation = np.sqrt(np.nansum(value**2, axis=0) / np.maximum(np.sum(~np.isnan(value), axis=0), 1))
     return np.asarray(value / np.where(deviation > 0, deviation, 1.0))
 
 

@@ -1,0 +1,21 @@
+"""A process forked from one in which JAX has run would wait for threads that it does not have: it is told so."""
+
+import os
+
+from heliograph.numerics.check import fail
+
+_first: list[int] = []  # the process in which something was computed first; a fork inherits it
+
+
+def check_process() -> None:
+    """Raise ValueError in a fork of a process that has computed something; anywhere else remember the process.
+
+    Raises:
+        ValueError: such a fork; processes that are started anew ("spawn") know nothing of it.
+    """
+    here = os.getpid()
+    if not _first:
+        _first.append(here)
+    elif _first[0] != here:
+        wanted = 'one started anew (multiprocessing.get_context("spawn"))'
+        raise fail("process", wanted, "a fork of one in which JAX has run, which would hang")
