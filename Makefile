@@ -42,8 +42,8 @@ $(CREATED):
 	@touch $@
 
 .venv/.demo: $(CREATED) pyproject.toml constraints.txt
-	@echo "Installing heliograph into .venv (the first time: a minute or so) ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings]'
+	@echo "Installing heliograph into .venv (the first time: a minute or two, 1.4 GB) ..."
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi]'
 	@touch $@
 
 .venv/.test: $(CREATED) pyproject.toml constraints.txt

@@ -1,10 +1,8 @@
 """What the command does for somebody who begins: a first file, completion, hints that work, paths that do not nest."""
 
-import json
 import re
 import shutil
 import subprocess
-import sys
 
 import numpy as np
 import pandas
@@ -21,21 +19,12 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_a_new_network_runs(folder, capsys):
+def test_a_new_network_says_what_to_do_next(folder, capsys):
     assert cli.main(["new", "cart.py"]) == 0
     assert capsys.readouterr().out == "cart.py: next, python cart.py\n"
     text = (folder / "cart.py").read_text()
     assert "heliograph run cart.py --measurements data.csv --report report" in text and "my_network" not in text
-    done = subprocess.run([sys.executable, "cart.py"], cwd=folder, capture_output=True, text=True, check=True)
-    rows = re.findall(r"(\w+): rmse ([\d.]+) .*NEES ([\d.]+)", done.stdout)
-    (aware, aware_rmse, aware_nees), (_, mean_rmse, mean_nees) = rows
-    assert aware == "relay_aware" and float(aware_rmse) < float(mean_rmse)
-    assert abs(float(aware_nees) - 1) < abs(float(mean_nees) - 1)
-    command = re.search(r"heliograph (run cart.py .*?)  ", text)[1]
-    assert cli.main(command.split()) == 0
-    summary = json.loads((folder / "report" / "summary.json").read_text())
-    assert summary["rows"] == 200 and abs(summary["links"]["cart"]["left"]["arrived"] - 0.9) < 0.11  # 5 deviations
-    assert summary["filters"]["cart"]["relay_aware"]["size"] < summary["filters"]["cart"]["mean_gain"]["size"]
+    compile(text, "cart.py", "exec")  # tests/test_readme.py runs it
 
 
 @pytest.mark.parametrize(

@@ -145,3 +145,16 @@ def test_a_stream_goes_on_after_a_pickle():
     assert other.push([0.3, np.nan], [0.5]) == stream.push([0.3, np.nan], [0.5])
     stream.push([0.3, np.nan], [0.5])
     assert other != stream
+
+
+def test_a_timeline_goes_on_after_a_pickle():
+    network = hg.Network(LINEAR, {"n": hg.Node(LOOK, hg.perfect(2), {"f": hg.kalman_filter(LINEAR, LOOK)})})
+    timeline = hg.Timeline(network, window=3.0)
+    assert timeline.push("n", 0, 2.0, [0.5, 0.1]) == "used"
+    other = pickle.loads(pickle.dumps(timeline))
+    assert other == timeline and repr(other) == repr(timeline) and len(repr(other).splitlines()) <= LONG + 1
+    for one in (timeline, other):
+        assert one.push("n", 1, 1.0, [0.2, 0.0], arrival=2.5) == "used"
+    assert same(other.estimates(), timeline.estimates())
+    timeline.push("n", 2, 3.0, [0.2, 0.0])
+    assert other != timeline

@@ -95,7 +95,7 @@ def identical(one: hg.Record, other: hg.Record) -> bool:
     return one == other and bits(one) == bits(other)
 
 
-@settings(max_examples=40, derandomize=True)
+@settings(max_examples=25, derandomize=True)
 @given(record=records())
 def test_a_record_comes_back_from_arrays_tables_and_pickles(record):
     assert identical(hg.Record.from_xarray(record.to_xarray()), record)
@@ -103,7 +103,7 @@ def test_a_record_comes_back_from_arrays_tables_and_pickles(record):
     assert identical(pickle.loads(pickle.dumps(record)), record) and identical(copy.deepcopy(record), record)
 
 
-@settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(record=records(), ending=st.sampled_from([".nc", ".nc", ".zarr"]))
 def test_a_record_comes_back_from_a_file(record, ending, tmp_path):
     path = tmp_path / f"record{ending}"
@@ -118,7 +118,7 @@ def test_names_in_files_can_be_read_and_undone(name):
     assert from_file(in_file(name)) == name and in_file(name).isprintable()
 
 
-@settings(max_examples=12, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=8, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     names=st.lists(NAMES, min_size=2, max_size=2, unique=True),
     numbers=st.lists(NUMBERS, min_size=1, max_size=6),

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.clock import uneven
@@ -18,11 +19,14 @@ from heliograph.live.tape import READ, Tape, copied, read
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import first, steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
 from heliograph.simulation.record import Record, by_name
 
 
+@readable
 class Timeline:
     """A network's filters on events that come late, out of order and twice.
 
@@ -76,6 +80,17 @@ class Timeline:
         self._order, self._free = np.zeros(slots, dtype=np.int32), list(range(slots - 2, 0, -1))
         self._unread, self._left = list[HeldRow](), list[int]()  # final rows, and slots to free when these were read
         self._latest: list[np.ndarray] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """All that is held, in double precision wherever it is read: what is compiled is no part of it."""
+        kept = {name: value for name, value in vars(self).items() if name != "_player"}
+        return kept | {"_tape": to_numpy(self._tape)}
+
+    def __setstate__(self, kept: dict[str, Any]) -> None:
+        vars(self).update(kept)
+        self._player = player(self.network)
+        with jax.enable_x64(True):
+            self._tape = jax.tree.map(jnp.asarray, self._tape)
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.

@@ -12,12 +12,14 @@ from numpy.typing import ArrayLike
 from heliograph.model.plant import AbstractPlant, LinearPlant, NoiseFunction
 from heliograph.model.sensor import AbstractSensor, LinearSensor, check_sensor
 from heliograph.numerics.check import array, fail, function, instance, scalar, table
+from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import library
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent, Matrix, Square, Vector
 
 Motion = Callable[[jax.Array], ArrayLike] | Matrix  # dx/dt, or the matrix of it
 
 
+@readable
 class Clock(NamedTuple):
     """A clock that shows t + offset at t; the offset grows by `drift` a unit of time, the drift wanders.
 

@@ -10,12 +10,14 @@ from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.sweep import carried_ahead, swept, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
 
 
+@readable
 class AbstractSmoothing(eqx.Module):
     """Which states are estimated from which later data, given what a filter retained of a run."""
 
