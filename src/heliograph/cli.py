@@ -77,6 +77,7 @@ def run(
     *,
     measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
     out: Annotated[Path, place("CSV or Parquet to write: estimates with their claimed covariances.")],
+    smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
 ) -> None:
     """Run the filters of your own network over measured data.
 
@@ -90,7 +91,9 @@ def run(
     from heliograph.files.table import check_output
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
+    from heliograph.smoothing.modes import named_smoothing
 
+    named_smoothing(smooth)
     check_output(out)
     if out.resolve() == measurements.resolve():
         raise fail(f"output file {out}", "another file than the measurements", "the same")
@@ -104,7 +107,7 @@ def run(
             raise fail(f"network {network}", "at least one filter to run", "none")
         recording = read_recording(measurements, loaded)
         advance(f"filtering {len(recording.time)} rows")
-        record = heliograph.run(loaded, *recording)
+        record = heliograph.run(loaded, *recording, smooth=named_smoothing(smooth))
         advance(f"writing {out}")
         write_estimates(record, out)
     for failure in record.failures():

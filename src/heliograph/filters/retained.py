@@ -16,6 +16,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.small_matrix import (
     congruence,
+    diagonal,
     runs_last,
     squared_distance,
     symmetric,
@@ -302,23 +303,46 @@ def linear_retained(
 
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular.
     """
-    present = ~jnp.isnan(innovation)
-    heard = jnp.where(present[:, None], output, 0.0)
-    both = present[:, None] & present
-    weigh = solve(jnp.where(both, total, jnp.diag(jnp.where(present, 0.0, 1.0))), heard).T
-    known = weigh @ heard
-    mean, covariance = jnp.asarray(after.mean), jnp.asarray(after.covariance)
+    heard, total, innovation = _of_what_arrived(jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation))
+    weigh = solve(total, heard).T
+    keep, known = _kept(jnp.asarray(prior.covariance), weigh, heard)
     return RetainedLinear(
-        mean=mean,
-        covariance=covariance,
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
         transition=jnp.asarray(transition),
-        keep=jnp.eye(len(mean)) - prior.covariance @ known,
+        keep=keep,
         weigh=weigh,
-        known=(known + known.T) / 2,
-        innovation=jnp.where(present, innovation, 0.0),
+        known=known,
+        innovation=innovation,
         claim=claim,
         want=None if want is None else jnp.asarray(want),
         shift=None,
         surprise=None,
         heard=None,
     )
+
+
+@runs_last
+def _of_what_arrived(
+    output: jax.Array, total: jax.Array, innovation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """H, S and e without the rows of what did not arrive, for which S has ones."""
+    present = ~jnp.isnan(innovation)
+    both = present[:, None] & present[None]
+    alone = diagonal(jnp.where(present, 0.0, 1.0))
+    return jnp.where(present[:, None], output, 0.0), jnp.where(both, total, alone), jnp.where(present, innovation, 0.0)
+
+
+@runs_last
+def _kept(prior: jax.Array, weigh: jax.Array, heard: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """I - K H and H' S^-1 H, from P-, H' S^-1 and H."""
+    known = symmetric(times(weigh, heard))
+    return diagonal(jnp.ones_like(prior[0])) - times(prior, known), known
+
+
+@runs_last
+def heard_through(
+    gain: jax.Array, offset: jax.Array, matrix: jax.Array, expected: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """H = M C and e = z - M y - b, from what is expected of y."""
+    return times(gain, matrix), z - times_vector(gain, expected) - offset

@@ -94,3 +94,18 @@ class FixedPoint(AbstractSmoothing):
         """One of the run's steps."""
         if self.step >= horizon:
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
+
+
+def named_smoothing(name: str) -> AbstractSmoothing | None:
+    """From a word on the command line: "all" for the fixed interval, a number for a lag, nothing for none.
+
+    Raises:
+        ValueError: another word.
+    """
+    if name == "":
+        return None
+    if name == "all":
+        return FixedInterval()
+    if not (name.isascii() and name.isdecimal()):
+        raise fail("--smooth", "all, or how many later rows", repr(name))
+    return FixedLag(int(name))

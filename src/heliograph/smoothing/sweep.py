@@ -35,13 +35,13 @@ def retained_steps(
     z = array("measurements", measurements, (None, filter.received or None), missing=True)
     z = z if filter.received else z[:, :0]
     u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
-    return _retained_steps(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
+    return stepped(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
 
 
 @compiled
-def _retained_steps(
-    item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
-) -> tuple[PyTree, AbstractRetained]:
+def stepped(item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, AbstractRetained]:
+    """The same inside a compiled computation."""
+
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractRetained]:
         return item.step_retained(state, *row)
 
@@ -54,9 +54,14 @@ def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
     planned = item.planned(inputs)
     if planned is item:
         return item
-    start = jax.tree.map(jnp.asarray, item.init())
+    return planned.with_past(quiet_steps(item, inputs))
+
+
+def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractRetained:
+    """What a filter retains of data that say nothing: for one whose gains no data change, all but means is right."""
     quiet = jnp.zeros((len(inputs), item.received))
-    return planned.with_past(_retained_steps(item, quiet, jnp.asarray(inputs), start, jnp.asarray(0))[1])
+    steps: AbstractRetained = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
+    return steps
 
 
 def swept(steps: AbstractRetained) -> Estimate:
