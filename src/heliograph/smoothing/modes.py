@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.retained import AbstractRetained
@@ -11,7 +12,7 @@ from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.smoothing.consistency import surprise_sums, warn_of
-from heliograph.smoothing.sweep import carried_ahead, swept, swept_over_lag
+from heliograph.smoothing.sweep import carried_ahead, swept, swept_means, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
 
@@ -30,6 +31,14 @@ class AbstractSmoothing(eqx.Module):
     def sweep(self, steps: AbstractRetained) -> Estimate:
         """The estimates, as `estimates`, of one run inside a compiled computation."""
         raise NotImplementedError
+
+    def means(self, steps: AbstractRetained) -> jax.Array:
+        """Means alone, where covariances are known from elsewhere."""
+        return jnp.asarray(self.sweep(steps).mean)
+
+    def covariances(self, steps: AbstractRetained) -> jax.Array:
+        """Covariances alone, whatever the data were."""
+        return jnp.asarray(self.sweep(steps.without_data()).covariance)
 
     def about(self, values: A) -> A:
         """Of something along time (..., time, n), such as the true state, what the estimates are about."""
@@ -50,6 +59,10 @@ class FixedInterval(AbstractSmoothing):
     def sweep(self, steps: AbstractRetained) -> Estimate:
         """(time, ...)."""
         return swept(steps)
+
+    def means(self, steps: AbstractRetained) -> jax.Array:
+        """(time, ...)."""
+        return swept_means(steps)
 
 
 class FixedLag(AbstractSmoothing):

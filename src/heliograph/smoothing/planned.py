@@ -31,7 +31,7 @@ class PlannedSmoother(eqx.Module):
         """Smoothed means of one run's z (horizon, received), written for `hg.simulation.over_runs` and `jax.vmap`."""
 
         _, steps = stepped(self.filter, jnp.asarray(z), self.inputs, self.filter.init(), np.asarray(0))
-        return jnp.asarray(self.smoothing.sweep(steps).mean)
+        return self.smoothing.means(steps)
 
 
 def planned_smoother(

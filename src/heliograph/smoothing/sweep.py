@@ -11,6 +11,7 @@ from heliograph.filters.retained import AbstractRetained, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
 
 T = TypeVar("T")
@@ -66,17 +67,43 @@ def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractRetained:
 
 def swept(steps: AbstractRetained) -> Estimate:
     """Each step's state given all data: one sweep back."""
+    return Estimate(*_both(steps), steps.claim)
 
-    def body(later: PyTree, item: tuple[AbstractRetained, jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        step, mean, covariance = item
-        earlier = step.back(later, mean, covariance)
-        return earlier, earlier
 
-    end = row(steps, -1).end()
-    rows = rows_of(steps, slice(1, None)), steps.mean[:-1], steps.covariance[:-1]
-    _, earlier = jax.lax.scan(body, end, rows, reverse=True)
-    later = jax.tree.map(lambda some, last: jnp.concatenate([some, last[None]]), earlier, end)
-    return _told(steps, later)
+def swept_means(steps: AbstractRetained) -> jax.Array:
+    """Its means alone."""
+    return _means(steps)
+
+
+@runs_last
+def _both(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+    return _back(steps)
+
+
+@runs_last
+def _means(steps: AbstractRetained) -> jax.Array:
+    return _back(steps)[0]
+
+
+def _back(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+    """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
+
+    def told(step: AbstractRetained, later: PyTree) -> tuple[jax.Array, jax.Array]:
+        found = step.told(step.smoothed(later))
+        return jnp.asarray(found.mean), jnp.asarray(found.covariance)
+
+    def body(later: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, Any]:
+        before, step = item
+        earlier = step.back(later, before.mean, before.covariance)
+        return earlier, told(before, earlier)
+
+    last = row(steps, -1)
+    rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
+    shapes, _ = jax.eval_shape(body, last.end(), row(rows, -1))  # of what runs share, their axis is 1 long
+    end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), last.end(), shapes)
+    _, found = jax.lax.scan(body, end, rows, reverse=True)
+    mean, covariance = (jnp.concatenate([part, one[None]]) for part, one in zip(found, told(last, end), strict=True))
+    return mean, covariance
 
 
 def swept_over_lag(steps: AbstractRetained, lag: int | Int[Array, ""]) -> Estimate:
