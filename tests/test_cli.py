@@ -101,6 +101,17 @@ def test_run_writes_what_the_library_computes(folder, capsys):
             assert row["valid"] == 1
 
 
+def test_run_writes_what_later_rows_say_too(folder, capsys):
+    assert cli.main([*run_arguments(), "--smooth", "1"]) == 0
+    net, table = load_network("net.py"), read_table("out.csv")
+    found = h.run(net, *read_recording("data.csv", net), smooth=h.smoothing.FixedLag(1)).smoothed
+    for name, estimate in found.estimates["remote"].items():
+        np.testing.assert_allclose(table[f"{name}.smoothed.p"], estimate.mean[:, 0], rtol=1e-12)
+        assert table[f"{name}.smoothed.v.sd"][1] < table[f"{name}.v.sd"][1]
+    assert cli.main([*run_arguments(), "--smooth", "soon"]) == 2
+    assert "--smooth: expected all, or how many later rows, got 'soon'" in capsys.readouterr().err
+
+
 def test_names_do_not_act_on_the_terminal(folder, capsys):
     (folder / "net.py").write_text(NETWORK.replace('"aware"', '"\\x1b[31maware"'))
     assert cli.main(run_arguments()) == 0

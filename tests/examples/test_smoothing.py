@@ -21,7 +21,7 @@ def summary(tmp_path_factory):
         patch.setattr(compute, "RUNS", 400)
         out = tmp_path_factory.mktemp("example")
         example(out, 0)
-    assert {"report.html", "path.svg", "deviations.svg"} <= {p.name for p in (out / "smoothing").iterdir()}
+    assert {"report.html", "errors.svg", "deviations.svg"} <= {p.name for p in (out / "smoothing").iterdir()}
     return json.loads((out / "smoothing" / "summary.json").read_text())
 
 

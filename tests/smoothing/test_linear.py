@@ -6,6 +6,7 @@ import pytest
 import heliograph as hg
 from tests.oracles.stacked_estimate import Step, estimate, stacked
 
+PLANT = hg.LinearPlant([[1.0]], 1.0, [0.0], 1.0)
 N, M, TIME, LAG, POINT = 3, 2, 9, 3, 2
 VALUES = np.array([0.2, 1.1, 1.4])
 CLOSE = 1e-11  # of numbers of size one; the worst of 60 such problems is 4e-12, in one where P- is nearly singular
@@ -30,7 +31,7 @@ def problem(seed):
         channels.append(hg.hop(hg.Discrete(VALUES, chances), n))
         gains = VALUES[:, None, None] * np.eye(M)
         steps.append(Step(a, np.zeros(N), q, c, np.zeros(M), r, gains, chances, np.zeros(M), n))
-    z = 2 * rng.normal(size=(TIME, M))
+    z = rng.normal(size=(TIME, M))
     z[rng.random((TIME, M)) < 0.3] = np.nan
     item = hg.linear_filter(hg.over_time(plants), hg.over_time(sensors), hg.over_time(channels))
     return item, stacked(mean, covariance, steps), z
@@ -51,3 +52,18 @@ def test_smoothers_are_the_stacked_linear_estimate(seed):
             mean, covariance = given[upto]
             np.testing.assert_allclose(found.mean[at], mean[about], atol=CLOSE, rtol=0)
             np.testing.assert_allclose(found.covariance[at], covariance[about], atol=CLOSE, rtol=0)
+
+
+def test_planned_before_data_it_maps_data_to_the_same_means():
+    item, _, z = problem(0)
+    z = 0.1 * np.nan_to_num(z)  # larger data would not be such as the filter expects, and warn
+    for smoothing in (hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(LAG)):
+        planned = hg.smoothing.planned_smoother(item, TIME, smoothing)
+        _, steps = hg.smoothing.retained_steps(item, z)
+        known = smoothing.estimates(steps)
+        means = hg.simulation.over_runs(planned.means, np.stack([z, 2 * z]))
+        np.testing.assert_allclose(means[0], known.mean, atol=CLOSE, rtol=0)
+        np.testing.assert_allclose(planned.estimate.covariance, known.covariance, atol=CLOSE, rtol=0)
+        assert planned.estimate.claim == "exact"
+    with pytest.raises(ValueError, match=r"filter: expected one whose gains depend on no data, got OpenLoop"):
+        hg.smoothing.planned_smoother(hg.open_loop_filter(PLANT), 3, hg.smoothing.FixedInterval())

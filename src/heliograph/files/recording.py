@@ -108,7 +108,8 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
     `time`; then for each filter the mean `STATE`, the standard deviation `STATE.sd`, the covariances `cov.A.B` (A
     before B in the state), and `valid`: false where mean or covariance are not finite, or the covariance is no
     longer positive semidefinite. A filter that claims no covariance has no columns for one. Each name starts with
-    `NODE.` where there are several nodes, and with `FILTER.` where a node has several filters.
+    `NODE.` where there are several nodes, and with `FILTER.` where a node has several filters. What was estimated given
+    later data too has the same columns under `smoothed.`, from the row on that it begins with.
 
     Raises:
         ValueError: Monte Carlo runs, or names that coincide.
@@ -119,6 +120,10 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
         for name, estimate in filters.items():
             prefix = "".join(f"{part}." for part, used in zip((node, name), several, strict=True) if used)
             columns += [(prefix + key, values) for key, values in _claims(record.states, estimate)]
+            later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
+            if name in later:
+                told = _claims(record.states, later[name])
+                columns += [(f"{prefix}smoothed.{key}", _at_the_end(values, len(record.time))) for key, values in told]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")
@@ -149,6 +154,12 @@ def _claims(states: Sequence[str], estimate: Estimate) -> list[tuple[str, np.nda
         for i, a in enumerate(states):
             result += [(f"cov.{a}.{states[j]}", bound[:, i, j]) for j in range(i + 1, len(states))]
     return [*result, ("valid", is_sound(estimate))]
+
+
+def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
+    """The last rows of a column; those before are NaN, or false."""
+    none = np.full(rows - len(values), np.nan if values.dtype.kind == "f" else False)
+    return np.concatenate([none.astype(values.dtype), values])
 
 
 def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:

@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal, known_gain_covariance
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, linear_retained, moments_retained
+from heliograph.filters.retained import AbstractRetained, heard_through, linear_retained, moments_retained
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, Transformed, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.angle import received_angles
@@ -97,15 +97,9 @@ class GaussianFilter(AbstractFilter):
         y = signal_of(plant, sensor, self.transform, prior)
         expected = channel.mean_gain @ y.mean + channel.offset
         z = nearest(jnp.asarray(z), expected, self.heard_angles)
-        return linear_retained(
-            after,
-            prior,
-            plant.matrix,
-            channel.mean_gain @ sensor.matrix,
-            z - expected,
-            known_gain_covariance(y, channel, ~jnp.isnan(z)),
-            self.claim,
-        )
+        output, innovation = heard_through(channel.mean_gain, channel.offset, sensor.matrix, y.mean, z)
+        total = known_gain_covariance(y, channel, ~jnp.isnan(z))
+        return linear_retained(after, prior, plant.matrix, output, innovation, total, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""

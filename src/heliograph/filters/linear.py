@@ -16,7 +16,7 @@ from heliograph.filters.gaussian import Belief, describe, predicted
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.modal import modal_filter
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, linear_retained, moments_retained
+from heliograph.filters.retained import AbstractRetained, heard_through, linear_retained, moments_retained
 from heliograph.filters.told import told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.uncertain import uncertain_modal_filter
@@ -118,16 +118,10 @@ class LinearFilter(AbstractFilter):
             cross = before.covariance @ transition.T
             return moments_retained(after, prior, cross, "nominal")
         y = signal(prior, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-        expected = channel.mean_gain @ (sensor.matrix @ prior.mean + sensor.noise.mean) + channel.offset
-        return linear_retained(
-            after,
-            prior,
-            transition,
-            channel.mean_gain @ sensor.matrix,
-            z - expected,
-            known_gain_covariance(y, channel, ~jnp.isnan(z)),
-            self.claim,
-        )
+        expected = sensor.matrix @ prior.mean + sensor.noise.mean
+        output, innovation = heard_through(channel.mean_gain, channel.offset, sensor.matrix, expected, z)
+        total = known_gain_covariance(y, channel, ~jnp.isnan(z))
+        return linear_retained(after, prior, transition, output, innovation, total, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""

@@ -15,6 +15,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
 from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.retained import AbstractRetained, moments_retained
 from heliograph.filters.told import Told, by_pattern, pattern_of
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope
@@ -156,8 +157,22 @@ class MultipleModelFilter(AbstractFilter):
     @in_float64
     def estimate(self, state: ModalBeliefs) -> Estimate:
         """Mean and covariance of the whole mixture, angles between -pi and pi."""
-        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-        return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
+        whole = _whole(state)
+        return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
+
+    def retain(
+        self, before: ModalBeliefs, prior: ModalBeliefs, after: ModalBeliefs, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """Moments of the whole mixture around the update; nothing later is said of the modes."""
+        own = _whole(before)
+        cross = predicted(at(self.plant, k), self.transform, own, jnp.asarray(u)).cross
+        return moments_retained(_whole(after), _whole(prior), cross, "nominal")
+
+
+def _whole(state: ModalBeliefs) -> Belief:
+    """Mean and covariance of the whole mixture."""
+    found, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+    return Belief(found.mean[0], found.covariance[0])
 
 
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:

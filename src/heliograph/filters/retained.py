@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.numerics.linalg import psd_solve
 from heliograph.numerics.small_matrix import (
     congruence,
+    diagonal,
     runs_last,
     squared_distance,
     symmetric,
@@ -24,6 +24,7 @@ from heliograph.numerics.small_matrix import (
     transpose,
     with_rounding,
 )
+from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Array, Float, PyTree
 
 
@@ -88,6 +89,10 @@ class AbstractRetained(eqx.Module):
         n = self.mean.shape[-1]
         return Point(self.mean, self.covariance, self._link(n))
 
+    def without_data(self) -> "AbstractRetained":
+        """The same step without what only means depend on."""
+        raise NotImplementedError
+
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> "AbstractRetained":
         """The same step of other data that arrived in the same places: only means and innovation are others."""
         raise NotImplementedError
@@ -106,7 +111,7 @@ class AbstractRetained(eqx.Module):
 class RetainedLinear(AbstractRetained):
     """A linear update: y- = A y + ..., y = y- + K e, e = z - H y- - ..., K = P- H' S^-1, nothing else inverted.
 
-    transition A, keep B = I - K H, weigh H' S^-1, known H' S^-1 H, innovation e; of what did not arrive nothing.
+    transition A, gain K, output H, weigh H' S^-1, innovation e; of what did not arrive nothing. With B = I - K H,
     lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both through A'.
 
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
@@ -115,9 +120,9 @@ class RetainedLinear(AbstractRetained):
     mean: Float[jax.Array, "*time N"]
     covariance: Float[jax.Array, "*time N N"]
     transition: Float[jax.Array, "*time N N"]
-    keep: Float[jax.Array, "*time N N"]
+    gain: Float[jax.Array, "*time N m"]
+    output: Float[jax.Array, "*time m N"]
     weigh: Float[jax.Array, "*time N m"]
-    known: Float[jax.Array, "*time N N"]
     innovation: Float[jax.Array, "*time m"]
     claim: Claim = eqx.field(static=True)
     want: Float[jax.Array, "*time n N"] | None
@@ -131,8 +136,8 @@ class RetainedLinear(AbstractRetained):
 
     def back(self, later: Adjoint, mean: jax.Array, covariance: jax.Array) -> Adjoint:
         """Through the update, then through the transition."""
-        vector = _vector_back(later.vector, self.transition, self.keep, self.weigh, self.innovation)
-        return Adjoint(vector, _matrix_back(later.matrix, self.transition, self.keep, self.known))
+        vector = _vector_back(later.vector, self.transition, self.gain, self.output, self.weigh, self.innovation)
+        return Adjoint(vector, _matrix_back(later.matrix, self.transition, self.gain, self.output, self.weigh))
 
     def smoothed(self, later: Adjoint) -> Moments:
         """x - P lambda and P - P Lambda P."""
@@ -142,9 +147,12 @@ class RetainedLinear(AbstractRetained):
 
     def ahead(self, point: Point) -> Point:
         """Pi- = Pi A', g = Pi- H' S^-1: x_j + g e, P_j - g H Pi-', and Pi = Pi- B'; Pi is Cov(y_j, y)."""
-        moved = _right(point.link, self.transition)
-        news = _product(moved, _product(self.weigh, self.innovation))
-        return Point(point.mean + news, _less(point.covariance, moved, self.known), _right(moved, self.keep))
+        return Point(*_point_ahead(*point, self.transition, self.gain, self.output, self.weigh, self.innovation))
+
+    def without_data(self) -> AbstractRetained:
+        """Without mean and innovation."""
+        mean, innovation = jnp.zeros_like(self.mean), jnp.zeros_like(self.innovation)
+        return replace(self, mean=mean, innovation=innovation, shift=None, surprise=None, heard=None)
 
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
         """Mean and innovation."""
@@ -193,6 +201,11 @@ class RetainedMoments(AbstractRetained):
         news = _product(gain, self.mean - self.prior_mean)
         return Point(point.mean + news, _less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
 
+    def without_data(self) -> AbstractRetained:
+        """Without both means."""
+        none = jnp.zeros_like(self.mean)
+        return replace(self, mean=none, prior_mean=none, shift=None, surprise=None, heard=None)
+
     def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractRetained:
         """Both means."""
         return replace(self, mean=mean, prior_mean=prior_mean)
@@ -201,26 +214,59 @@ class RetainedMoments(AbstractRetained):
         return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
 
     def _gain(self) -> jax.Array:
-        return jnp.swapaxes(psd_solve(self.prior_covariance, jnp.swapaxes(self.cross, -1, -2)), -1, -2)
+        return _solved(self.prior_covariance, self.cross)
 
 
 @runs_last
 def _vector_back(
-    vector: jax.Array, transition: jax.Array, keep: jax.Array, weigh: jax.Array, innovation: jax.Array
+    vector: jax.Array,
+    transition: jax.Array,
+    gain: jax.Array,
+    output: jax.Array,
+    weigh: jax.Array,
+    innovation: jax.Array,
 ) -> jax.Array:
-    before = times_vector(transpose(keep), vector) - times_vector(weigh, innovation)
-    return times_vector(transpose(transition), before)
+    kept = vector - times_vector(transpose(output), times_vector(transpose(gain), vector))
+    return times_vector(transpose(transition), kept - times_vector(weigh, innovation))
 
 
 @runs_last
-def _matrix_back(matrix: jax.Array, transition: jax.Array, keep: jax.Array, known: jax.Array) -> jax.Array:
-    return symmetric(congruence(transpose(transition), congruence(transpose(keep), matrix) + known))
+def _matrix_back(
+    matrix: jax.Array, transition: jax.Array, gain: jax.Array, output: jax.Array, weigh: jax.Array
+) -> jax.Array:
+    half = matrix - times(times(matrix, gain), output)
+    kept = half - times(transpose(output), times(transpose(gain), half)) + times(weigh, output)
+    return symmetric(congruence(transpose(transition), kept))
+
+
+@runs_last
+def _point_ahead(
+    mean: jax.Array,
+    covariance: jax.Array,
+    link: jax.Array,
+    transition: jax.Array,
+    gain: jax.Array,
+    output: jax.Array,
+    weigh: jax.Array,
+    innovation: jax.Array,
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    moved = times(link, transpose(transition))
+    news = times(moved, weigh)
+    heard = times(output, transpose(moved))
+    after = symmetric(with_rounding(covariance, len(covariance)) - times(news, heard))
+    return mean + times_vector(news, innovation), after, moved - times(transpose(heard), transpose(gain))
 
 
 @runs_last
 def _less(p: jax.Array, factor: jax.Array, inner: jax.Array) -> jax.Array:
     """P - F M F', known to rounding of P alone, which is added."""
     return symmetric(with_rounding(p, len(p)) - congruence(factor, inner))
+
+
+@runs_last
+def _solved(a: jax.Array, b: jax.Array) -> jax.Array:
+    """B A^+."""
+    return transpose(small_solve(a, transpose(b)))
 
 
 @runs_last
@@ -231,12 +277,6 @@ def _product(a: jax.Array, x: jax.Array) -> jax.Array:
 @runs_last
 def _product_of(a: jax.Array, b: jax.Array) -> jax.Array:
     return times(a, b)
-
-
-@runs_last
-def _right(a: jax.Array, b: jax.Array) -> jax.Array:
-    """A B'."""
-    return times(a, transpose(b))
 
 
 @runs_last
@@ -296,29 +336,56 @@ def linear_retained(
     total: Array,
     claim: Claim,
     want: Array | None = None,
-    solve: Callable[[jax.Array, jax.Array], jax.Array] = psd_solve,
+    solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> RetainedLinear:
     """From the states after and before a correction, A, H, e, and the S that the gain was made for.
 
-    Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular.
+    Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
+    component that others determine is left out.
     """
-    present = ~jnp.isnan(innovation)
-    heard = jnp.where(present[:, None], output, 0.0)
-    both = present[:, None] & present
-    weigh = solve(jnp.where(both, total, jnp.diag(jnp.where(present, 0.0, 1.0))), heard).T
-    known = weigh @ heard
-    mean, covariance = jnp.asarray(after.mean), jnp.asarray(after.covariance)
+    given = jnp.asarray(prior.covariance), jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    if solve is None:
+        gain, weigh, heard, innovation = _parts(*given)
+    else:
+        heard, total, innovation = _of_what_arrived(*given[1:])
+        weigh = solve(total, heard).T
+        gain = given[0] @ weigh
     return RetainedLinear(
-        mean=mean,
-        covariance=covariance,
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
         transition=jnp.asarray(transition),
-        keep=jnp.eye(len(mean)) - prior.covariance @ known,
+        gain=gain,
+        output=heard,
         weigh=weigh,
-        known=(known + known.T) / 2,
-        innovation=jnp.where(present, innovation, 0.0),
+        innovation=innovation,
         claim=claim,
         want=None if want is None else jnp.asarray(want),
         shift=None,
         surprise=None,
         heard=None,
     )
+
+
+@runs_last
+def _parts(prior: jax.Array, output: jax.Array, total: jax.Array, innovation: jax.Array) -> tuple[jax.Array, ...]:
+    heard, total, innovation = _of_what_arrived(output, total, innovation)
+    weigh = transpose(small_solve(total, heard))
+    return times(prior, weigh), weigh, heard, innovation
+
+
+def _of_what_arrived(
+    output: jax.Array, total: jax.Array, innovation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """H, S and e without the rows of what did not arrive, for which S has ones."""
+    present = ~jnp.isnan(innovation)
+    both = present[:, None] & present[None]
+    alone = diagonal(jnp.where(present, 0.0, 1.0))
+    return jnp.where(present[:, None], output, 0.0), jnp.where(both, total, alone), jnp.where(present, innovation, 0.0)
+
+
+@runs_last
+def heard_through(
+    gain: jax.Array, offset: jax.Array, matrix: jax.Array, expected: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """H = M C and e = z - M y - b, from what is expected of y."""
+    return times(gain, matrix), z - times_vector(gain, expected) - offset

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, GaussianFilter
+from heliograph.filters.gaussian import Belief, GaussianFilter, predicted
+from heliograph.filters.retained import AbstractRetained, moments_retained
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
-from heliograph.model.over_time import alike, stack
+from heliograph.model.over_time import alike, at, stack
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -65,6 +66,14 @@ class SequentialFilter(AbstractFilter):
         """The belief, as the first node's filter tells it."""
         told = self.filters[0].estimate(state)
         return Estimate(told.mean, told.covariance, self.claim)
+
+    def retain(
+        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractRetained:
+        """The moments around all nodes' updates."""
+        item = self.filters[0]
+        cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
+        return moments_retained(after, prior, cross, self.claim)
 
 
 def _joined(each: Sequence[Innovation]) -> Innovation:

@@ -5,6 +5,7 @@ Sigma- <= (1 + b) F Sigma F' + (1 + 1/b) D + W with D >= sum_i p_i Delta_i Delta
 What depends on the law p of the modes is bounded over the interval in which p can be.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,6 +24,7 @@ from heliograph.filters.modal import (
     sum_of_modes,
 )
 from heliograph.filters.plan import plan
+from heliograph.filters.retained import AbstractRetained, moments_retained
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
@@ -110,6 +112,22 @@ class UncertainModalFilter(AbstractFilter):
         """x = sum_j zeta^j."""
         want = sum_of_modes(len(self.states), len(self.initial))
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+
+    def retain(
+        self,
+        before: UncertainBelief,
+        prior: UncertainBelief,
+        after: UncertainBelief,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractRetained:
+        """The moments of zeta around the update; what is proved of the filter's bound is not of theirs."""
+        move, _ = move_matrix(at(self.plant, k), jnp.asarray(u))
+        rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
+        cross = before.covariance @ jnp.kron(rows.T, move).T
+        want = sum_of_modes(len(self.states), len(self.initial))
+        return replace(moments_retained(after, prior, cross, "nominal"), want=jnp.asarray(want))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""

@@ -82,9 +82,12 @@ def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bo
 
 
 def has_known_mean(described: SecondOrder) -> bool:
-    """Whether E[G] and E[n] are the same under every possible law; with traced parameters that is not known."""
-    shift = described.shift
-    return not is_traced(shift) and not np.any(shift.center) and not np.any(shift.radius)
+    """Whether E[G] and E[n] are the same under every possible law, to rounding; with traced parameters nobody knows."""
+    if is_traced((described.shift, described.mean_gain, described.offset)):
+        return False
+    size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
+    largest = max(np.max(np.abs(part), initial=0.0) for part in (described.shift.center, described.shift.radius))
+    return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
 
 
 def has_known_gain(channel: AbstractRandomAffine) -> bool:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.retained import AbstractRetained
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
@@ -39,10 +40,9 @@ class Smoother(eqx.Module):
         """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
         retained = [found["retained"][k] for k in self.kinds]
         filtered = {name: part for name, part in found.items() if name not in ("retained", "retained_centrally")}
-        each = jax.vmap(jax.vmap(self.smoothing.sweep, in_axes=1, out_axes=1), in_axes=1, out_axes=1)
         surprised = jax.vmap(jax.vmap(surprise_sums, in_axes=1), in_axes=1)
-        estimates = tuple(each_run(each, steps) for steps in retained)
-        fused = {name: each_run(self.smoothing.sweep, steps) for name, steps in found["retained_centrally"].items()}
+        estimates = tuple(self._estimates(steps, 2) for steps in retained)
+        fused = {name: self._estimates(steps, 0) for name, steps in found["retained_centrally"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
         length = jax.tree.leaves((estimates, fused))[0].shape[1]
@@ -57,6 +57,20 @@ class Smoother(eqx.Module):
         surprise = tuple(each_run(surprised, steps) for steps in retained)
         centrally = {name: each_run(surprise_sums, steps) for name, steps in found["retained_centrally"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": surprise, "fused": centrally}}
+
+    def _estimates(self, steps: AbstractRetained, axes: int) -> Estimate:
+        """Of runs (run, time, ...), with so many axes after time; where runs share all matrices, covariances once."""
+
+        def over(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree], PyTree]:
+            for _ in range(axes):
+                function = jax.vmap(function, in_axes=1, out_axes=1)
+            return function
+
+        if len(steps.covariance) == len(steps.mean):
+            result: Estimate = each_run(over(self.smoothing.sweep), steps)
+            return result
+        covariances = each_run(over(self.smoothing.covariances), steps)
+        return Estimate(each_run(over(self.smoothing.means), steps), covariances, steps.claim)
 
 
 def _combined(item: Fused, estimates: Sequence[Estimate]) -> dict[str, Estimate]:

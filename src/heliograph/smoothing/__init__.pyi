@@ -6,6 +6,10 @@ from .modes import (
     FixedLag as FixedLag,
     FixedPoint as FixedPoint,
 )
+from .planned import (
+    PlannedSmoother as PlannedSmoother,
+    planned_smoother as planned_smoother,
+)
 from .sweep import (
     retained_steps as retained_steps,
 )

@@ -4,6 +4,7 @@ from typing import TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.retained import AbstractRetained
@@ -12,7 +13,7 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.smoothing.consistency import surprise_sums, warn_of
-from heliograph.smoothing.sweep import carried_ahead, swept, swept_over_lag
+from heliograph.smoothing.sweep import carried_ahead, swept, swept_means, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
 
@@ -33,6 +34,14 @@ class AbstractSmoothing(eqx.Module):
         """The estimates, as `estimates`, of one run inside a compiled computation."""
         raise NotImplementedError
 
+    def means(self, steps: AbstractRetained) -> jax.Array:
+        """Means alone, where covariances are known from elsewhere."""
+        return jnp.asarray(self.sweep(steps).mean)
+
+    def covariances(self, steps: AbstractRetained) -> jax.Array:
+        """Covariances alone, whatever the data were."""
+        return jnp.asarray(self.sweep(steps.without_data()).covariance)
+
     def about(self, values: A) -> A:
         """Of something along time (..., time, n), such as the true state, what the estimates are about."""
         return values
@@ -52,6 +61,10 @@ class FixedInterval(AbstractSmoothing):
     def sweep(self, steps: AbstractRetained) -> Estimate:
         """(time, ...)."""
         return swept(steps)
+
+    def means(self, steps: AbstractRetained) -> jax.Array:
+        """(time, ...)."""
+        return swept_means(steps)
 
 
 class FixedLag(AbstractSmoothing):
@@ -96,3 +109,18 @@ class FixedPoint(AbstractSmoothing):
         """One of the run's steps."""
         if self.step >= horizon:
             raise fail("step of a fixed point", f"one of the run's {horizon}, counted from 0", self.step)
+
+
+def named_smoothing(name: str) -> AbstractSmoothing | None:
+    """From a word on the command line: "all" for the fixed interval, a number for a lag, nothing for none.
+
+    Raises:
+        ValueError: another word.
+    """
+    if name == "":
+        return None
+    if name == "all":
+        return FixedInterval()
+    if not (name.isascii() and name.isdecimal()):
+        raise fail("--smooth", "all, or how many later rows", repr(name))
+    return FixedLag(int(name))

@@ -11,6 +11,7 @@ from heliograph.filters.retained import AbstractRetained, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
 
 T = TypeVar("T")
@@ -35,13 +36,13 @@ def retained_steps(
     z = array("measurements", measurements, (None, filter.received or None), missing=True)
     z = z if filter.received else z[:, :0]
     u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
-    return _retained_steps(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
+    return stepped(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
 
 
 @compiled
-def _retained_steps(
-    item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
-) -> tuple[PyTree, AbstractRetained]:
+def stepped(item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, AbstractRetained]:
+    """The same inside a compiled computation."""
+
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractRetained]:
         return item.step_retained(state, *row)
 
@@ -54,24 +55,55 @@ def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
     planned = item.planned(inputs)
     if planned is item:
         return item
-    start = jax.tree.map(jnp.asarray, item.init())
+    return planned.with_past(quiet_steps(item, inputs))
+
+
+def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractRetained:
+    """What a filter retains of data that say nothing: for one whose gains no data change, all but means is right."""
     quiet = jnp.zeros((len(inputs), item.received))
-    return planned.with_past(_retained_steps(item, quiet, jnp.asarray(inputs), start, jnp.asarray(0))[1])
+    steps: AbstractRetained = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
+    return steps
 
 
 def swept(steps: AbstractRetained) -> Estimate:
     """Each step's state given all data: one sweep back."""
+    return Estimate(*_both(steps), steps.claim)
 
-    def body(later: PyTree, item: tuple[AbstractRetained, jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        step, mean, covariance = item
-        earlier = step.back(later, mean, covariance)
-        return earlier, earlier
 
-    end = row(steps, -1).end()
-    rows = rows_of(steps, slice(1, None)), steps.mean[:-1], steps.covariance[:-1]
-    _, earlier = jax.lax.scan(body, end, rows, reverse=True)
-    later = jax.tree.map(lambda some, last: jnp.concatenate([some, last[None]]), earlier, end)
-    return _told(steps, later)
+def swept_means(steps: AbstractRetained) -> jax.Array:
+    """Its means alone."""
+    return _means(steps)
+
+
+@runs_last
+def _both(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+    return _back(steps)
+
+
+@runs_last
+def _means(steps: AbstractRetained) -> jax.Array:
+    return _back(steps)[0]
+
+
+def _back(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+    """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
+
+    def told(step: AbstractRetained, later: PyTree) -> tuple[jax.Array, jax.Array]:
+        found = step.told(step.smoothed(later))
+        return jnp.asarray(found.mean), jnp.asarray(found.covariance)
+
+    def body(later: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, Any]:
+        before, step = item
+        earlier = step.back(later, before.mean, before.covariance)
+        return earlier, told(before, earlier)
+
+    last = row(steps, -1)
+    rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
+    shapes, _ = jax.eval_shape(body, last.end(), row(rows, -1))  # of what runs share, their axis is 1 long
+    end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), last.end(), shapes)
+    _, found = jax.lax.scan(body, end, rows, reverse=True)
+    mean, covariance = (jnp.concatenate([part, one[None]]) for part, one in zip(found, told(last, end), strict=True))
+    return mean, covariance
 
 
 def swept_over_lag(steps: AbstractRetained, lag: int | Int[Array, ""]) -> Estimate:

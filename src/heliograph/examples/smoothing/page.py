@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+import heliograph as hg
 from heliograph.examples.smoothing.compute import LAG_STEP, LAGS, RUNS, Outcome
 from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, PALE, PURPLE, STYLE, VERMILION, WIDTH, Curve
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, VERMILION, Curve, errors_with_bands
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 
 COLOURS = dict(zip(LAGS, (AMBER, PURPLE, GREEN, VERMILION), strict=True))
@@ -16,31 +16,25 @@ SHOWN_LAGS = (1, 5, 20)
 
 
 def smoothing_figures(outcome: Outcome) -> dict[str, Figure]:
-    """Deviations over time, and one run on its map."""
+    """Deviations over time, and the errors of one run."""
     clock = np.arange(1, len(outcome.filtered) + 1)
-    curves = [Curve("filter", "#66727f", _deviation(outcome.filtered))]
+    curves = [Curve("filter", MUTED, _deviation(outcome.filtered))]
     curves += [Curve(f"lag {lag}", COLOURS[lag], _deviation(outcome.lagged[lag])) for lag in SHOWN_LAGS]
     curves.append(Curve("all data", BLUE, _deviation(outcome.smoothed)))
-    return {"deviations": curves_over_time(clock, [Panel("deviation of the place", curves)]), "path": _path(outcome)}
+    return {
+        "deviations": curves_over_time(clock, [Panel("deviation of the place", curves)]),
+        "errors": _errors(outcome.run),
+    }
 
 
-@matplotlib.rc_context(STYLE)
-def _path(outcome: Outcome) -> Figure:
-    """The first run: true path, filter and smoother side by side."""
-    run = outcome.run
-    assert run.smoothed is not None and run.truth is not None  # it was simulated and smoothed
-    figure = Figure(figsize=(WIDTH, WIDTH / 2 + 0.6), layout="constrained")
-    row = figure.subplots(1, 2, sharex=True, sharey=True)
-    parts = {"filter": (run, "#66727f"), "smoother": (run.smoothed, BLUE)}
-    for axes, (name, (part, colour)) in zip(row, parts.items(), strict=True):
-        (true,) = axes.plot(run.truth[:, 0], run.truth[:, 2], color=PALE, linewidth=3.5)
-        mean = np.asarray(part.estimates["node"]["linear"].mean)
-        axes.plot(mean[:, 0], mean[:, 2], color=colour, linewidth=1.2)
-        axes.set(xlabel="x", aspect="equal")
-        axes.set_title(name, color=colour)
-    row[0].set_ylabel("y")
-    figure.legend([true], ["true path"], loc="outside lower right", frameon=False)
-    return figure
+def _errors(run: hg.Record) -> Figure:
+    """Errors of one run within what filter and smoother claim."""
+    parts = {"filter": (run, MUTED), "smoother": (run.smoothed or run, BLUE)}
+    curves = []
+    for name, (part, colour) in parts.items():
+        deviation = np.sqrt(np.diagonal(part.estimates["node"]["linear"].covariance, axis1=1, axis2=2))
+        curves.append(Curve(name, colour, part.errors("node", "linear")[:, [0, 2]], deviation[:, [0, 2]]))
+    return errors_with_bands(run.time, curves, ["x", "y"])
 
 
 def smoothing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
@@ -61,12 +55,13 @@ def smoothing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
     sections = [
         Section("A moving point behind two fading hops", [
             KeyFigures([
-                KeyFigure("filter", f"{filtered[at]:.3f}", f"deviation at step {LAG_STEP}", "#66727f"),
+                KeyFigure("filter", f"{filtered[at]:.3f}", f"deviation at step {LAG_STEP}", MUTED),
                 KeyFigure("smoother", f"{smoothed[at]:.3f}", "given all 100 steps", BLUE),
             ]),
             Picture(pictures["deviations"], "Deviation of the place over time by lag", "Claimed before any data."),
             Table(["lag", "variance of the filter's"], lags, f"Variance of the place at step {LAG_STEP}."),
-            Picture(pictures["path"], "One run on its map, filtered and smoothed", "One run."),
+            Picture(pictures["errors"], "Errors of one run, filtered and smoothed, within two claimed deviations",
+                    "Errors of one run, and two claimed deviations."),
             Table(["", "RMSE", "NEES per dimension"], measured, f"{RUNS} simulated runs; 1 if the claim is exact."),
         ]),
         Section("A receiver behind relays that take turns", [

@@ -1,0 +1,37 @@
+"""Smoothers by moments around an update: as the best where that is known, better than the filter elsewhere."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+
+PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
+SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.05)
+INTERVAL = hg.smoothing.FixedInterval()
+HORIZON, RUNS = 15, 200
+
+
+def test_a_central_filter_without_random_gains_smooths_as_one_that_hears_all_at_once():
+    links = [hg.hop(0.8, 0.1), hg.hop(1.1, 0.3)]
+    central = hg.filters.sequential_filter([hg.cubature_filter(PLANT, SENSOR, link) for link in links])
+    both = hg.LinearSensor([[1.0, 0.0], [1.0, 0.0]], 0.05 * np.eye(2))
+    joint = hg.linear_filter(PLANT, both, hg.parallel(links))
+    z = 0.5 * np.sin(np.arange(2.0 * HORIZON)).reshape(HORIZON, 2)
+    z[3, 0] = z[5] = np.nan
+    found, known = (INTERVAL.estimates(hg.smoothing.retained_steps(item, z)[1]) for item in (central, joint))
+    assert found.claim == known.claim == "exact"
+    np.testing.assert_allclose(found.mean, known.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(found.covariance, known.covariance, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", ["uncertain chain", "multiple models"])
+def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(kind):
+    road = hg.MarkovChain([[0.95, 0.05], [0.1, 0.9]], radius=0.02 if kind == "uncertain chain" else 0.0)
+    link = hg.markov_fading([1.0, 0.3], road, 0.05)
+    make = hg.linear_filter if kind == "uncertain chain" else hg.filters.imm_filter
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, link, {"one": make(PLANT, SENSOR, link)})})
+    found = hg.monte_carlo(network, HORIZON, RUNS, 1, keep=hg.Statistics(), smooth=INTERVAL)
+    filtered, smoothed = found["node"]["one"], found.smoothed["node"]["one"]
+    assert smoothed.claim == "nominal"
+    assert smoothed.rmse()[0] < 0.95 * filtered.rmse()[0]
+    assert smoothed.nees_per_dimension()[0] < 1.2
