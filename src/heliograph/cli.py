@@ -7,6 +7,7 @@ from _thread import interrupt_main
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from threading import Timer
 from types import FrameType
@@ -75,10 +76,15 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or events.")],
     out: Annotated[Path, place("CSV or Parquet to write: estimates with their claimed covariances.")],
+    window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
+    lag: Annotated[float | None, Parameter(help="Of events: also estimates given what came so much later.")] = None,
 ) -> None:
     """Run the filters of your own network over measured data.
+
+    A file of events has the columns node, sequence, time, arrival, and what was heard: in any order, late, twice. Then
+    the estimates are those that became final, and with --lag those of a lag later stand in a file beside, OUT.lagged.
 
     Parameters
     ----------
@@ -96,15 +102,22 @@ def run(
         raise fail(f"output file {out}", "another file than the measurements", "the same")
     with progress(3) as advance:
         advance("starting")
+        from heliograph.files.events import holds_events, run_events
         from heliograph.files.network_file import load_network
         from heliograph.files.recording import read_recording, write_estimates
 
         loaded = load_network(network)
         if not any(node.filters for node in loaded.nodes.values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
-        recording = read_recording(measurements, loaded)
-        advance(f"filtering {len(recording.time)} rows")
-        record = heliograph.run(loaded, *recording)
+        if holds_events(measurements):
+            advance("filtering events")
+            record, notes = run_events(measurements, loaded, out, 10.0 if window is None else window, lag)
+        else:
+            if window is not None or lag is not None:
+                raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
+            recording, notes = read_recording(measurements, loaded), []
+            advance(f"filtering {len(recording.time)} rows")
+            record = heliograph.run(loaded, *recording)
         advance(f"writing {out}")
         write_estimates(record, out)
     for failure in record.failures():
@@ -114,7 +127,8 @@ def run(
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    print(visible(f"{out}: {len(record.time)} rows of {', '.join(filters)}"))
+    for line in (f"{out}: {len(record.time)} rows of {', '.join(filters)}", *notes):
+        print(visible(line))
 
 
 @app.command
@@ -134,6 +148,7 @@ def example(
     *,
     out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
     seed: Annotated[int, number("Seed of what is simulated.")] = 0,
+    trace: Annotated[Path | None, place("Log of a radio network, for an example that takes one.")] = None,
 ) -> None:
     """Run an example and report, or list them."""
     from heliograph.examples import examples, load_example
@@ -143,10 +158,16 @@ def example(
         width = max(map(len, known))
         print("\n".join(f"{each:{width}}  {what}" for each, what in known.items()))
         return
-    from heliograph.numerics.check import check_seed
+    from heliograph.numerics.check import check_seed, fail
 
     run_example = load_example(name)
-    run_example(_folder("example", out), check_seed("--seed", seed))
+    target, seed = _folder("example", out), check_seed("--seed", seed)
+    if trace is None:
+        run_example(target, seed)
+    elif "trace" not in signature(run_example).parameters:
+        raise fail("--trace", "an example that takes one, such as late-data", name)
+    else:
+        run_example(target, seed, trace)
 
 
 @app.command

@@ -1,0 +1,78 @@
+"""Times with dates and zones: ISO 8601 to datetime64[ns] in UTC."""
+
+import re
+from collections.abc import Iterable
+from typing import Literal
+
+import numpy as np
+
+from heliograph.numerics.check import fail, shown
+
+DATE = re.compile(
+    r"(?P<day>\d{4}-\d\d-\d\d)(?:[T ](?P<clock>\d\d:\d\d(?::\d\d(?:[.]\d{1,9})?)?))?"
+    r" ?(?P<zone>Z|UTC|[+-]\d\d(?::?\d\d)?)?"
+)
+UNITS: dict[Literal["s", "ms", "us", "ns"], int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+MISSING = np.iinfo(np.int64).min  # NumPy's NaT
+YEARS = range(1678, 2262)  # that nanoseconds since 1970 can say in 64 bits
+
+
+def looks_like_date(text: str) -> bool:
+    """Whether a text begins as a date of ISO 8601 does."""
+    return re.match(r"\d{4}-\d\d-", text) is not None
+
+
+def dates(texts: Iterable[object], name: str) -> np.ndarray:
+    """Dates of ISO 8601 as datetime64[ns] in UTC; empty is NaT. Without a zone they are taken as they stand, as UTC.
+
+    Raises:
+        ValueError: a text that is no date; some with a zone and some without; one line that names the row, from 1.
+    """
+    found, zones = [], set()
+    for row, each in enumerate(texts, 1):
+        text = each.isoformat() if hasattr(each, "isoformat") else "" if each is None else str(each).strip()
+        if not text or text == "NaT":
+            found.append(MISSING)
+            continue
+        match = DATE.fullmatch(text)
+        try:
+            if match is None:
+                raise ValueError
+            found.append(_instant(match))
+        except ValueError:
+            wanted = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
+            raise fail(f"{name}, row {row}", wanted, shown(text)) from None
+        zones.add(match["zone"] is not None)
+        if len(zones) > 1:
+            raise fail(f"{name}, row {row}", "a zone with every date or with none", shown(text))
+    return np.array(found, dtype=np.int64).view("datetime64[ns]")
+
+
+def _instant(match: re.Match[str]) -> int:
+    """Nanoseconds since 1970 in UTC."""
+    if int(match["day"][:4]) not in YEARS:
+        raise ValueError
+    local = int(np.datetime64(f"{match['day']}T{match['clock'] or '00:00'}", "ns").astype(np.int64))
+    zone = match["zone"] or "Z"
+    if zone in ("Z", "UTC"):
+        return local
+    hours, minutes = int(zone[1:3]), int(zone[-2:]) if len(zone) > 3 else 0
+    if hours > 23 or minutes > 59:
+        raise ValueError
+    ahead = (60 * hours + minutes) * 60 * 10**9
+    return local - ahead if zone[0] == "+" else local + ahead
+
+
+def seconds_between(time: np.ndarray) -> np.ndarray:
+    """Seconds since the row before, 0 in the first; of dates from whole nanoseconds."""
+    if time.dtype.kind != "M":
+        return np.diff(time, prepend=time[:1])
+    whole = time.astype("datetime64[ns]").astype(np.int64)
+    return np.asarray(np.diff(whole, prepend=whole[:1]) / 1e9)
+
+
+def in_iso(time: np.ndarray) -> np.ndarray:
+    """Dates as texts in UTC, all with as many digits of a second as one of them needs; NaT is empty."""
+    there = time[~np.isnat(time)].astype("datetime64[ns]").astype(np.int64)
+    unit = next(unit for unit, size in UNITS.items() if not np.any(there % size))
+    return np.asarray(np.where(np.isnat(time), "", np.datetime_as_string(time, unit=unit, timezone="UTC")))
