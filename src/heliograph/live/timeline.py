@@ -67,7 +67,7 @@ class Timeline:
         self.forced = 0
         slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
         begun = self.now if self._dt is not None else -1.0
-        self._tape, self._finals = self._player.blank(slots, begun), Finals(self.capacity)
+        self._tape, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
         ends = np.cumsum([size for _, size in self._sizes.values()])
         places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
         self._size = int(ends[-1])
@@ -154,7 +154,7 @@ class Timeline:
     def final(self) -> Record:
         """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
 
-        They are the filters' own after the row, in the order of time. Unless somebody asks the last `capacity` stay.
+        They are the filters' own after the row, in the order of time. If nobody asks, the last 2 `capacity` are kept.
         """
         self._collect()
         time, told = self._finals.take(self._tape.told)
