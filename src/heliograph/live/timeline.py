@@ -8,7 +8,6 @@ from typing import Any
 import jax
 import numpy as np
 
-from heliograph.live.clock import uneven
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
 from heliograph.live.player import player
@@ -16,7 +15,7 @@ from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
 from heliograph.live.tape import READ, Tape, copied, read
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import first, steps_covered
+from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
@@ -59,7 +58,7 @@ class Timeline:
         self._dt = self._player.dt
         if self._dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
-        if self._dt is not None and (what := uneven(first(network.plant), self._dt)):
+        if what := self._player.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self._player.given
