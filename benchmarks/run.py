@@ -35,7 +35,8 @@ RESULTS = HERE / "results.json"
 ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
 ALONE = (
-    "startup", "stream", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion", "links_with_memory"
+    "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
+    "links_with_memory",
 )  # fmt: skip
 
 

@@ -403,7 +403,9 @@ def test_help_does_not_load_jax():
 
 def test_lists_do_not_load_jax():
     lines = without_jax(["example"]).splitlines()
-    assert [line.split()[0] for line in lines] == ["delays", "demo", "fusion", "links-with-memory", "motor-drive"]
+    assert [line.split()[0] for line in lines] == [
+        *("delays", "demo", "fusion", "late-data", "links-with-memory", "motor-drive", "range-bearing", "smoothing")
+    ]
     assert all(len(line.split()) > 5 for line in lines)
     assert "cubature-fusion" in without_jax(["reproduce"]).splitlines()
 
@@ -426,7 +428,7 @@ def test_a_refusal_in_a_process_of_its_own(folder):
         (["reproduce", "cubature-fusion"], ["reproduce: expected a folder for the results (--out DIR), got none"]),
         (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
         (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
-        (["example", "dmeo", "--out", "o"], ["example: expected one of demo, fusion, links", "-drive, got 'dmeo'"]),
+        (["example", "dmeo", "--out", "o"], ["example: expected one of demo, fusion, late-data", "-drive, got 'dmeo'"]),
         (["demo", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0 to 4294967295, got 111"]),
         (["demo", "--out", "o", "--seed", "-1"], ["--seed: expected a whole number from 0 to 4294967295, got -1"]),
         (["reproduce", "all", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0"]),

@@ -18,7 +18,7 @@ WORLDS = {
     "sharing": (lambda: worlds.moving(shared=True), True),
 }
 WINDOW, CAPACITY = 4.0, 30
-FEW = settings(max_examples=6, deadline=None, phases=[Phase.explicit, Phase.generate])
+FEW = settings(max_examples=4, deadline=None, phases=[Phase.explicit, Phase.generate])
 
 
 class World:
@@ -73,7 +73,7 @@ def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixi
     network, continuous = world.network, world.continuous
     generator = np.random.default_rng(seed)
     pushes = []
-    for event in worlds.events(network, seed, 14, continuous):
+    for event in worlds.events(network, seed, 10, continuous):
         arrival = event.time + mixing * generator.random() ** 2
         pushes.append(event._replace(arrival=arrival))
         if generator.random() < 0.2:

@@ -22,8 +22,6 @@ def forgetful() -> hg.Network:
     own = {
         "linear": hg.linear_filter(*parts),
         "cubature": hg.cubature_filter(*parts),
-        "extended": hg.extended_filter(*parts),
-        "mean_gain": hg.mean_gain_filter(*parts),
         "mixture": hg.mixture_filter(*parts),
         "open_loop": hg.open_loop_filter(PUSHED),
     }
@@ -43,7 +41,6 @@ def remembering() -> hg.Network:
     own = {
         "linear": hg.linear_filter(*parts),
         "imm": hg.filters.imm_filter(*parts),
-        "gpb2": hg.filters.gpb2_filter(*parts),
         "particles": hg.filters.particle_filter(*parts, particles=8),
     }
     sure = PLANT, SENSOR, hg.hop(1.0, 0.05)

@@ -1,5 +1,6 @@
 """`heliograph example` and `heliograph demo`, which is the first of them."""
 
+from inspect import signature
 from pathlib import Path
 from typing import Annotated
 
@@ -27,6 +28,7 @@ def example(
     *,
     out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
     seed: Annotated[int, number("Seed of what is simulated.")] = 0,
+    trace: Annotated[Path | None, place("Log of a radio network, for an example that takes one.")] = None,
 ) -> None:
     """Run an example and report, or list them."""
     from heliograph.examples import examples, load_example
@@ -36,7 +38,13 @@ def example(
         width = max(map(len, known))
         print("\n".join(f"{each:{width}}  {what}" for each, what in known.items()))
         return
-    from heliograph.numerics.check import check_seed
+    from heliograph.numerics.check import check_seed, fail
 
     run_example = load_example(name)
-    run_example(folder("example", out, name), check_seed("--seed", seed))
+    target, seed = folder("example", out, name), check_seed("--seed", seed)
+    if trace is None:
+        run_example(target, seed)
+    elif "trace" not in signature(run_example).parameters:
+        raise fail("--trace", "an example that takes one, such as late-data", name)
+    else:
+        run_example(target, seed, trace)

@@ -5,6 +5,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+from cyclopts import Parameter
+
 import heliograph
 from heliograph.cli.app import place
 
@@ -18,11 +20,17 @@ def run(
     network: str,
     /,
     *,
-    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements; or events.")],
     out: Annotated[Path | None, place("CSV or Parquet to write: estimates with their claimed covariances.")] = None,
     report: Annotated[Path | None, place("Folder for figures and a page on estimates, innovations and links.")] = None,
+    smooth: Annotated[str, Parameter(help="Estimates given later data too: of all rows (all), or of so many.")] = "",
+    window: Annotated[float | None, Parameter(help="Of events: how long one may be late; 10 unless given.")] = None,
+    lag: Annotated[float | None, Parameter(help="Of events: also estimates given what came so much later.")] = None,
 ) -> None:
     """Run the filters of your own network over measured data.
+
+    A file of events has the columns node, sequence, time, arrival, and what was heard: in any order, late, twice. Then
+    the estimates are those that became final, and with --lag those of a lag later stand in a file beside, OUT.lagged.
 
     Parameters
     ----------
@@ -30,24 +38,38 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.files.events import holds_events
     from heliograph.files.quoting import visible
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
+    from heliograph.smoothing.modes import named_smoothing
 
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
+    later, events = named_smoothing(smooth), holds_events(measurements)
+    if events and (out is None or report is not None or later is not None):
+        raise fail("--smooth and --report", f"rows of time, and --out FILE alone for events such as {measurements}",
+                   "events")  # fmt: skip
+    if not events and (window is not None or lag is not None):
+        raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
     _check_places(measurements, out, report)
+    notes: list[str] = []
     with progress(3) as advance:
         advance("starting")
+        from heliograph.files.events import run_events
         from heliograph.files.network_file import load_network
         from heliograph.files.recording import read_recording, write_estimates
 
         loaded = load_network(network)
         if not any(node.filters for node in loaded.nodes.values()):
             raise fail(f"network {network}", "at least one filter to run", "none")
-        recording = read_recording(measurements, loaded)
-        advance(f"filtering {len(recording.time)} rows")
-        record = heliograph.run(loaded, *recording)
+        if events and out is not None:
+            advance("filtering events")
+            record, notes = run_events(measurements, loaded, out, 10.0 if window is None else window, lag)
+        else:
+            recording = read_recording(measurements, loaded)
+            advance(f"filtering {len(recording.time)} rows")
+            record = heliograph.run(loaded, *recording, smooth=later)
         if out is not None:
             advance(f"writing {out}")
             write_estimates(record, out)
@@ -60,10 +82,9 @@ def run(
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    if out is not None:
-        print(visible(f"{out}: {len(record.time)} rows of {', '.join(filters)}"))
-    if report is not None:
-        print(visible(f"{report / 'report.html'}: {len(record.time)} rows of {', '.join(filters)}"))
+    written = [path for path in (out, report and report / "report.html") if path is not None]
+    for line in (*(f"{target}: {len(record.time)} rows of {', '.join(filters)}" for target in written), *notes):
+        print(visible(line))
 
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:

@@ -6,7 +6,9 @@ from importlib import import_module
 from pathlib import Path
 from pkgutil import iter_modules
 
-Example = Callable[[Path, int], None]  # folder and seed: it writes report, figures and summary to a folder of its own
+Example = Callable[
+    ..., None
+]  # folder and seed, and a file: it writes report, figures and summary to a folder of its own
 
 
 def examples() -> dict[str, str]:

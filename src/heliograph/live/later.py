@@ -141,7 +141,8 @@ class Sweeper:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(item for item in AllFilters(network).fusions if self._fuses(item, kinds))
         with jax.enable_x64(True):
-            self.numbers, mould = cast(Sweep(Ears(network, AllFilters(alone, kinds)), fusions, kinds))
+            self.item = Sweep(Ears(network, AllFilters(alone, kinds)), fusions, kinds)
+            self._numbers, mould = cast(self.item)
         self._run = sweep_back(mould, dt)
 
     def _fuses(self, item: Fused, kinds: tuple[int, ...]) -> bool:
@@ -150,7 +151,7 @@ class Sweeper:
     def estimates(self, tape: Tape, order: np.ndarray, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
-            own, fused = self._run(self.numbers, tape, order, np.array([begin, stop], dtype=np.int32))
+            own, fused = self._run(self._numbers, tape, order, np.array([begin, stop], dtype=np.int32))
         found: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
         for k, told in own.items():
             for f, name in enumerate(self.network.kinds[k].filters):

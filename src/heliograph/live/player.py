@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.live.clock import time_input
+from heliograph.live.clock import time_input, uneven
 from heliograph.live.later import Sweeper
 from heliograph.live.mould import cast
 from heliograph.live.tape import Ears, Tape, replay
+from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
@@ -19,11 +20,13 @@ from heliograph.simulation.stepping import AllFilters
 class Player:
     """A network's filters compiled, their numbers where the program finds them: what all its timelines share.
 
-    `structure` of what is told. A tape's rows have `received` numbers and `given` inputs.
+    `structure` of what is told; `uneven`: how the plant cannot be cut in time, "" if it can. A tape's rows have
+    `received` numbers and `given` inputs.
     """
 
     def __init__(self, network: Network):
         self.network, self.dt = network, time_input(network)
+        self.uneven = "" if self.dt is None else uneven(first(network.plant), self.dt)
         self.claims, inputs = network.claims(), len(network.inputs)
         self.received = sum(node.received for node in network.nodes.values())
         self.given = inputs - (self.dt is not None)
@@ -47,27 +50,22 @@ class Player:
 
     def blank(self, slots: int, time: float) -> Tape:
         """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
-        rows = np.full((slots, self.received + self.given + 1), np.nan)
+        rows = np.full((1, self.received + self.given + 1), np.nan)
         rows[0, -1] = time
-        with jax.enable_x64(True):
-            return Tape(
-                rows=jnp.array(rows),
-                state=jax.tree.map(lambda leaf: jnp.repeat(leaf[None], slots, axis=0), self._start),
-                held=jnp.zeros((slots, self.given)),
-                step=jnp.full(slots, -1),
-                told=[jnp.zeros((slots, *leaf.shape), leaf.dtype) for leaf in self._like],
-            )
+        state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self._start)
+        told = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._like]
+        begun = rows, state, np.zeros((1, self.given)), np.full(1, -1), told
+        return self.filled(slots, begun)
 
-    def filled(self, slots: int, some: Tape) -> Tape:
-        """A tape with these rows in its first slots."""
+    def filled(self, slots: int, some: tuple[PyTree, ...]) -> Tape:
+        """A tape with these rows in its first slots; in the others the first again, which nobody reads."""
 
-        def copied(all_: jax.Array, first: np.ndarray) -> jax.Array:
-            found = np.zeros(all_.shape, all_.dtype)
-            found[: len(first)] = first
-            return jnp.array(found)  # never the array itself: a tape is given away
+        def repeated(part: np.ndarray) -> jax.Array:
+            rest = np.repeat(part[:1], slots - len(part), axis=0)
+            return jnp.array(np.concatenate([part, rest]))  # never the array itself: a tape is given away
 
         with jax.enable_x64(True):
-            return Tape(*jax.tree.map(copied, tuple(self.blank(slots, 0.0)), tuple(some)))
+            return Tape(*jax.tree.map(repeated, tuple(some)))
 
 
 _SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id of a network, which its entry keeps

@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.live.clock import uneven
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
 from heliograph.live.player import player
@@ -17,7 +16,7 @@ from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
 from heliograph.live.tape import READ, Tape, copied, read
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import first, steps_covered
+from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
@@ -63,7 +62,7 @@ class Timeline:
         self._dt = self._player.dt
         if self._dt is None and start != 0:
             raise fail("start", "0 where time counts steps", start)
-        if self._dt is not None and (what := uneven(first(network.plant), self._dt)):
+        if what := self._player.uneven:
             warnings.warn(f"timeline: predictions depend on when others are asked for: {what}", stacklevel=2)
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self._player.given
@@ -71,7 +70,7 @@ class Timeline:
         self.forced = 0
         slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
         begun = self.now if self._dt is not None else -1.0
-        self._tape, self._finals = self._player.blank(slots, begun), Finals(self.capacity)
+        self._tape, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
         ends = np.cumsum([size for _, size in self._sizes.values()])
         places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
         self._size = int(ends[-1])
@@ -169,7 +168,7 @@ class Timeline:
     def final(self) -> Record:
         """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
 
-        They are the filters' own after the row, in the order of time. Unless somebody asks the last `capacity` stay.
+        They are the filters' own after the row, in the order of time. If nobody asks, the last 2 `capacity` are kept.
         """
         self._collect()
         time, told = self._finals.take(self._tape.told)

@@ -1,0 +1,122 @@
+"""Packets as a network delivered them, and what that says of the network: losses, order, copies, delays."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+FALL = 50  # a sequence number that falls by more, or to RESTART at most, tells of a reboot; less are swapped neighbours
+RESTART = 3
+
+
+@dataclass(frozen=True)
+class Packets:
+    """One entry for each packet that was heard, in the order of hearing, copies too.
+
+    Shapes (packet,): node and sequence, whole numbers; sent and received in seconds since the first was sent.
+    """
+
+    node: np.ndarray
+    sequence: np.ndarray
+    sent: np.ndarray
+    received: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.node)
+
+    def among(self, which: np.ndarray) -> "Packets":
+        """Some of them."""
+        return Packets(self.node[which], self.sequence[which], self.sent[which], self.received[which])
+
+    def first_heard(self) -> np.ndarray:
+        """Whether each is the first with its node, sequence and time; numbers come again after a reboot."""
+        known = set[tuple[int, int, float]]()
+        result = np.zeros(len(self), dtype=bool)
+        for i, name in enumerate(zip(self.node.tolist(), self.sequence.tolist(), self.sent.tolist(), strict=True)):
+            result[i] = name not in known
+            known.add(name)
+        return result
+
+    def boots(self) -> "list[Packets]":
+        """Without copies, sorted by the time of sending: one part for each boot of each node."""
+        own, parts = self.among(self.first_heard()), list[Packets]()
+        for node in np.unique(own.node):
+            mine = np.flatnonzero(own.node == node)
+            mine = mine[np.argsort(own.sent[mine], kind="stable")]
+            step = np.diff(own.sequence[mine])
+            again = (step < -FALL) | ((step < 0) & (own.sequence[mine][1:] <= RESTART))
+            parts += [own.among(part) for part in np.split(mine, np.flatnonzero(again) + 1)]
+        return parts
+
+    def fates(self) -> "list[np.ndarray]":
+        """For each boot the delay of every packet that was sent from its first to its last, NaN if it was lost."""
+        return [_fates(part) for part in self.boots()]
+
+
+def _fates(part: Packets) -> np.ndarray:
+    low = int(part.sequence.min())
+    result = np.full(int(part.sequence.max()) - low + 1, np.nan)
+    result[part.sequence - low] = part.received - part.sent
+    return result
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """What is known of a network from its packets; shares are of one.
+
+    lost: of those sent; runs of losses, their mean and the longest; lost_after_lost: of those after a loss.
+    out_of_order: of those heard, after one that was sent later, from anywhere or from their own node. copies: of all
+    that was heard. delay: median, 95 % and largest, seconds. interval: between packets of a node, seconds.
+    """
+
+    packets: int
+    nodes: int
+    boots: int
+    lost: float
+    run_mean: float
+    run_max: int
+    lost_after_lost: float
+    out_of_order: float
+    out_of_order_own: float
+    copies: float
+    delay_median: float
+    delay_95: float
+    delay_max: float
+    interval: float
+
+
+def statistics(packets: Packets) -> Statistics:
+    """Of a network's packets."""
+    fates = [np.isnan(fate) for fate in packets.fates()]
+    runs = np.concatenate([_runs(lost) for lost in fates])
+    before, after = (np.concatenate([lost[part] for lost in fates]) for part in (slice(None, -1), slice(1, None)))
+    own = packets.among(packets.first_heard())
+    by_node = [own.sent[own.node == node] for node in np.unique(own.node)]
+    delay = own.received - own.sent
+    sent = sum(map(len, fates))
+    return Statistics(
+        packets=len(own),
+        nodes=len(by_node),
+        boots=len(fates),
+        lost=sum(int(lost.sum()) for lost in fates) / sent,
+        run_mean=float(runs.mean()) if len(runs) else 0.0,
+        run_max=int(runs.max(initial=0)),
+        lost_after_lost=float(after[before].mean()) if before.any() else 0.0,
+        out_of_order=float(_overtaken(own.sent).mean()),
+        out_of_order_own=float(np.concatenate([_overtaken(sent) for sent in by_node]).mean()),
+        copies=1 - len(own) / len(packets),
+        delay_median=float(np.median(delay)),
+        delay_95=float(np.quantile(delay, 0.95)),
+        delay_max=float(delay.max()),
+        interval=float(np.ptp(own.sent) * len(by_node) / sent),
+    )
+
+
+def _overtaken(sent: np.ndarray) -> np.ndarray:
+    """Of all but the first: whether one that was sent later was heard before."""
+    return sent[1:] < np.maximum.accumulate(sent)[:-1]
+
+
+def _runs(lost: np.ndarray) -> np.ndarray:
+    """Lengths of the runs of losses."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], lost.astype(int), [0]])))
+    return edges[1::2] - edges[::2]

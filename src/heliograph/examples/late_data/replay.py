@@ -1,0 +1,102 @@
+"""Events played to timelines as time goes on, and what these say at each moment, of now and of a while ago."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from heliograph.live.event import VERDICTS, Event
+from heliograph.live.timeline import Timeline
+from heliograph.model.estimate import Estimate
+from heliograph.simulation.network import Network
+
+WINDOW = 10.0  # s
+LAGS = {"lag_2s": 2.0, "lag_10s": 10.0}
+METHODS = ("used_as_current", "late_dropped", "rewound", *LAGS, "no_delay")
+
+
+@dataclass(frozen=True)
+class Heard:
+    """Estimates at moments, (moment, n) and (moment, n, n), and the moments that they are of."""
+
+    time: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+
+
+def arrival_of(event: Event) -> float:
+    """When an event was heard."""
+    return event.time if event.arrival is None else event.arrival
+
+
+def every_method(
+    network: Network, events: Sequence[Event], known: Sequence[Event], moments: np.ndarray
+) -> tuple[dict[str, Heard], dict[str, int]]:
+    """What each method says at these moments, and the verdicts on the events where they are rewound.
+
+    `events` come from the first node of the network, whose first filter is asked; in the order of their arrival.
+    `known`, inputs, come at once.
+    """
+    first = {(event.sequence, event.time): event for event in reversed(events)}.values()  # copies have the same number
+    now = [event._replace(time=arrival_of(event)) for event in first]
+    at_once = [event._replace(arrival=event.time) for event in events]
+    current, _ = _played(network, [*known, *now], WINDOW, moments)
+    dropped, _ = _played(network, [*known, *events], 0.0, moments)
+    rewound, counts = _played(network, [*known, *events], WINDOW, moments, LAGS)
+    ideal, _ = _played(network, [*known, *at_once], WINDOW, moments)
+    found = {"used_as_current": current["now"], "late_dropped": dropped["now"], "rewound": rewound["now"]}
+    return found | {name: rewound[name] for name in LAGS} | {"no_delay": ideal["now"]}, counts
+
+
+def _played(
+    network: Network,
+    events: Iterable[Event],
+    window: float,
+    moments: np.ndarray,
+    lags: Mapping[str, float] | None = None,
+) -> tuple[dict[str, Heard], dict[str, int]]:
+    """Estimates of now, and of `lags` before, at each moment; and the verdicts on what the first node sent."""
+    timeline, wanted = Timeline(network, window), {} if lags is None else lags
+    coming = sorted(events, key=arrival_of)  # stable: else as they were heard
+    node, at = network.names[0], 0
+    found: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *wanted)}
+    for moment in moments:
+        while at < len(coming) and arrival_of(coming[at]) <= moment:
+            timeline.push(*coming[at])
+            at += 1
+        timeline.advance(float(moment))
+        found["now"].append((moment, _first(timeline.estimates()[node])))
+        for name, lag in wanted.items():
+            if moment - lag >= 0:
+                found[name].append((moment - lag, _first(timeline.lagged(lag)[node])))
+    return {name: _stacked(part) for name, part in found.items()}, {v: timeline.counts[node][v] for v in VERDICTS}
+
+
+def _first(filters: Mapping[str, Estimate]) -> Estimate:
+    return next(iter(filters.values()))
+
+
+def _stacked(parts: Sequence[tuple[float, Estimate]]) -> Heard:
+    means, spreads = np.array([e.mean for _, e in parts]), np.array([e.covariance for _, e in parts])
+    return Heard(np.array([time for time, _ in parts]), means, spreads)
+
+
+@dataclass(frozen=True)
+class Score:
+    """Of a position in the plane: root of the mean squared error, and the mean of e' P^-1 e / 2, honestly 1."""
+
+    rmse: float
+    nees: float
+
+
+def squared_errors(heard: Heard, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """|e|^2 and e' P^-1 e / 2 of the first two states at each moment; truth (moment, 2)."""
+    error = (heard.mean[:, :2] - truth)[:, :, None]
+    weighted = np.linalg.solve(heard.covariance[:, :2, :2], error)
+    return np.sum(error**2, axis=(1, 2)), np.sum(error * weighted, axis=(1, 2)) / 2
+
+
+def score(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Score:
+    """Over all moments of several runs, from their squared errors."""
+    squared, nees = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return Score(float(np.sqrt(squared.mean())), float(nees.mean()))

@@ -1,0 +1,169 @@
+"""Events in files: one row for each thing that was heard, in any order, with names of nodes and perhaps dates."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.recording import TIME_STEP, received_names, write_estimates
+from heliograph.files.table import FORMATS
+from heliograph.live.event import INPUTS, Event
+from heliograph.live.recorded import play
+from heliograph.numerics.check import fail, shown
+from heliograph.numerics.dates import dates, looks_like_date
+from heliograph.simulation.network import Network
+from heliograph.simulation.record import Record
+
+NODE, SEQUENCE, TIME, ARRIVAL, VALUES = "node", "sequence", "time", "arrival", "values"
+
+
+def holds_events(path: str | Path) -> bool:
+    """Whether a CSV or Parquet file has events and not rows: it has the columns `node` and `sequence`."""
+    path = Path(path)
+    if not path.is_file() or path.suffix.lower() not in FORMATS:
+        return False
+    return {NODE, SEQUENCE} <= set(_header(path))
+
+
+def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.datetime64 | None]:
+    """Events from a CSV or Parquet file; times are seconds since the moment returned where the file has dates.
+
+    Columns: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (may be left out: at once), and what was heard:
+    one column for each component, named as the sensor's outputs or the plant's inputs, or one column `values` with all
+    of the node's numbers, separated by spaces or as a list. An empty cell did not arrive. Dates are ISO 8601, with a
+    zone each or none; the moment returned is the earliest `time`.
+
+    Raises:
+        ValueError: missing or unknown columns, a cell that is none of this; one line that names the row, from 1.
+    """
+    path = Path(path)
+    columns = _columns(path)
+    components = {name: received_names(node) for name, node in network.nodes.items()}
+    components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
+    known = [NODE, SEQUENCE, TIME, ARRIVAL, VALUES, *(name for names in components.values() for name in names)]
+    for name in columns:
+        if name not in known:
+            raise fail(f"{path}, header", f"only the columns {', '.join(dict.fromkeys(known))}", repr(name))
+    for name in (NODE, SEQUENCE, TIME):
+        if name not in columns:
+            raise fail(f"{path}, header", f"a column {name!r}", f"only {', '.join(columns)}")
+    time, arrival, origin = _times(columns, path)
+    events = []
+    for row, node in enumerate(columns[NODE]):
+        where = f"{path}, row {row + 1}"
+        if node not in components:
+            raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(components)}", shown(node))
+        values = _heard({name: column[row] for name, column in columns.items()}, components[node], where)
+        number = _number(columns[SEQUENCE][row], f"{where}, column {SEQUENCE!r}")
+        if number != np.floor(number):
+            raise fail(f"{where}, column {SEQUENCE!r}", "a whole number", shown(columns[SEQUENCE][row]))
+        events.append(Event(node, int(number), float(time[row]), values, float(arrival[row])))
+    return events, origin
+
+
+def run_events(path: Path, network: Network, out: Path, window: float, lag: float | None) -> tuple[Record, list[str]]:
+    """Final estimates from a file of events, and lines to tell of it: verdicts, and where the lagged ones are.
+
+    With a lag these are written to a file beside `out`: estimates.csv becomes estimates.lagged.csv.
+
+    Raises:
+        ValueError: what `read_events` and `Timeline` refuse, a lag beyond the window.
+    """
+    events, origin = read_events(path, network)
+    continuous = TIME_STEP in network.inputs
+    start = min(event.time for event in events) if continuous else 0.0  # the initial law is that of the first moment
+    found = play(network, events, window, lag, start)
+    lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in each.items() if count)
+             for node, each in found.counts.items() if any(each.values())]  # fmt: skip
+    if found.forced:
+        lines.append(f"{found.forced} rows became final before their time, for want of room")
+    if origin is not None:
+        lines.append(f"times in seconds since {np.datetime_as_string(origin, timezone='UTC')}")
+    if found.lagged is not None:
+        beside = out.with_suffix(f".lagged{out.suffix}")
+        write_estimates(found.lagged, beside)
+        lines.append(f"{beside}: {len(found.lagged.time)} rows, each given what came {lag:g} later")
+    return found.final, lines
+
+
+def _header(path: Path) -> list[str]:
+    if path.suffix.lower() == ".parquet":
+        import pyarrow.parquet as pq
+
+        try:
+            return list(pq.ParquetFile(path).schema_arrow.names)
+        except (ValueError, OSError):  # no such file: who reads it says so
+            return []
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            return [name.strip() for name in next(csv.reader(file), [])]
+    except (csv.Error, UnicodeDecodeError):
+        return []
+
+
+def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
+    """Cells as they stand: texts in CSV, whatever a Parquet file holds."""
+    if path.suffix.lower() == ".parquet":
+        import pyarrow.parquet as pq
+
+        table = pq.ParquetFile(path).read()
+        return {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as file:
+            header, *rows = [[cell.strip() for cell in line] for line in csv.reader(file, strict=True) if line]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise fail(str(path), "a CSV file in UTF-8", str(error)) from None
+    for number, row in enumerate(rows, 1):
+        if len(row) != len(header):
+            raise fail(f"{path}, row {number}", f"{len(header)} cells, one for each column", len(row))
+    if not rows:
+        raise fail(str(path), "at least one row", "none")
+    return dict(zip(header, zip(*rows, strict=True), strict=True))
+
+
+def _times(columns: Mapping[str, Sequence[Any]], path: Path) -> tuple[np.ndarray, np.ndarray, np.datetime64 | None]:
+    """Times and arrivals as numbers, and the moment that they are counted from if they were dates."""
+    parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
+    first = columns[TIME][0]
+    if hasattr(first, "isoformat") or looks_like_date(str(first)):
+        found = [dates(columns[part], f"{path}, column {part!r}") for part in parts]
+        for part, values in zip(parts, found, strict=True):
+            _refuse_missing(np.isnat(values), f"{path}, column {part!r}")
+        origin: np.datetime64 = found[0].min()
+        seconds = [(values - origin).astype(np.int64) / 1e9 for values in found]  # exact before they are floats
+        return seconds[0], seconds[-1], origin
+    numbers = [
+        np.array([_number(cell, f"{path}, row {row}, column {part!r}") for row, cell in enumerate(columns[part], 1)])
+        for part in parts
+    ]
+    return numbers[0], numbers[-1], None
+
+
+def _refuse_missing(missing: np.ndarray, name: str) -> None:
+    if missing.any():
+        raise fail(f"{name}, row {int(np.argmax(missing)) + 1}", "a date", "an empty cell")
+
+
+def _heard(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
+    """The numbers of one event."""
+    if row.get(VALUES) not in (None, ""):
+        cell = row[VALUES]
+        parts = cell.replace(";", " ").split() if isinstance(cell, str) else list(np.atleast_1d(cell))
+        if len(parts) != len(names):
+            raise fail(f"{where}, column {VALUES!r}", f"{len(names)} numbers, {' '.join(names)}", shown(cell))
+        return np.array([_number(part, f"{where}, column {VALUES!r}", empty=True) for part in parts])
+    return np.array([_number(row.get(name), f"{where}, column {name!r}", empty=True) for name in names])
+
+
+def _number(cell: Any, name: str, empty: bool = False) -> float:
+    if empty and (cell is None or cell == ""):
+        return np.nan
+    try:
+        found = float(cell)
+    except (TypeError, ValueError):
+        found = np.inf
+    if np.isinf(found) or (np.isnan(found) and not empty):
+        raise fail(name, "a number or an empty cell" if empty else "a number", shown(cell))
+    return found

@@ -1,0 +1,88 @@
+"""Recorded events through a timeline: what became final, and what was known of each moment a lag later."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from heapq import heappop, heappush
+
+import numpy as np
+
+from heliograph.live.event import INPUTS, Event, Verdict
+from heliograph.live.timeline import Timeline
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network
+from heliograph.simulation.record import Record
+
+
+@dataclass(frozen=True)
+class Played:
+    """Final estimates after each row, those of the same moments given what came a lag later, and the verdicts.
+
+    `lagged` has each moment at which a node was heard by then, once; None where no lag was asked for.
+    """
+
+    final: Record
+    lagged: Record | None
+    counts: dict[str, dict[Verdict, int]]
+    forced: int
+
+
+def play(
+    network: Network, events: Sequence[Event], window: float, lag: float | None = None, start: float = 0.0
+) -> Played:
+    """Push events in the order of their arrival, and let time pass until all are final.
+
+    Raises:
+        ValueError: no events, and what `Timeline` refuses; a lag beyond the window.
+    """
+    if not events:
+        raise fail("events", "at least one", "none")
+    if lag is not None and not 0 <= lag <= window:
+        raise fail("lag", f"a number from 0 to the window, {window:g}", lag)
+    timeline = Timeline(network, window, start)
+    coming = sorted(events, key=lambda event: event.time if event.arrival is None else event.arrival)
+    finals: list[Record] = []
+    lagged: list[tuple[float, Mapping[str, Mapping[str, Estimate]]]] = []
+    waiting: list[float] = []  # moments of which the lag has not passed
+
+    def look(until: float) -> None:
+        while lag is not None and waiting and waiting[0] + lag < until:
+            moment = heappop(waiting)
+            if lagged and lagged[-1][0] == moment:
+                continue
+            timeline.advance(moment + lag)
+            lagged.append((moment, timeline.lagged(min(timeline.now - moment, window))))
+
+    for i, event in enumerate(coming):
+        look(event.time if event.arrival is None else event.arrival)
+        if timeline.push(*event) == "used" and event.node != INPUTS and timeline.now <= event.time + (lag or 0.0):
+            heappush(waiting, event.time)
+        if (i + 1) % timeline.capacity == 0:
+            finals.append(timeline.final())
+    look(np.inf)
+    timeline.advance(timeline.now + window + 1.0)
+    finals.append(timeline.final())
+    late = None if lag is None else _record(network, lagged)
+    return Played(_joined(finals), late, timeline.counts, timeline.forced)
+
+
+def _joined(parts: Sequence[Record]) -> Record:
+    estimates = {
+        node: {name: _stacked([part.estimates[node][name] for part in parts], np.concatenate) for name in filters}
+        for node, filters in parts[0].estimates.items()
+    }
+    return Record(np.concatenate([part.time for part in parts]), parts[0].states, None, {}, estimates)
+
+
+def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
+    found = [part for _, part in parts]
+    estimates = {
+        node: {name: _stacked([part[node][name] for part in found], np.stack) for name in filters}
+        for node, filters in (found[0] if found else {}).items()
+    }
+    return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
+
+
+def _stacked(parts: Sequence[Estimate], how: Callable[[list[np.ndarray]], np.ndarray]) -> Estimate:
+    mean, covariance = (how([np.asarray(getattr(e, name)) for e in parts]) for name in ("mean", "covariance"))
+    return Estimate(mean, covariance, parts[0].claim)

@@ -1,0 +1,145 @@
+"""Files of events: whatever their order, dates or format, the estimates are those of the events in order."""
+
+import csv
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import heliograph as hg
+from heliograph.cli import main
+from heliograph.files.events import holds_events, read_events
+from heliograph.live.event import Event
+from heliograph.live.recorded import play
+
+NETWORK = """
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as hg
+
+plant = hg.Plant(lambda x, u: x + u[0] * u[1], lambda u: 0.3 * jnp.diag(u[1:]), [0.5], 2.0, ["x"], ["speed", "dt"])
+sensor = hg.LinearSensor([[1.0], [1.0]], 0.1 * np.eye(2), ["left", "right"])
+filters = {"f": hg.cubature_filter(plant, sensor, hg.perfect(2))}
+network = hg.Network(plant, {"cart": hg.Node(sensor, hg.perfect(2), filters)})
+"""
+ROWS = [
+    ("inputs", 0, 0.0, 0.0, "", "", "0.1"),
+    ("cart", 1, 1.5, 1.6, "1.0", "", ""),
+    ("cart", 3, 3.0, 3.1, "3.1", "2.9", ""),
+    ("cart", 2, 2.0, 3.5, "2.0", "1.9", ""),
+    ("cart", 2, 2.0, 3.6, "2.0", "1.9", ""),
+    ("cart", 4, 9.0, 9.5, "", "8.0", ""),
+    ("cart", 0, 0.5, 15.0, "9.0", "", ""),
+]
+HEADER = ["node", "sequence", "time", "arrival", "left", "right", "speed"]
+
+
+@pytest.fixture(scope="module")
+def network():
+    scope = {}
+    exec(NETWORK, scope)
+    return scope["network"]
+
+
+def written(path, header, rows):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, *rows])
+    return path
+
+
+def heard(row):
+    """The cells of its node."""
+    return row[6:] if row[0] == "inputs" else row[4:6]
+
+
+def dated(seconds):
+    """Of a zone, an hour ahead."""
+    return f"2026-11-21T10:00:{seconds:06.3f}+01:00"
+
+
+def same(one, other):
+    for a, b in zip(one, other, strict=True):
+        assert a[:3] == b[:3] and a.arrival == b.arrival
+        np.testing.assert_array_equal(a.values, b.values)
+
+
+def test_every_way_to_write_events_is_read_alike(tmp_path, network):
+    plain, none = read_events(written(tmp_path / "a.csv", HEADER, ROWS), network)
+    assert none is None and plain[1].node == "cart"
+    np.testing.assert_array_equal(plain[1].values, [1.0, np.nan])
+    rows = [(n, s, dated(t), dated(a), *rest) for n, s, t, a, *rest in ROWS]
+    found, origin = read_events(written(tmp_path / "b.csv", HEADER, rows), network)
+    same(plain, found)
+    assert origin == np.datetime64("2026-11-21T09:00:00")
+    rows = [(*row[:4], " ".join(cell or "nan" for cell in heard(row))) for row in ROWS]
+    same(plain, read_events(written(tmp_path / "c.csv", [*HEADER[:4], "values"], rows), network)[0])
+    columns = dict(zip(HEADER, zip(*ROWS, strict=True), strict=True))
+    numbers = {name: [float(x) if x else None for x in columns[name]] for name in HEADER[4:]}
+    pq.write_table(pa.table({**{name: list(columns[name]) for name in HEADER[:4]}, **numbers}), tmp_path / "d.parquet")
+    same(plain, read_events(tmp_path / "d.parquet", network)[0])
+    assert all(holds_events(tmp_path / name) for name in ("a.csv", "b.csv", "c.csv", "d.parquet"))
+    assert not holds_events(written(tmp_path / "rows.csv", ["time", "left"], [(0, 1)]))
+
+
+@pytest.mark.parametrize(
+    ("place", "cell", "message"),
+    [
+        (0, "robot", "row 2, column 'node': expected one of cart, inputs, got 'robot'"),
+        (1, "1.5", "row 2, column 'sequence': expected a whole number, got '1.5'"),
+        (1, "", "row 2, column 'sequence': expected a number, got ''"),
+        (2, "soon", "row 2, column 'time': expected a number, got 'soon'"),
+        (3, "", "row 2, column 'arrival': expected a number, got ''"),
+        (4, "inf", "row 2, column 'left': expected a number or an empty cell, got 'inf'"),
+    ],
+)
+def test_a_cell_that_is_none_is_named(tmp_path, network, place, cell, message):
+    rows = [list(row) for row in ROWS]
+    rows[1][place] = cell
+    with pytest.raises(ValueError, match=message):
+        read_events(written(tmp_path / "events.csv", HEADER, rows), network)
+
+
+def test_columns_that_nobody_knows_or_that_lack_are_named(tmp_path, network):
+    with pytest.raises(ValueError, match=r"header: expected only the columns node, sequence, .*, got 'middle'"):
+        read_events(written(tmp_path / "a.csv", [*HEADER[:4], "middle"], [row[:5] for row in ROWS]), network)
+    with pytest.raises(ValueError, match="header: expected a column 'time', got only node, sequence"):
+        read_events(written(tmp_path / "b.csv", HEADER[:2], [row[:2] for row in ROWS]), network)
+
+
+def test_playing_gives_final_and_lagged_estimates(network):
+    """Final ones are those of the rows in order; of each moment then what was heard a lag later."""
+    events = [Event(*row[:3], [float(cell or "nan") for cell in heard(row)], row[3]) for row in ROWS]
+    found = play(network, events, 5.0, 1.0)
+    assert {name: {v: n for v, n in each.items() if n} for name, each in found.counts.items()} == {
+        "cart": {"used": 4, "duplicate": 1, "late": 1}, "inputs": {"used": 1},
+    }  # fmt: skip
+    assert found.final.time.tolist() == [1.5, 2.0, 3.0, 9.0] and found.lagged.time.tolist() == [1.5, 3.0, 9.0]
+    rows = [events[i].values for i in (1, 3, 2, 5)]
+    u = [[0.1, dt] for dt in (1.5, 0.5, 1.0, 6.0)]
+    whole = hg.run(network, {"cart": rows}, u)
+    np.testing.assert_allclose(found.final.estimates["cart"]["f"].mean, whole.estimates["cart"]["f"].mean, rtol=1e-12)
+    within = hg.run(
+        network, {"cart": rows[:3]}, u[:3], smooth=hg.smoothing.FixedLag(1)
+    )  # at 2.5 nothing else was there
+    late = found.lagged.estimates["cart"]["f"]
+    np.testing.assert_allclose(late.mean[1], within.estimates["cart"]["f"].mean[2], rtol=1e-12)
+    alone = hg.run(network, {"cart": rows[:1]}, u[:1])
+    np.testing.assert_allclose(late.mean[0], alone.estimates["cart"]["f"].mean[0], rtol=1e-12)
+
+
+def test_the_command_takes_events(tmp_path, capsys):
+    (tmp_path / "net.py").write_text(NETWORK)
+    data, out = written(tmp_path / "events.csv", HEADER, ROWS), tmp_path / "est.csv"
+    command = ["run", str(tmp_path / "net.py"), "--measurements", str(data), "--out", str(out)]
+    assert main([*command, "--window", "5", "--lag", "1"]) == 0
+    told = capsys.readouterr().out
+    assert "4 rows of cart/f" in told and "cart: 4 used, 1 duplicate, 1 late" in told and "inputs: 1 used" in told
+    assert len(out.read_text().splitlines()) == 5 and len((tmp_path / "est.lagged.csv").read_text().splitlines()) == 4
+    assert main([*command, "--window", "1", "--lag", "2"]) == 2
+    assert "lag: expected a number from 0 to the window, 1, got 2" in capsys.readouterr().err
+    rows = written(tmp_path / "rows.csv", ["time", "left", "right", "speed"], [(0, 1, 1, 0), (1, 1, 1, 0)])
+    command[3] = str(rows)
+    assert main([*command, "--lag", "1"]) == 2
+    assert "--window and --lag: expected a file of events" in capsys.readouterr().err
