@@ -19,6 +19,9 @@ from .quantizer import (
     Quantized as Quantized,
     UniformQuantizer as UniformQuantizer,
 )
+from .report_link import (
+    ReportLink as ReportLink,
+)
 from .rules import (
     AbstractFusion as AbstractFusion,
     FixedIntersection as FixedIntersection,

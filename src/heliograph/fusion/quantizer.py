@@ -51,6 +51,16 @@ class AbstractQuantizer(eqx.Module):
         """What the widened covariance of a quantized estimate claims, from what the estimate's own claims."""
         raise NotImplementedError
 
+    def error(self, n: int) -> Float[np.ndarray, " n"]:
+        """Bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
+
+        Raises:
+            ValueError: there is none.
+        """
+        raise fail(
+            f"reports through {type(self).__name__}", "a quantizer whose error is bounded before any data", "none"
+        )
+
     def check(self, n: int) -> None:
         """Raise ValueError unless the parameters fit values of n components."""
         for leaf in jax.tree.leaves(self):
@@ -90,6 +100,10 @@ class UniformQuantizer(AbstractQuantizer):
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the one amplitude."""
         return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
+
+    def error(self, n: int) -> Float[np.ndarray, " n"]:
+        """Half of a segment."""
+        return np.broadcast_to(np.asarray(self.scale * self.amplitude / self.levels), (n,))
 
     def claim(self, claim: Claim) -> Claim:
         """At most "upper"."""

@@ -14,6 +14,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.uplinks import SentReports
 
 Result = TypeVar("Result")
 
@@ -44,7 +45,8 @@ class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
-    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
+    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
+    reports[name][node] of each fusion that hears reports.
     """
 
     time: np.ndarray
@@ -53,6 +55,7 @@ class Record:
     measurements: dict[str, np.ndarray]
     estimates: dict[str, dict[str, Estimate]]
     uplinks: dict[str, Uplink] = field(default_factory=dict)
+    reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
 
     def errors(self, node: str, name: str) -> np.ndarray:
         """x - xhat of one filter of one node.
@@ -151,7 +154,23 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
         for node, claims in network.claims().items()
     }
-    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks_of(network, batch["uplinks"]))
+    uplinks, reports = uplinks_of(network, batch["uplinks"]), _reports(network, batch["reports"])
+    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports)
+
+
+def _reports(network: Network, found: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, dict[str, SentReports]]:
+    """Reports by fusion and node, without the rows that a node has not, from (..., node, m) and (..., node)."""
+    result: dict[str, dict[str, SentReports]] = {}
+    for name, (values, delay) in found.items():
+        fusion = network.fused[name]
+        assert isinstance(fusion, Fusion)  # nothing else hears reports
+        nodes, n = network.nodes_with(fusion.filter), len(network.states)
+        sizes = [link.received(n) for link in fusion.links(nodes)]
+        result[name] = {
+            node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
+            for i, node in enumerate(nodes)
+        }
+    return result
 
 
 def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

@@ -23,6 +23,7 @@ from heliograph.simulation.lanes import BLOCK, Lanes
 from heliograph.simulation.network import Network
 from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
 from heliograph.simulation.stepping import AllFilters, plan, plans
+from heliograph.simulation.uplinks import Drawn, SentReports
 
 Progress = Callable[[int, int], None]
 
@@ -123,12 +124,16 @@ def run(
     measurements: Mapping[str, ArrayLike],
     inputs: ArrayLike | None = None,
     time: ArrayLike | None = None,
+    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
 ) -> Record:
     """Run every filter of the network over recorded measurements.
 
     measurements: for each node an array (steps, received), NaN where a component did not arrive; what relays heard may
     be left out, and with it their own filters. inputs: (steps,
     inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given.
+    reports: of each fusion by `AllReports` and each of its nodes what became of the report that was sent at each step,
+    (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be left out where
+    nothing happens to them by chance.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards.
@@ -146,17 +151,23 @@ def run(
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
     grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
     with jax.enable_x64(True):
-        found = to_numpy(_run_filters(AllFilters(network), grouped, u))
+        filters = AllFilters(network)
+        given = {} if reports is None else table("reports", reports, "reports by fusion")
+        arrivals = {
+            name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
+            for name, item in filters.reporting.items()
+        }
+        found = to_numpy(_run_filters(filters, grouped, u, arrivals))
     return trajectories_record(network, {"truth": None, "measurements": grouped, **found}, clock)
 
 
 @large_program
-def _run_filters(filters: AllFilters, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
+def _run_filters(filters: AllFilters, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]) -> PyTree:
     def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
-        k, u_k, z_k = row
-        return filters.step(states, z_k, u_k, k)
+        k, u_k, z_k, drawn = row
+        return filters.step(states, z_k, u_k, k, drawn)
 
-    return jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z))[1]
+    return jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z, arrivals))[1]
 
 
 class World(eqx.Module):
@@ -177,7 +188,8 @@ class World(eqx.Module):
         plant = at(self.plant, k)
         x = plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u)
         air, z = self.air.hear(air, x, key, k)
-        states, found = self.filters.step(states, z, u, k)
+        drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        states, found = self.filters.step(states, z, u, k, drawn)
         return (x, self.air.told(air, found["estimates"]), states), {"truth": x, "measurements": z, **found}
 
 
