@@ -3,6 +3,9 @@
 from .all_reports import (
     AllReports as AllReports,
 )
+from .event import (
+    EventSending as EventSending,
+)
 from .informed import (
     DiagonalWeights as DiagonalWeights,
     MatrixWeights as MatrixWeights,
@@ -28,6 +31,9 @@ from .rules import (
     InverseCovarianceIntersection as InverseCovarianceIntersection,
     WeightedFusion as WeightedFusion,
     fuse as fuse,
+)
+from .split import (
+    SplitIntersection as SplitIntersection,
 )
 from .weights import (
     diagonal_weights as diagonal_weights,

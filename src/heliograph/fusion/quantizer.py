@@ -39,6 +39,11 @@ class AbstractQuantizer(eqx.Module):
     leaves the state alone.
     """
 
+    @property
+    def silent(self) -> bool:
+        """Whether nothing may arrive of a value."""
+        return False
+
     def init(self, n: int) -> PyTree:
         """State before the first value, for values of n components."""
         raise NotImplementedError
@@ -51,7 +56,7 @@ class AbstractQuantizer(eqx.Module):
         """What the widened covariance of a quantized estimate claims, from what the estimate's own claims."""
         raise NotImplementedError
 
-    def error(self, n: int) -> Float[np.ndarray, " n"]:
+    def error(self, n: int) -> Float[Array, " n"]:
         """Bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
 
         Raises:
@@ -101,9 +106,9 @@ class UniformQuantizer(AbstractQuantizer):
         """Quantize with the one amplitude."""
         return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
 
-    def error(self, n: int) -> Float[np.ndarray, " n"]:
+    def error(self, n: int) -> Float[Array, " n"]:
         """Half of a segment."""
-        return np.broadcast_to(np.asarray(self.scale * self.amplitude / self.levels), (n,))
+        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
 
     def claim(self, claim: Claim) -> Claim:
         """At most "upper"."""

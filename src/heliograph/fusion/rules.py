@@ -230,6 +230,9 @@ class Fusion(eqx.Module):
             if not isinstance(first(item), AbstractQuantizer):
                 raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
             first(item).check(n)
+            if first(item).silent and not self.rule.hears_reports:
+                wanted = "a rule that hears reports (AllReports)"
+                raise fail(f"fusion through {type(first(item)).__name__}", wanted, type(self.rule).__name__)
         if self.by_report:
             self._check_reports(nodes, n)
         self.uplinks(nodes)
