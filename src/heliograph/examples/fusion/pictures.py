@@ -43,9 +43,9 @@ def fusion_figures(outcome: Outcome) -> dict[str, Figure]:
 
 @matplotlib.rc_context(STYLE)
 def tree_picture(levels: list[np.ndarray]) -> Figure:
-    """Each node's covariance of the point's place as an ellipse at the node, all to one scale, with its trace.
+    """Each node's covariance of the point's place as an ellipse at the node, with the trace of all of it.
 
-    An ellipse is the square root of its covariance, so that sizes can be compared from the leaves to the root.
+    The axes of an ellipse are standard deviations, so that sizes can be compared from the leaves to the root.
     """
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
@@ -54,7 +54,7 @@ def tree_picture(levels: list[np.ndarray]) -> Figure:
     for level in levels[1:]:
         where.append(where[-1].reshape(len(level), -1).mean(axis=1))
     shown = [level[:, PLACES][:, :, PLACES] for level in levels]
-    unit = 0.42 / np.sqrt(max(np.linalg.eigvalsh(part).max() for part in shown))
+    unit = 0.42 / np.sqrt(np.median([np.linalg.eigvalsh(part).max() for part in shown[0]]))
     height = count / (2.2 * len(levels))
     for depth, (xs, parts) in enumerate(zip(where, shown, strict=True)):
         for i, (x, part) in enumerate(zip(xs, parts, strict=True)):
@@ -63,8 +63,11 @@ def tree_picture(levels: list[np.ndarray]) -> Figure:
                 axes.plot([x, above], [depth * height, (depth + 1) * height], color=INK, linewidth=0.6, zorder=1)
             axes.add_patch(_ellipse(x, depth * height, part, unit, GREEN if depth + 1 == len(levels) else BLUE))
             note = f"{np.trace(levels[depth][i]):.2f}"
-            axes.text(x, depth * height - 0.55, note, ha="center", va="top", fontsize=8)
-    axes.set(xlim=(0, count), ylim=(-1.1, (len(levels) - 1) * height + 0.8), aspect="equal")
+            if depth:
+                axes.text(x + 0.5, depth * height + 0.1, note, ha="left", va="bottom", fontsize=8)
+            else:
+                axes.text(x, -0.9, note, ha="center", va="top", fontsize=8)
+    axes.set(xlim=(0, count), ylim=(-1.6, (len(levels) - 1) * height + 0.8), aspect="equal")
     axes.axis("off")
     return figure
 
