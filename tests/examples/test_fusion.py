@@ -9,7 +9,10 @@ RULES = ["matrix", "matrix_with_mean", "all_reports", "central"]
 
 
 def test_the_summary_has_every_rule_in_its_order(tmp_path, monkeypatch):
-    for name, value in {"STEPS": 60, "MANY": 20, "MANY_STEPS": 10, "RUNS": 64, "MEASURED_STEPS": 3}.items():
+    small = {"STEPS": 60, "MANY": 20, "MANY_STEPS": 10, "RUNS": 64, "MEASURED_STEPS": 3, "TREE_NODES": 30, "DEGREE": 5}
+    for name, value in (
+        small | {"STRONG_RUNS": 4, "INTERVALS": (1, 2), "THRESHOLDS": (0.3,), "TRAFFIC_STEPS": 8}
+    ).items():
         monkeypatch.setattr(compute, name, value)
     example(tmp_path, 0)
     found = json.loads((tmp_path / "fusion" / "summary.json").read_text())
@@ -21,4 +24,10 @@ def test_the_summary_has_every_rule_in_its_order(tmp_path, monkeypatch):
         assert min(found[case]["local"]) > trace[0] and found[case]["scalar"] >= trace[0] * (1 - 1e-9)
     assert found["tree"]["root"] >= found["tree"]["flat"] >= found["tree"]["central"]
     assert found["scale"]["matrix"] < found["scale"]["local"]
-    assert "traces.svg" in {p.name for p in (tmp_path / "fusion").iterdir()}
+    assert {"nodes", "seconds", "peak_gb", "tree_seconds"} <= set(found["scale"])
+    assert {"ci_equal", "matrix", "all_reports", "central"} <= set(found["strong"])
+    every, rarely = found["traffic"]["every"]
+    assert every["claimed"] < rarely["claimed"] and every["reports"] == 2 * rarely["reports"]
+    (told,) = found["traffic"]["told"]
+    assert told["claimed"] > told["error"] and told["reports"] < 1
+    assert {"traces.svg", "tree.svg", "traffic.svg"} <= {p.name for p in (tmp_path / "fusion").iterdir()}

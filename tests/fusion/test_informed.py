@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.fusion.fusion_problems import case, network, random_case, rules
+from tests.fusion.fusion_problems import case, network, random_case, rules, two_gains
 from tests.oracles.shared_information import local_gains, stacked_errors
 
 TARGETS = {  # traces after 200 steps: scalar, matrix, matrix with the plant's mean, all reports, central
@@ -169,7 +169,7 @@ def test_nodes_that_hear_the_same_and_estimates_without_error():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda p, s, c: hg.cubature_filter(p, s, c), "gains depend on no data, got GaussianFilter"),
+        (lambda p, s, c: hg.polynomial_filter(p, s, c, 2), "whose gains depend on no data, got"),
         (lambda p, s, c: hg.linear_filter(p, s, c), "expected a channel that forgets"),
     ],
 )
@@ -189,3 +189,58 @@ def test_a_covariance_each_is_not_enough():
     pair = [hg.Estimate(np.zeros(2), np.eye(2), "exact")] * 2
     with pytest.raises(ValueError, match="fusion by MatrixWeights: expected the errors' joint covariance"):
         hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
+
+
+def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
+    """Cubature filters behind gains that hardly vary are the linear ones: weights, reports and claims agree.
+
+    The spread of a gain times the square of the signal is all that differs: 1e-10 of variance.
+    """
+    plant, parts = random_case(2, nodes=2)
+    known = [(c, r, mean, 1e-10, noise) for c, r, mean, _, noise in parts]
+    fused = {name: rules()[name] for name in ("matrix", "all_reports")}
+    linear = network(plant, known, fused)
+    nodes = {
+        name: hg.Node(node.sensor, node.channel, {"own": hg.cubature_filter(plant, node.sensor, node.channel)})
+        for name, node in linear.nodes.items()
+    }
+    along = hg.Network(plant, nodes, fused)
+    assert set(along.claims()["fused"].values()) == {"nominal"}
+    draw = np.random.default_rng(0)
+    data = {name: draw.normal(size=(6, node.received)) for name, node in linear.nodes.items()}
+    found, expected = hg.run(along, data), hg.run(linear, data)
+    for name in fused:
+        ours, theirs = found.estimates["fused"][name], expected.estimates["fused"][name]
+        np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-9)
+        np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-6, atol=1e-6)
+    with pytest.raises(ValueError, match="filters whose gains depend on no data"):
+        hg.simulation.cross_covariances(along, "own", 3)
+    with pytest.raises(ValueError, match="for the plant's own moments"):
+        hg.Network(plant, nodes, {"one": rules()["matrix_with_mean"]})
+
+
+def test_a_large_tree_is_the_small_one():
+    """Eleven leaves in a tree of degree three, made of numbers: every level as relays of named nodes give it."""
+    plant, _ = random_case(4)
+    draw = np.random.default_rng(1)
+    numbers = {"output": draw.normal(size=(11, 1, 3)), "noise": 0.1 + draw.random(11)}
+
+    def leaf(one):
+        sensor, channel = hg.LinearSensor(one["output"], 0.2), hg.hop(two_gains(0.8, 0.05), noise=one["noise"])
+        return hg.Node(sensor, channel, {"own": hg.linear_filter(plant, sensor, channel)})
+
+    tree = hg.simulation.relay_tree(plant, leaf, numbers, 3, 5)
+    nodes = {f"{i}": leaf({name: values[i] for name, values in numbers.items()}) for i in range(11)}
+    net = hg.Network(plant, nodes)
+    level = hg.simulation.cross_covariances(net, "own", 5)
+    for covariances in tree.covariances:
+        np.testing.assert_allclose(covariances, np.einsum("iaib->iab", level.joint), rtol=1e-7)
+        names = level.nodes
+        level = level.fused({f"over {i}": names[i : i + 3] for i in range(0, len(names), 3)})
+    assert [len(c) for c in tree.covariances] == [11, 4, 2, 1] and tree.claim == "exact"
+    record = hg.monte_carlo(net, 5, 2016, 3)
+    estimates = np.stack([record.estimates[name]["own"].mean[:, -1] for name in net.names], axis=1)
+    square = np.sum((record.truth[:, -1] - tree.fused(estimates)) ** 2, axis=-1)
+    assert abs(square.mean() - np.trace(tree.root)) < 3 * square.std() / np.sqrt(len(square))
+    with pytest.raises(ValueError, match="one leading axis of nodes"):
+        hg.simulation.relay_tree(plant, leaf, {"output": numbers["output"], "noise": np.ones(3)}, 3, 5)

@@ -193,6 +193,38 @@ def linear_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k:
     )
 
 
+class Linearised(NamedTuple):
+    """One step of a filter along its own estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
+
+    Shapes: predicted m- (n,), gain K (n, m), output C (m, n), noise S (m, m); zero for what did not arrive.
+    """
+
+    predicted: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    noise: jax.Array
+
+
+def linearised_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+    """The derivatives of a filter's own correction at its prediction, with its covariance held.
+
+    The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
+    """
+    prior = item.predict(state, u, k)
+
+    def unexpected(mean: jax.Array) -> jax.Array:
+        return jnp.asarray(item.correct(prior._replace(mean=mean), z, k)[1].value)
+
+    def used(z: jax.Array) -> jax.Array:
+        return jnp.asarray(item.correct(prior, z, k)[0].mean)
+
+    present = ~jnp.isnan(z)
+    output = jnp.where(present[:, None], -jax.jacfwd(unexpected)(prior.mean), 0.0)
+    total = jnp.where(present[:, None] & present, item.correct(prior, z, k)[1].covariance, 0.0)
+    gain = jnp.where(present, jax.jacfwd(used)(z), 0.0)
+    return Linearised(prior.mean, gain, output, total - output @ prior.covariance @ output.T)
+
+
 def is_linear_filter(item: AbstractFilter) -> bool:
     """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
     planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)

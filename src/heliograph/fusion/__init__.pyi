@@ -3,6 +3,9 @@
 from .all_reports import (
     AllReports as AllReports,
 )
+from .event import (
+    EventSending as EventSending,
+)
 from .informed import (
     DiagonalWeights as DiagonalWeights,
     MatrixWeights as MatrixWeights,
@@ -19,12 +22,18 @@ from .quantizer import (
     Quantized as Quantized,
     UniformQuantizer as UniformQuantizer,
 )
+from .report_link import (
+    ReportLink as ReportLink,
+)
 from .rules import (
     AbstractFusion as AbstractFusion,
     FixedIntersection as FixedIntersection,
     InverseCovarianceIntersection as InverseCovarianceIntersection,
     WeightedFusion as WeightedFusion,
     fuse as fuse,
+)
+from .split import (
+    SplitIntersection as SplitIntersection,
 )
 from .weights import (
     diagonal_weights as diagonal_weights,

@@ -4,9 +4,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from heliograph.filters.correction import homogeneous
 from heliograph.fusion.cross_covariance import Errors, heard_noise
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.quantizer import widen
+from heliograph.fusion.report_link import Links
 from heliograph.fusion.rules import Fused, Means
 from heliograph.fusion.weights import solve_known
 from heliograph.numerics.linalg import symmetrize
@@ -14,11 +18,29 @@ from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Float
 
 
+class Past(NamedTuple):
+    """Of reports sent 0, 1, ... steps ago: mean gain, offset, noise Cov(z | sent) on average, quantizers' error.
+
+    Shapes: gain (age, node, m, n), offset (age, node, m), noise (age, node, m, m), error (age, node, n).
+    """
+
+    gain: jax.Array
+    offset: jax.Array
+    noise: jax.Array
+    error: jax.Array
+
+
 class Knowledge(NamedTuple):
-    """What the centre knows of (x, e_1, ..., e_nodes): mean (N,) and covariance (N, N), N = (1 + nodes) n."""
+    """What the centre knows of zeta = (x, e_1, ..., e_nodes, what the nodes sent one step ago, two steps ago, ...).
+
+    mean (N,) and covariance (N, N), N = (1 + nodes + nodes delays) n; of errors that quantizers made a bound `spill`
+    on their square, apart: the error of the mean is one of this covariance and one within that bound.
+    """
 
     mean: Float[jax.Array, " N"]
     covariance: Float[jax.Array, "N N"]
+    past: Past
+    spill: Float[jax.Array, "N N"] | None
 
 
 class AllReports(AbstractInformedFusion):
@@ -26,35 +48,52 @@ class AllReports(AbstractInformedFusion):
 
     Where every report arrives it equals the central filter if every gain has full column rank: the centre could compute
     each measurement back. It knows more than any weights of what is said now, at the price of a state of all errors.
+    Reports that fade, get lost or are late (`ReportLink`), or are quantized, are heard for what they are; one that is
+    late is of what was then sent, which the state holds as long as it may be on its way.
 
-    Claim: as `MatrixWeights`.
+    Claim: as `MatrixWeights`; "upper" behind quantizers whose error is bounded before any data. Refused where the
+    centre cannot know what happened: nodes that lose measurements behind links that may lack their report.
 
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """
 
+    @property
+    def hears_reports(self) -> bool:
+        """It does."""
+        return True
+
     def start(self, errors: Errors) -> Knowledge:
-        """Before the first report."""
-        nodes, n = errors.bias.shape
-        own = errors.own.reshape(nodes * n, n)
-        joint = errors.joint.reshape(nodes * n, nodes * n)
-        covariance = jnp.block([[errors.covariance, own.T], [own, joint]])
-        return Knowledge(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), covariance)
+        """Before the first report, over links that deliver what is sent."""
+        return begin(errors, 0, errors.bias.shape[1], quantized=False)
 
     def use(self, state: Knowledge, happened: Happened, means: Means) -> tuple[Knowledge, Fused]:
         """Move the plant and all errors, then hear the reports; one that is NaN did not arrive."""
-        before, reports = _moved(state, happened), jnp.ravel(means)
         nodes, n = means.shape
-        output = jnp.concatenate([jnp.tile(jnp.eye(n), (nodes, 1)), -jnp.eye(nodes * n)], axis=1)
-        present = ~jnp.isnan(reports)
-        cross = jnp.where(present[:, None], output @ before.covariance, 0.0)
-        gain = solve_known(jnp.where(present, cross @ output.T, 0.0), cross).T
-        mean = before.mean + gain @ jnp.where(present, reports - output @ before.mean, 0.0)
-        covariance = symmetrize(with_rounding(before.covariance, nodes * n) - gain @ cross)
-        return Knowledge(mean, covariance), (mean[:n], covariance[:n, :n])
+        after, _ = heard(moved(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
+        return after, told(after, n)
 
 
-def _moved(state: Knowledge, happened: Happened) -> Knowledge:
-    """x- = A x + b + w and e+ = T e + G x + g + B w - K nu, together."""
+def faithful(nodes: int, n: int) -> Links:
+    """Links that deliver what is sent."""
+    zero = np.zeros((nodes, n))
+    return Links(np.tile(np.eye(n), (nodes, 1, 1)), zero, np.zeros((nodes, n, n, n + 1, n + 1)), zero)
+
+
+def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowledge:
+    """Before the first report, where one may be so many steps late; each has `received` numbers."""
+    nodes, n = errors.bias.shape
+    size = nodes * n
+    own, joint = errors.own.reshape(size, n), errors.joint.reshape(size, size)
+    later = (0, size * delays)
+    covariance = jnp.pad(jnp.block([[errors.covariance, own.T], [own, joint]]), (later, later))
+    mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), later)
+    shapes = (received, n), (received,), (received, received), (n,)
+    past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
+    return Knowledge(mean, covariance, past, jnp.zeros_like(covariance) if quantized else None)
+
+
+def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
+    """x- = A x + b + w and e+ = T e + G x + g + B w - K nu, together; then each node sends x- - e+."""
     motion, step, noise, _ = happened
     nodes, n, _ = step.transition.shape
     size = nodes * n
@@ -65,5 +104,124 @@ def _moved(state: Knowledge, happened: Happened) -> Knowledge:
     shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
     own = jnp.pad(heard_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
     drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
-    covariance = transition @ state.covariance @ transition.T + shared @ motion.noise @ shared.T + own
-    return Knowledge(transition @ state.mean + drift, symmetrize(covariance))
+    new = shared @ motion.noise @ shared.T + own
+    later = len(state.mean) - n - size
+    if later:
+        kept = _kept(nodes, n, later)
+        transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), kept])
+        new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
+    return Knowledge(
+        transition @ state.mean + drift,
+        symmetrize(transition @ state.covariance @ transition.T + new),
+        _with_new(state.past, happened, links),
+        None if state.spill is None else transition @ state.spill @ transition.T,
+    )
+
+
+class Expected(NamedTuple):
+    """What the reports were expected to be, (age, node, m) in a row, and the covariance of what they are."""
+
+    mean: Float[jax.Array, " M"]
+    covariance: Float[jax.Array, "M M"]
+
+
+def heard(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Knowledge, Expected]:
+    """Use the reports that arrived, by how many steps ago they were sent; NaN for those that did not arrive now.
+
+    With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
+    error then is (I - K O) e - K n, whose covariance is carried along, and -K mu, within `spill`.
+    """
+    nodes, n = state.past.error.shape[1:]
+    values = jnp.ravel(reports)
+    output, offset = _output(state.past, len(state.mean)), jnp.ravel(state.past.offset)
+    noise = _along_diagonal(state.past.noise)
+    present = ~jnp.isnan(values)
+    expected = output @ state.mean + offset
+    unexpected = jnp.where(present, values - expected, 0.0)
+    cross = output @ state.covariance
+    total = cross @ output.T + noise
+    if state.spill is None:
+        cross = jnp.where(present[:, None], cross, 0.0)
+        gain = solve_known(_of_present(present, total), cross).T
+        covariance = symmetrize(with_rounding(state.covariance, nodes * n) - gain @ cross)
+        return Knowledge(state.mean + gain @ unexpected, covariance, state.past, None), Expected(expected, total)
+    push = _quantized(state.past, present)
+    cross = jnp.where(present[:, None], cross, 0.0)
+    wide = push @ (jnp.ravel(state.past.error)[:, None] ** 2 / 3 * push.T)
+    gain = solve_known(_of_present(present, total + wide), cross).T
+    keep = jnp.eye(len(state.mean)) - gain @ output
+    covariance = symmetrize(keep @ state.covariance @ keep.T + gain @ _of_present(present, noise) @ gain.T)
+    into = gain @ push
+    bound = _within(into, jnp.ravel(state.past.error))
+    spill = symmetrize(_sum(keep @ state.spill @ keep.T, bound))
+    return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
+
+
+def told(state: Knowledge, n: int) -> Fused:
+    """The estimate of x, and the covariance or bound of its error."""
+    covariance = state.covariance[:n, :n]
+    return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
+
+
+def _with_new(past: Past, happened: Happened, links: Links) -> Past:
+    """What is sent now, before what was sent earlier."""
+    found = happened.errors
+    mean = found.mean - found.bias
+    blocks = jnp.einsum("iaib->iab", found.joint)
+    second = found.covariance - found.own - jnp.swapaxes(found.own, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
+    error = jnp.asarray(links.error)
+    known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
+    known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
+    noise = jnp.einsum("iabcd,icd->iab", links.spread, known)
+    new = Past(jnp.asarray(links.gain), jnp.asarray(links.offset), noise, error)
+    return Past(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
+
+
+def _kept(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
+    """x - e_i becomes what was sent a step ago, what was sent a step ago becomes what was sent two steps ago."""
+    size = nodes * n
+    sent = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size), np.zeros((size, later))], axis=1)
+    shift = np.eye(later - size, n + size + later, n + size)
+    return np.concatenate([sent, shift])
+
+
+def _output(past: Past, length: int) -> Float[jax.Array, "M N"]:
+    """The reports' mean gains: of x - e_i now, and of what was sent then."""
+    ages, nodes, m, n = past.gain.shape
+    size = nodes * n
+    now = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size)], axis=1)
+    before = np.eye(length - n - size, length, n + size)
+    sent = np.concatenate([np.pad(now, ((0, 0), (0, length - n - size))), before]).reshape(ages, nodes, n, length)
+    return jnp.einsum("aimn,ainN->aimN", past.gain, sent).reshape(ages * nodes * m, length)
+
+
+def _of_present(present: jax.Array, matrix: jax.Array) -> jax.Array:
+    return jnp.where(present[:, None] & present, matrix, 0.0)
+
+
+def _quantized(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
+    """How the quantizers' errors, (age, node, n) in a row, get into the reports that arrived."""
+    return jnp.where(present[:, None], _along_diagonal(past.gain), 0.0)
+
+
+def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
+    """One block after another, zero elsewhere."""
+    ages, nodes, rows, columns = blocks.shape
+    each = jnp.arange(ages * nodes)
+    empty = jnp.zeros((len(each), rows, len(each), columns))
+    full = empty.at[each, :, each, :].set(blocks.reshape(-1, rows, columns))
+    return full.reshape(len(each) * rows, len(each) * columns)
+
+
+def _within(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:
+    """B with (B mu)(B mu)' <= B s diag(D) B' for |mu| <= D, s = sum D over what B uses (Cauchy)."""
+    used = jnp.where(jnp.any(into != 0, axis=0), error, 0.0)
+    return jnp.sum(used) * (into * used) @ into.T
+
+
+def _sum(a: jax.Array, b: jax.Array) -> jax.Array:
+    """(1 + s / r) A + (1 + r / s) B above E[(u + v)(u + v)'], the smallest trace: r^2 = tr A, s^2 = tr B (Young)."""
+    r, s = jnp.sqrt(jnp.trace(a)), jnp.sqrt(jnp.trace(b))
+    both = (r > 0) & (s > 0)
+    ratio = jnp.where(both, s / jnp.where(r > 0, r, 1.0), 1.0)
+    return jnp.where(both, (1 + ratio) * a + (1 + 1 / ratio) * b, a + b)

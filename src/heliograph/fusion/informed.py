@@ -31,6 +31,11 @@ class AbstractInformedFusion(AbstractFusion):
     `start` is the rule's own state before the first step, `use` what it makes of the reports of one step.
     """
 
+    @property
+    def needs_plant_moments(self) -> bool:
+        """Whether it needs the mean and the covariance of the plant's state before any data."""
+        return False
+
     def claim(self, claims: list[Claim]) -> Claim:
         """Refused: what the local claims say of each error alone says nothing of the joint covariance."""
         raise self._lacking()
@@ -60,6 +65,11 @@ class AbstractWeights(AbstractInformedFusion):
     """
 
     with_mean: eqx.AbstractVar[bool]
+
+    @property
+    def needs_plant_moments(self) -> bool:
+        """For the plant's own mean."""
+        return self.with_mean
 
     def weights(self, joint: Joint) -> Float[jax.Array, "n node n"]:
         """W from P."""

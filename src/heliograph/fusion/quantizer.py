@@ -42,6 +42,11 @@ class AbstractQuantizer(eqx.Module):
     leaves the state alone.
     """
 
+    @property
+    def silent(self) -> bool:
+        """Whether nothing may arrive of a value."""
+        return False
+
     def init(self, n: int) -> PyTree:
         """State before the first value, for values of n components."""
         raise NotImplementedError
@@ -53,6 +58,16 @@ class AbstractQuantizer(eqx.Module):
     def claim(self, claim: Claim) -> Claim:
         """What the widened covariance of a quantized estimate claims, from what the estimate's own claims."""
         raise NotImplementedError
+
+    def error(self, n: int) -> Float[Array, " n"]:
+        """Bound on |what arrives - x| by component that holds whatever the data, where anything arrives.
+
+        Raises:
+            ValueError: there is none.
+        """
+        raise fail(
+            f"reports through {type(self).__name__}", "a quantizer whose error is bounded before any data", "none"
+        )
 
     def check(self, n: int) -> None:
         """Raise ValueError unless the parameters fit values of n components."""
@@ -93,6 +108,10 @@ class UniformQuantizer(AbstractQuantizer):
     def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
         """Quantize with the one amplitude."""
         return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
+
+    def error(self, n: int) -> Float[Array, " n"]:
+        """Half of a segment."""
+        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
 
     def claim(self, claim: Claim) -> Claim:
         """At most "upper"."""

@@ -15,6 +15,7 @@ from heliograph.fusion.intersection import (
     without_known,
 )
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantizer
+from heliograph.fusion.report_link import ReportLink, ReportLinks
 from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
@@ -34,6 +35,11 @@ class AbstractFusion(eqx.Module):
 
     A fused claim is never stronger than the weakest of its inputs; what else a rule assumes is in `claim`.
     """
+
+    @property
+    def hears_reports(self) -> bool:
+        """Whether it makes something of reports that fade, are late, or never arrive."""
+        return False
 
     def check(self, count: int) -> None:
         """Raise ValueError if the rule cannot fuse this number of estimates."""
@@ -211,12 +217,14 @@ class Fusion(eqx.Module):
 
     `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each
     node by its name, all of one kind. The local covariance is widened by the quantizer's error. Covariances are taken
-    to arrive as they are: most are computed before any data.
+    to arrive as they are: most are computed before any data. `uplink`: how what comes out of it travels, for rules that
+    hear reports (`AllReports`); one for all nodes, or one for each node by its name.
     """
 
     filter: str = eqx.field(static=True)
     rule: AbstractFusion
     quantizer: Quantizer | Mapping[str, Quantizer] | None = None
+    uplink: ReportLinks | None = None
 
     def __check_init__(self) -> None:
         instance("filter of a fusion", self.filter, str, "its name")
@@ -231,7 +239,39 @@ class Fusion(eqx.Module):
             if not isinstance(first(item), AbstractQuantizer):
                 raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
             first(item).check(n)
+            if first(item).silent and not self.rule.hears_reports:
+                wanted = "a rule that hears reports (AllReports)"
+                raise fail(f"fusion through {type(first(item)).__name__}", wanted, type(self.rule).__name__)
+        if self.by_report:
+            self._check_reports(nodes, n)
         self.uplinks(nodes)
+
+    @property
+    def by_report(self) -> bool:
+        """Whether the centre hears reports that may not be what was sent."""
+        return self.uplink is not None or (self.rule.hears_reports and self.quantizer is not None)
+
+    def _check_reports(self, nodes: Sequence[str], n: int) -> None:
+        if not self.rule.hears_reports:
+            raise fail("fusion over report links", "a rule that hears reports (AllReports)", type(self.rule).__name__)
+        if isinstance(self.uplink, Mapping) and set(self.uplink) != set(nodes):
+            raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
+        for link in self.links(nodes):
+            instance("report link", link, ReportLink, "a ReportLink").check(n)
+        for item in self._each(nodes):
+            if isinstance(item, OverTime):
+                raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
+            item.error(n)
+
+    def links(self, nodes: Sequence[str]) -> list[ReportLink]:
+        """How the reports of these nodes travel."""
+        if self.uplink is None:
+            return [ReportLink()] * len(nodes)
+        return [self.uplink[n] if isinstance(self.uplink, Mapping) else self.uplink for n in nodes]
+
+    def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
+        """The quantizers of these nodes' reports, which do not vary over time; none where there are none."""
+        return [item for item in self._each(nodes) if isinstance(item, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
         """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import eigh, regular_solve, symmetrize
 from heliograph.numerics.types import Array, Float
 
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
@@ -29,7 +29,7 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
     found = solve_known(total, ones).T  # E' U^+
-    weights = jnp.linalg.solve(found @ ones, found).reshape(n, nodes, n)
+    weights = regular_solve(found @ ones, found).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
@@ -78,7 +78,7 @@ def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) 
     """U^+ B for a positive semidefinite U, by its correlation matrix; directions that U has not are skipped."""
     deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(total), 0.0))
     scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * total * scale)
+    values, vectors = eigh(scale[:, None] * total * scale)
     used = values > RANK * float(np.finfo(values.dtype).eps) * values[-1]
     inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
     root = scale[:, None] * vectors

@@ -12,6 +12,7 @@ from heliograph.live.later import Sweeper
 from heliograph.live.mould import cast
 from heliograph.live.tape import Ears, Tape, replay
 from heliograph.model.over_time import first
+from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
@@ -31,7 +32,12 @@ class Player:
         self.received = sum(node.received for node in network.nodes.values())
         self.given = inputs - (self.dt is not None)
         with jax.enable_x64(True):
-            ears = Ears(network, AllFilters(network))
+            filters = AllFilters(network)
+            for name, link in filters.reporting.items():
+                if link.uplinks.groups:
+                    wanted = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
+                    raise fail(f"timeline: fusion {name!r}", wanted, "links that chance has a part in")
+            ears = Ears(network, filters)
             self.numbers, mould = cast(ears)
             self._start: PyTree = jax.tree.map(jnp.asarray, ears.filters.init())
             data = self.numbers, self._start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
 
 from heliograph.numerics.small_matrix import (
@@ -46,3 +47,22 @@ def psd_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n
 
 
 _solve = runs_last(solve)
+
+
+def eigh(a: Float[Array, "n n"]) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """Eigenvalues and eigenvectors of a symmetric matrix; of a batch one after another.
+
+    A batch at once is dealt out to the processor's threads by a call that waits for them on one of them: programs that
+    run side by side on as many threads then wait for each other for ever.
+    """
+    values, vectors = _eigh(a)
+    return values, vectors
+
+
+def regular_solve(a: Float[Array, "n n"], b: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Solve A X = B for a regular A; of a batch one after another, as `eigh`."""
+    return jnp.asarray(_regular_solve(a, b))
+
+
+_eigh = sequential_vmap(lambda a: tuple(jnp.linalg.eigh(a)))  # type: ignore[no-untyped-call]
+_regular_solve = sequential_vmap(jnp.linalg.solve)  # type: ignore[no-untyped-call]

@@ -23,6 +23,16 @@ from .record import (
     Trajectories as Trajectories,
     Uplink as Uplink,
 )
+from .stepping import (
+    centre_filter as centre_filter,
+)
+from .uplinks import (
+    SentReports as SentReports,
+)
+from .tree import (
+    RelayTree as RelayTree,
+    relay_tree as relay_tree,
+)
 from .statistics import (
     ErrorStatistics as ErrorStatistics,
     pool as pool,

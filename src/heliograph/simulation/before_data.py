@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.plan import Plan
 from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
@@ -17,7 +16,7 @@ from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
-from heliograph.simulation.centre import Centre, Together
+from heliograph.simulation.centre import Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, plan
 
@@ -157,21 +156,23 @@ def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple
     filters = AllFilters(network)
     if not filters.centres:
         raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
+    if len(filters.informed) < len(filters.centres):
+        raise fail("covariances before data", "filters whose gains depend on no data", "some whose gains do")
     return plan(filters, u), u
 
 
 @large_program
 def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
-    centre = filters.centres[0]
+    (centre,) = filters.informed
 
     def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
         (own, factors), (k, u_k) = carry, row
-        local = centre.gathered(_matrices(filters, centre, own, u_k, k))
+        local = centre.gathered(filters.matrices(centre, own, u_k, k))
         spread = factors.state @ factors.state.T
         motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
-        return (_followed(filters, own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+        return (filters.followed(own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
 
-    own, _, _, known = filters.init()
+    own, _, _, known, _ = filters.init()
     nodes, n = known[0].errors.bias.shape
     each = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
     start = own, initial_factors(known[0].errors, each * len(u))
@@ -185,27 +186,12 @@ def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
         (own, known), (k, u_k) = carry, row
         told: dict[str, jax.Array] = {}
         following = []
-        for centre, state in zip(filters.centres, known, strict=True):
+        for centre, state in zip(filters.informed, known, strict=True):
             means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
-            after, found = centre.step(state, _matrices(filters, centre, own, u_k, k), means, u_k, k)
+            after, found = centre.step(state, filters.matrices(centre, own, u_k, k), means, u_k, k)
             following.append(after)
             told |= {name: jnp.asarray(estimate.covariance) for name, estimate in found.items()}
-        return (_followed(filters, own, u_k, k), tuple(following)), told
+        return (filters.followed(own, u_k, k), tuple(following)), told
 
-    own, _, _, known = filters.init()
+    own, _, _, known, _ = filters.init()
     return jax.lax.scan(body, (own, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
-
-
-def _matrices(filters: AllFilters, centre: Centre, own: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
-    """Of the centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
-    return [filters.alike[i].matrices(own[i], f, _quiet(filters, i), u, k) for i, f in centre.sources]
-
-
-def _followed(filters: AllFilters, own: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
-    """The nodes' states after step k."""
-    pairs = zip(filters.alike, own, strict=True)
-    return tuple(item.step(state, _quiet(filters, i), u, k)[0] for i, (item, state) in enumerate(pairs))
-
-
-def _quiet(filters: AllFilters, kind: int) -> jax.Array:
-    return jnp.zeros((filters.alike[kind].nodes, filters.alike[kind].filters.received))

@@ -10,7 +10,8 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.correction import homogeneous
-from heliograph.filters.plan import Plan, is_linear_filter
+from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.plan import Plan, is_linear_filter, linear_step
 from heliograph.fusion.cross_covariance import (
     Errors,
     ErrorStep,
@@ -22,8 +23,9 @@ from heliograph.fusion.cross_covariance import (
     moved_state,
 )
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, weakest
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
@@ -125,6 +127,8 @@ class Centre(eqx.Module):
     size: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
 
+    read = staticmethod(linear_step)
+
     def init(self, starts: Sequence[jax.Array]) -> CentreState:
         """Before the first step, from the means at which each source's filters start."""
         plant = at(self.plant, 0)
@@ -187,27 +191,71 @@ def described(channel: Channel) -> SecondOrder | OverTime:
     return second_order(arrived(channel))
 
 
-def informed_claim(rule: str, plant: AnyPlant, nodes: Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]) -> Claim:
-    """What fusion by an informed rule claims: "exact", "nominal" where a law is not known.
+Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
+
+
+def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+    """What fusion by an informed rule claims: "exact", "nominal" where a law is not known or filters are not linear.
+
+    `shared`: whether the nodes hear parts of one channel.
 
     Raises:
         ValueError: naming the knowledge that is missing.
     """
+    for name, (_, channel, _) in nodes.items():
+        if first(channel).remembers:
+            wanted = f"fusion by {rule}: node {name!r}"
+            raise fail(wanted, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
+    if along_estimates(nodes):
+        _check_along_estimates(rule, nodes, shared)
+        return "nominal"
+    _check_linear(rule, plant, nodes)
+    return "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
+
+
+def along_estimates(nodes: Parts) -> bool:
+    """Whether errors can only be followed along the estimates: some filter's gains depend on data."""
+    return any(isinstance(item, GaussianFilter) and not item.linear for _, _, item in nodes.values())
+
+
+def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
+    for name, (_, _, item) in nodes.items():
+        if not isinstance(item, GaussianFilter) or item.linear:
+            raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", item)
+    if shared:
+        raise fail(f"fusion by {rule}", "nodes that share nothing but the plant, or filters whose gains depend on no "
+                   "data", "nodes that share a channel")  # fmt: skip
+
+
+def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
     refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
-    uncertain, seen = False, set()
-    for name, (sensor, channel, item) in nodes.items():
+    seen = set()
+    for name, (sensor, _, item) in nodes.items():
         where = f"fusion by {rule}: node {name!r}"
         if not isinstance(first(sensor), LinearSensor):
             raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
-        if first(channel).remembers:
-            raise fail(where, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
         if structure(item) not in seen and not is_linear_filter(item):
             raise fail(where, "a filter of the plant's state whose gains depend on no data", type(item).__name__)
         seen.add(structure(item))
-        uncertain = uncertain or _uncertain(channel)
-    return "nominal" if uncertain else "exact"
+
+
+def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
+    """What is left of a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
+
+    Raises:
+        ValueError: nodes that lose measurements, of which a report that does not come cannot tell.
+    """
+    lossy = [name for name, hears_all in complete.items() if not hears_all]
+    if lossy:
+        raise fail(f"fusion by {rule} over uplinks", "nodes that lose no measurements, of which the centre would have "
+                   "to know", f"losses at {lossy}")  # fmt: skip
+    names = list(complete)
+    channels = [link.channel for link in fusion.links(names) if link.channel is not None]
+    for quantizer in fusion.quantizers(names):
+        claim = quantizer.claim(claim)
+    return weakest([claim, "nominal"]) if any(map(_uncertain, channels)) else claim
 
 
 def _uncertain(channel: Channel) -> bool:

@@ -23,7 +23,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
-from heliograph.simulation.centre import informed_claim
+from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
@@ -243,13 +243,24 @@ class Network(eqx.Module):
         if not isinstance(item.rule, AbstractInformedFusion):
             return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
         rule, own = type(item.rule).__name__, {n: self.nodes[n] for n in names}
-        if item.quantizer is not None:
+        if item.quantizer is not None and not item.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
-        worlds = {n: v if isinstance(v, Node) else self.common for n, v in own.items()}
-        known = {n: (w.sensor, w.channel, own[n].filters[item.filter]) for n, w in worlds.items() if w is not None}
+        known = self.parts_of(item.filter)
         if len(known) < len(own):
             raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
-        return informed_claim(rule, self.plant, known)
+        if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
+            raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
+                       type(next(iter(known.values()))[2]).__name__)  # fmt: skip
+        claim = informed_claim(rule, self.plant, known, self.common is not None)
+        if not item.by_report:
+            return claim
+        return reported_claim(rule, claim, item, {n: node.complete for n, node in own.items()})
+
+    def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
+        """Sensor, channel and the filter `name` of each node that has it and hears a sensor through a channel."""
+        own = {node: self.nodes[node] for node in self.nodes_with(name)}
+        worlds = {n: v if isinstance(v, Node) else self.common for n, v in own.items()}
+        return {n: (w.sensor, w.channel, own[n].filters[name]) for n, w in worlds.items() if w is not None}
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""

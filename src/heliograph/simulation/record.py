@@ -21,6 +21,7 @@ from heliograph.simulation.labelled_record import record_dataset, record_from
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plots import plot_record
 from heliograph.simulation.saved import opened, save
+from heliograph.simulation.uplinks import SentReports
 
 if TYPE_CHECKING:  # extras
     import pandas as pd
@@ -58,7 +59,8 @@ class Record:
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
-    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers.
+    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
+    reports[name][node] of each fusion that hears reports.
     time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
     smoothed: the same of estimates given later data too, where these were asked for: a record of its own to save.
     """
@@ -71,6 +73,7 @@ class Record:
     uplinks: dict[str, Uplink] = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     smoothed: "Record | None" = None
+    reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
 
     @property
     def runs(self) -> int | None:
@@ -294,7 +297,23 @@ def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Re
         node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
         for node, claims in network.claims().items()
     }
-    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks_of(network, batch["uplinks"]))
+    uplinks, reports = uplinks_of(network, batch["uplinks"]), _reports(network, batch["reports"])
+    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports)
+
+
+def _reports(network: Network, found: dict[str, tuple[np.ndarray, np.ndarray]]) -> dict[str, dict[str, SentReports]]:
+    """Reports by fusion and node, without the rows that a node has not, from (..., node, m) and (..., node)."""
+    result: dict[str, dict[str, SentReports]] = {}
+    for name, (values, delay) in found.items():
+        fusion = network.fused[name]
+        assert isinstance(fusion, Fusion)  # nothing else hears reports
+        nodes, n = network.nodes_with(fusion.filter), len(network.states)
+        sizes = [link.received(n) for link in fusion.links(nodes)]
+        result[name] = {
+            node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
+            for i, node in enumerate(nodes)
+        }
+    return result
 
 
 def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:

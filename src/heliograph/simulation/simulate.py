@@ -27,6 +27,7 @@ from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories
 from heliograph.simulation.smoothed import Beside, Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
+from heliograph.simulation.uplinks import Drawn, SentReports
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Progress = Callable[[int, int], None]
@@ -148,6 +149,7 @@ def run(
     inputs: ArrayLike | None = None,
     time: ArrayLike | None = None,
     smooth: AbstractSmoothing | None = None,
+    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
 ) -> Record:
     """Run every filter of the network over recorded measurements.
 
@@ -155,6 +157,9 @@ def run(
     be left out, and with it their own filters. inputs: (steps,
     inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given. smooth: as of
     `monte_carlo`.
+    reports: of each fusion by `AllReports` and each of its nodes what became of the report that was sent at each step,
+    (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be left out where
+    nothing happens to them by chance.
 
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
@@ -176,17 +181,25 @@ def run(
     part = None if smooth is None else smoothed_part(network, smooth, steps)
     filters = AllFilters(network, part and part.kinds)
     with jax.enable_x64(True):
-        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u))
+        given = {} if reports is None else table("reports", reports, "reports by fusion")
+        arrivals = {
+            name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
+            for name, item in filters.reporting.items()
+        }
+        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u, arrivals))
     return found_record(network, part, found, clock)
 
 
 @large_program
-def _run_filters(filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray) -> PyTree:
+def _run_filters(
+    filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
+) -> PyTree:
     def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
-        k, u_k, z_k = row
-        return filters.step(states, z_k, u_k, k)
+        k, u_k, z_k, drawn = row
+        return filters.step(states, z_k, u_k, k, drawn)
 
-    found = {"measurements": z, **jax.lax.scan(body, filters.init(), (jnp.arange(len(u)), u, z))[1]}
+    rows = jnp.arange(len(u)), u, z, arrivals
+    found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
     return found if later is None else one_run(later.both, found)
 
 
@@ -208,7 +221,8 @@ class World(eqx.Module):
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         air, z = self.air.hear(air, x, key, k)
-        states, found = self.filters.step(states, z, u, k)
+        drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
+        states, found = self.filters.step(states, z, u, k, drawn)
         after = x, self.air.told(air, found["estimates"]), states
         return after, {"truth": x, "measurements": z, **_near(plant, x, found)}
 

@@ -51,6 +51,7 @@ class Smoother(eqx.Module):
             "estimates": estimates,
             "fused": fused,
             "uplinks": {},
+            "reports": {},
         }
         if "truth" in found:
             smoothed["truth"] = self.smoothing.about(found["truth"])

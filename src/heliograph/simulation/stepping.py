@@ -3,7 +3,7 @@
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -12,20 +12,34 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plan import Plan, linear_step
+from heliograph.filters.plan import Plan
 from heliograph.filters.retained import AbstractRetained
+from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import Array, Float
-from heliograph.simulation.centre import AbstractHears, Apart, Centre, CentreState, Together, described, listening
+from heliograph.simulation.centre import (
+    AbstractHears,
+    Apart,
+    Centre,
+    CentreState,
+    Together,
+    along_estimates,
+    described,
+    listening,
+)
+from heliograph.simulation.hearing import CentreFilter
+from heliograph.simulation.linearised import Followed, LinearisedCentre
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.node import Node
+from heliograph.simulation.node import Listener, Node
+from heliograph.simulation.uplinks import Drawn, Flying, Uplinks, uplinks_of
 from heliograph.smoothing.sweep import planned_with_past
 
 
@@ -73,14 +87,14 @@ class Alike(eqx.Module):
         after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)))
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
 
-    def matrices(self, states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array) -> Plan:
-        """Matrices of this step of filter f at each node, from the states before it; (node, ...)."""
+    def matrices(
+        self, read: Callable[..., Any], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+    ) -> Any:
+        """What `read` gives of this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        found: Plan = eqx.filter_vmap(
-            lambda item, state, z: linear_step(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0)
-        )(filters, states, z)
-        return found
+        each = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
+        return each(filters, states, z)
 
 
 class Fused(eqx.Module):
@@ -133,6 +147,34 @@ class Fused(eqx.Module):
         return jnp.stack([part[order] for part, order in zip(joined, self.order, strict=True)])
 
 
+class Reporting(eqx.Module):
+    """A fusion that hears reports: what happens to them on their way, and the filter at the centre.
+
+    `sources` and `order` as in `Centre`.
+    """
+
+    uplinks: Uplinks
+    centre: CentreFilter
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    nodes: tuple[str, ...] = eqx.field(static=True)
+
+    def init(self) -> tuple[Flying, PyTree]:
+        """Nothing is on its way, nothing heard."""
+        return self.uplinks.init(), _initial(self.centre)
+
+    def step(
+        self, state: tuple[Flying, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
+    ) -> tuple[tuple[Flying, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
+        """Send the nodes' means, and hear what arrives: state, estimate, traffic, what becomes of what is sent when."""
+        flying, known = state
+        means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
+        flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
+        flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
+        known, estimate = self.centre.step(known, jnp.ravel(reports)[self.centre.rows], u, k)
+        return (flying, known), estimate, traffic, (sent, drawn.delay)
+
+
 class AllFilters(eqx.Module):
     """Every filter of a network: those of the nodes by kind, fusion rules, centres that know more, central filters.
 
@@ -142,7 +184,8 @@ class AllFilters(eqx.Module):
 
     alike: tuple[Alike, ...]
     fusions: tuple[Fused, ...]
-    centres: tuple[Centre, ...]
+    centres: tuple[Centre | LinearisedCentre, ...]
+    reporting: dict[str, Reporting]
     central: dict[str, AbstractFilter]
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
@@ -164,6 +207,7 @@ class AllFilters(eqx.Module):
         )
         self.central = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
         self.fusions, self.centres = _fusions(network), _centres(network)
+        self.reporting = _reporting(network)
         grouped = [name for names in network.groups for name in names]
         lengths = [network.nodes[name].received for name in grouped]
         entries = dict(zip(grouped, np.split(np.arange(sum(lengths)), np.cumsum(lengths)[:-1]), strict=True))
@@ -172,25 +216,49 @@ class AllFilters(eqx.Module):
         self.n = len(network.states)
 
     def init(self) -> PyTree:
-        """States before the first step: of the nodes' filters, of central filters, of quantizers, and of centres."""
+        """States before the first step: of nodes' filters, central filters, quantizers, centres, reports."""
         central = {name: _initial(item) for name, item in self.central.items()}
         own = tuple(item.init() for item in self.alike)
         sent = tuple(item.init(self.n) for item in self.fusions)
-        return own, central, sent, tuple(self._started(item, own) for item in self.centres)
+        reporting = {name: item.init() for name, item in self.reporting.items()}
+        return own, central, sent, tuple(self._started(item, own) for item in self.centres), reporting
 
-    def _started(self, centre: Centre, own: Sequence[PyTree]) -> CentreState:
+    def _started(self, centre: Centre | LinearisedCentre, own: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
         means = [own[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
         return centre.init(means)
 
-    def step(
-        self, states: PyTree, z: Sequence[jax.Array], u: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, dict[str, PyTree]]:
-        """One step of all filters from the measurements of each group.
+    @property
+    def informed(self) -> tuple[Centre, ...]:
+        """The centres of filters whose gains depend on no data."""
+        return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
-        Gives "estimates" by kind, (filter, node, ...), "fused" by name, and "uplinks" of what has quantizers; and what
-        is retained where that is asked for, "retained" by kind and "retained_centrally" by name.
+    def matrices(self, centre: Centre, own: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+        """Of a centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
+        return [self.alike[i].matrices(centre.read, own[i], f, self._quiet(i), u, k) for i, f in centre.sources]
+
+    def followed(self, own: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """The nodes' states after step k, where what is heard is zero."""
+        pairs = zip(self.alike, own, strict=True)
+        return tuple(item.step(state, self._quiet(i), u, k)[0] for i, (item, state) in enumerate(pairs))
+
+    def _quiet(self, kind: int) -> jax.Array:
+        return jnp.zeros((self.alike[kind].nodes, self.alike[kind].filters.received))
+
+    def step(
+        self,
+        states: PyTree,
+        z: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+        drawn: Mapping[str, Drawn] | None = None,
+    ) -> tuple[PyTree, dict[str, PyTree]]:
+        """One step of all filters from the measurements of each group, and from what happens to reports, by fusion.
+
+        Gives "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of what has quantizers, and
+        "reports" with their delays by fusion, as the nodes send them; and what is retained where that is asked for,
+        "retained" by kind and "retained_centrally" by name.
         """
-        own, central, sent, known = states
+        own, central, sent, known, reporting = states
         results = [item.step(state, z[item.group], u, k) for item, state in zip(self.alike, own, strict=True)]
         estimates = tuple(one.estimate for _, one in results)
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
@@ -206,17 +274,24 @@ class AllFilters(eqx.Module):
             uplinks |= traffic
         learned = []
         for centre, state in zip(self.centres, known, strict=True):
-            parts = [self.alike[i].matrices(own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources]
+            parts = [
+                self.alike[i].matrices(centre.read, own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
+            ]
             state, found = centre.step(state, parts, [estimates[i].mean[f] for i, f in centre.sources], u, k)
             learned.append(state)
             fused |= found
+        told, reports = {}, {}
+        for name, link in self.reporting.items():
+            happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
+            told[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
+            uplinks |= {name: traffic} if traffic else {}
         own, central = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}
-        following = own, central, tuple(after), tuple(learned)
-        told: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks}
+        following = own, central, tuple(after), tuple(learned), told
+        result: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
         if self.retains:
-            told["retained"] = tuple(one.retained for _, one in results)
-            told["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
-        return following, told
+            result["retained"] = tuple(one.retained for _, one in results)
+            result["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
+        return following, result
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
@@ -280,23 +355,84 @@ def _fused(
     return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
 
 
-def _centres(network: Network) -> tuple[Centre, ...]:
+def _centres(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
     """One for the informed fusions of each filter."""
     rules: dict[str, dict[str, AbstractInformedFusion]] = {}
     for name, item in network.fused.items():
-        if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion):
+        if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion) and not item.by_report:
             rules.setdefault(item.filter, {})[name] = item.rule
     return tuple(_centre(network, name, mine) for name, mine in rules.items())
 
 
-def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre:
+def _reporting(network: Network) -> dict[str, Reporting]:
+    """The fusions that hear reports."""
+    found = {}
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion) and item.by_report:
+            centre = centre_filter(network, name)
+            places, mine = network.places(), network.nodes_with(item.filter)
+            sources, order = _gathering(network, places, mine, item.filter)
+            uplinks = uplinks_of(item, mine, len(network.states))
+            found[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
+    return found
+
+
+def centre_filter(network: Network, name: str) -> CentreFilter:
+    """The fusion `name` of the network, by `AllReports`, as a filter that hears the nodes' reports.
+
+    It hears, joined: of each node in the network's order what arrives of the report of this step, then of that of the
+    step before if links may be a step late, and so on; NaN for what did not arrive. What a quantizer adds is known by
+    its bound. Claim: as the fusion's.
+
+    Raises:
+        ValueError: no fusion of this name, or one by another rule.
+    Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
+    """
+    fusion = network.fused.get(name)
+    if not isinstance(fusion, Fusion) or not fusion.rule.hears_reports:
+        hearing = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.hears_reports]
+        raise fail("fusion", f"one of {hearing}, which hear reports", repr(name))
+    names = network.nodes_with(fusion.filter)
+    alone = Network(
+        network.plant,
+        {one: _with_only(network.nodes[one], fusion.filter) for one in network.names},
+        {"all": Fusion(fusion.filter, AllReports())},
+        network.relays,
+        network.common,
+    )
+    uplinks = uplinks_of(fusion, names, len(network.states))
+    return CentreFilter(
+        filters=AllFilters(alone),
+        links=uplinks.links,
+        rows=uplinks.rows,
+        ages=uplinks.delay.shape[1],
+        widest=max(uplinks.received),
+        quantized=uplinks.quantizers is not None,
+        claim=network.claims()[FUSED][name],
+        states=network.states,
+        inputs=network.inputs,
+        received=len(uplinks.rows),
+    )
+
+
+def _with_only(node: Node | Listener, name: str) -> Node | Listener:
+    """A node with one of its filters."""
+    filters = {one: item for one, item in node.filters.items() if one == name}
+    if isinstance(node, Node):
+        return Node(node.sensor, node.channel, filters)
+    return replace(node, filters=filters)
+
+
+def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
     """What the centre knows of the nodes that have the filter `name`."""
     places, claims = network.places(), network.claims()[FUSED]
     mine = network.nodes_with(name)
-    sources = tuple({places[node, name][:2]: None for node in mine})
+    sources, order = _gathering(network, places, mine, name)
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    found = {node: i for i, node in enumerate(node for names in groups for node in names)}
-    order, size = np.array([found[node] for node in mine]), max(network.nodes[node].received for node in mine)
+    size = max(network.nodes[node].received for node in mine)
+    claim = claims[next(iter(rules))]
+    if along_estimates(network.parts_of(name)):
+        return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return Centre(
         plant=network.plant,
         listening=_hears(network, mine, groups, order, size),
@@ -304,8 +440,18 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
         order=order,
         sources=sources,
         size=size,
-        claim=claims[next(iter(rules))],
+        claim=claim,
     )
+
+
+def _gathering(
+    network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
+) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
+    """Kinds and filters that hold the nodes' estimates, and what brings these into the order of the nodes."""
+    sources = tuple({places[node, name][:2]: None for node in nodes})
+    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    found = {node: i for i, node in enumerate(node for names in groups for node in names)}
+    return sources, np.array([found[node] for node in nodes])
 
 
 def _hears(

@@ -1,14 +1,15 @@
 """What every rule reaches before any data, in three small networks, a tree of twelve nodes, and a network of many."""
 
-import resource
-import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 import heliograph as hg
+from heliograph.examples.fusion import machine
+from heliograph.examples.fusion.memory import peak_gb
 
 CASES = {
     "three_partial": "three sensors that each see a part of a moving point",
@@ -24,8 +25,12 @@ RULES = {
 OWN = "own"
 STEPS = 200
 MANY, MANY_STEPS = 1000, 100
+TREE_NODES, DEGREE = 10_000, 10
 RUNS, MEASURED_STEPS = 2000, 30
-STAGES = len(CASES) + 3
+STRONG_RUNS = 256
+INTERVALS, THRESHOLDS = (1, 2, 3, 4, 6), (0.05, 0.15, 0.4)
+TRAFFIC_STEPS = 36  # a multiple of all intervals; the second half is judged
+STAGES = len(CASES) + 5
 
 Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean and variance of the gain, variance of n
 
@@ -38,7 +43,11 @@ class Outcome:
     cases: dict[str, dict[str, float | list[float]]]
     measured: dict[str, dict[str, float]]
     tree: dict[str, float]
+    levels: list[np.ndarray]
     scale: dict[str, float]
+    strong: dict[str, float]
+    strong_claimed: dict[str, float]
+    traffic: dict[str, list[dict[str, float]]]
 
 
 def moving_point() -> hg.LinearPlant:
@@ -130,37 +139,125 @@ def drawn_parts(count: int, seed: int) -> list[Part]:
     return [(draw.normal(size=(2, 4)), 0.3, 0.75, 1 / 16, 0.2 + 0.2 * draw.random()) for _ in range(count)]
 
 
-def tree(seed: int) -> dict[str, float]:
-    """Twelve nodes heard by four relays, these by two, these by the root: its error, and that without the relays."""
+def tree(seed: int) -> tuple[dict[str, float], list[np.ndarray], dict[str, float]]:
+    """Twelve nodes heard by four relays, these by two, these by the root.
+
+    Its error, that without the relays, and the central filter's; covariances at every place; what simulation says of
+    the root's claim.
+    """
     plant, parts = moving_point(), drawn_parts(12, seed)
-    leaves = hg.simulation.cross_covariances(network(plant, parts), OWN, STEPS)
-    relays = leaves.fused({f"relay {i}": leaves.nodes[3 * i : 3 * i + 3] for i in range(4)})
-    upper = relays.fused({"left": relays.nodes[:2], "right": relays.nodes[2:]})
-    traces = [float(np.trace(level.matrix_weights()[1])) for level in (upper, leaves)]
+    net = network(plant, parts)
+    leaves = hg.simulation.cross_covariances(net, OWN, STEPS)
+    levels = _levels(leaves)
+    traces = [float(np.trace(level.matrix_weights()[1])) for level in (levels[-1], leaves)]
     best = float(np.trace(central(plant, parts, STEPS)[-1]))
-    return {"root": traces[0], "flat": traces[1], "central": best}
+    covariances = [np.einsum("iaib->iab", level.joint) for level in levels]
+    known = [*covariances, levels[-1].matrix_weights()[1][None]]
+    return {"root": traces[0], "flat": traces[1], "central": best}, known, _root_simulated(net, seed)
+
+
+def _levels(leaves: hg.simulation.CrossCovariances) -> list[hg.simulation.CrossCovariances]:
+    relays = leaves.fused({f"relay {i}": leaves.nodes[3 * i : 3 * i + 3] for i in range(4)})
+    return [leaves, relays, relays.fused({"left": relays.nodes[:2], "right": relays.nodes[2:]})]
+
+
+def _root_simulated(net: hg.Network, seed: int) -> dict[str, float]:
+    """E |x - xhat|^2 at the root after some steps, beside its claim: weights of each level on the estimates below."""
+    alone = hg.Network(net.plant, net.nodes)
+    record = hg.monte_carlo(alone, MEASURED_STEPS, RUNS, seed)
+    levels = _levels(hg.simulation.cross_covariances(alone, OWN, MEASURED_STEPS))
+    told = np.stack([record.errors(name, OWN)[:, -1] for name in alone.names], axis=1)
+    for level, size in zip(levels, (3, 2, 2), strict=True):
+        groups = [slice(i, i + size) for i in range(0, len(level.nodes), size)]
+        weights = [hg.fusion.matrix_weights(level.joint[g][:, :, g]) for g in groups]
+        pairs = zip(groups, weights, strict=True)
+        told = np.stack([np.einsum("aib,kib->ka", w, told[:, g]) for g, w in pairs], axis=1)
+    square = np.sum(told[:, 0] ** 2, axis=-1)
+    claimed = float(np.trace(levels[-1].matrix_weights()[1]))
+    error = float(square.std(ddof=1) / np.sqrt(RUNS))
+    return {"claimed": claimed, "measured": float(square.mean()), "standard_error": error}
 
 
 def scale(seed: int) -> dict[str, float]:
-    """All cross-covariances and matrix weights of many nodes: seconds with compilation, peak memory of the process."""
-    plant, parts = moving_point(), drawn_parts(MANY, seed)
-    begin = time.perf_counter()
-    found = hg.simulation.cross_covariances(network(plant, parts), OWN, MANY_STEPS)
+    """All cross-covariances and matrix weights of many nodes, and a tree of many more, with compilation."""
+    plant, parts = moving_point(), drawn_parts(TREE_NODES, seed)
+    numbers = {"output": np.array([part[0] for part in parts]), "noise": np.array([part[4] for part in parts])}
+
+    def leaf(one: dict[str, Any]) -> hg.Node:
+        sensor, gain = hg.LinearSensor(one["output"], 0.3 * np.eye(2)), hg.Discrete([0.5, 1.0], [0.5, 0.5])
+        channel = hg.hop(gain, one["noise"] * np.eye(2))
+        return hg.Node(sensor, channel, {OWN: hg.linear_filter(plant, sensor, channel)})
+
+    begin = time.perf_counter(), time.process_time()
+    grown = hg.simulation.relay_tree(plant, leaf, numbers, DEGREE, MANY_STEPS)
+    tree_took, tree_peak = _since(begin), peak_gb()
+    begin = time.perf_counter(), time.process_time()
+    found = hg.simulation.cross_covariances(network(plant, parts[:MANY]), OWN, MANY_STEPS)
     pairs, (_, covariance) = found.joint, found.matrix_weights()
-    seconds = time.perf_counter() - begin
-    unit = 1e9 if sys.platform == "darwin" else 1e6
+    took = _since(begin)
     return {
         "nodes": MANY,
         "steps": MANY_STEPS,
-        "seconds": seconds,
-        "peak_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit,
+        "seconds": took[0],
+        "processor_seconds": took[1],
+        "peak_gb": peak_gb(),
         "local": float(np.einsum("iaia->", pairs) / MANY),
         "matrix": float(np.trace(covariance)),
+        "tree_nodes": TREE_NODES,
+        "tree_degree": DEGREE,
+        "tree_seconds": tree_took[0],
+        "tree_processor_seconds": tree_took[1],
+        "tree_peak_gb": tree_peak,
+        "tree_root": float(np.trace(grown.root)),
     }
+
+
+def _since(begin: tuple[float, float]) -> tuple[float, float]:
+    """Seconds of the clock, and of the processor."""
+    return time.perf_counter() - begin[0], time.process_time() - begin[1]
+
+
+def strong(seed: int) -> tuple[dict[str, float], dict[str, float]]:
+    """An induction machine behind strong relays: root mean squared error of each rule, and what it claims."""
+    rules = {"ci_equal": hg.EqualIntersection(), "matrix": RULES["matrix"], "all_reports": RULES["all_reports"]}
+    net = machine.network(OWN, {name: hg.Fusion(OWN, rule) for name, rule in rules.items()})
+    found = hg.monte_carlo(net, machine.HORIZON, STRONG_RUNS, seed, hg.Statistics())["fused"]
+    claimed = {name: np.trace(item.claimed(), axis1=1, axis2=2).mean() for name, item in found.items()}
+    return (
+        {name: float(item.rmse()[0]) for name, item in found.items()},
+        {name: float(np.sqrt(value)) for name, value in claimed.items()},
+    )
+
+
+def traffic(seed: int) -> dict[str, list[dict[str, float]]]:
+    """Three rooms whose nodes report every d-th step, or on event: reports per step and node, error, and claim."""
+    plant, parts = described("three_rooms")
+    every = {f"every {d}": hg.fusion.ReportLink(every=d) for d in INTERVALS}
+    fused: dict[str, hg.Fusion | hg.AbstractFilter] = {
+        name: hg.Fusion(OWN, hg.fusion.AllReports(), uplink=link) for name, link in every.items()
+    }
+    for told in (True, False):
+        for level in THRESHOLDS:
+            sends = hg.fusion.EventSending(level, told)
+            name = f"{'told' if told else 'untold'} {level}"
+            fused[name] = hg.Fusion(OWN, hg.fusion.AllReports(), quantizer=sends)
+    net = hg.Network(plant, network(plant, parts).nodes, fused)
+    found = hg.monte_carlo(net, TRAFFIC_STEPS, RUNS // 4, seed, hg.Statistics())["fused"]
+    result: dict[str, list[dict[str, float]]] = {"every": [], "told": [], "untold": []}
+    late = slice(TRAFFIC_STEPS // 2, None)
+    for name, item in found.items():
+        kind, number = name.split()
+        sent = 1 / int(number) if item.uplink is None else float(item.uplink.symbols[late].mean())
+        claimed = float(np.trace(item.claimed(), axis1=1, axis2=2)[late].mean())
+        square = float(np.mean(item.rmse_over_time()[late] ** 2))
+        result[kind].append({"level": float(number), "reports": sent, "error": square, "claimed": claimed})
+    return result
 
 
 def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
     """Everything; `advance` is told what begins."""
+    advance(f"{TREE_NODES} nodes in a tree, {MANY} nodes")
+    of_many = scale(seed)  # first: what memory the process has had at most is of all that came before
     traces, numbers = {}, {}
     for name, what in CASES.items():
         advance(what)
@@ -168,6 +265,9 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
     advance("simulating three rooms")
     simulated = measured(seed)
     advance("a tree of relays")
-    of_tree = tree(seed)
-    advance(f"{MANY} nodes")
-    return Outcome(traces, numbers, simulated, of_tree, scale(seed))
+    of_tree, levels, simulated["root"] = tree(seed)
+    advance("choosing what is sent")
+    sent = traffic(seed)
+    advance("an induction machine")
+    errors, claims = strong(seed)
+    return Outcome(traces, numbers, simulated, of_tree, levels, of_many, errors, claims, sent)

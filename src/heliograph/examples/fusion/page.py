@@ -2,37 +2,10 @@
 
 from collections.abc import Mapping
 
-import numpy as np
-from matplotlib.figure import Figure
-
-from heliograph.examples.fusion.compute import CASES, MANY, MEASURED_STEPS, RUNS, STEPS, Outcome
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, PURPLE, VERMILION, Curve
+from heliograph.examples.fusion.compute import CASES, MANY, MEASURED_STEPS, RUNS, STEPS, STRONG_RUNS, Outcome
+from heliograph.examples.fusion.pictures import KINDS, LABELS
+from heliograph.report.figures import BLUE, PURPLE, VERMILION
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
-
-DRAWN = {"matrix": BLUE, "matrix_with_mean": AMBER, "all_reports": PURPLE, "central": GREEN}
-LABELS = {
-    "equal_intersection_claimed": "equal intersection, claimed",
-    "equal_intersection_true": "equal intersection, its error",
-    "scalar": "scalar weights",
-    "matrix": "matrix weights",
-    "matrix_with_mean": "matrix weights and the plant's mean",
-    "all_reports": "all reports ever heard",
-    "central": "central filter",
-}
-SHOWN_STEPS = 60
-
-
-def fusion_figures(outcome: Outcome) -> dict[str, Figure]:
-    """Traces over time, a panel for each case."""
-    clock = np.arange(1, SHOWN_STEPS + 1)
-    panels = [
-        Panel(name.replace("_", " "), [
-            Curve(LABELS[rule], colour, outcome.traces[name][rule][:SHOWN_STEPS]) for rule, colour in DRAWN.items()
-        ])
-        for name in CASES
-    ]  # fmt: skip
-    return {"traces": curves_over_time(clock, panels, "step")}
 
 
 def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
@@ -40,10 +13,23 @@ def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
     rooms, equal, tree = outcome.cases["three_rooms"], outcome.cases["four_equal"], outcome.tree
     rows = [[label, *(_number(outcome.cases[case][rule]) for case in CASES)] for rule, label in LABELS.items()]
     judged = [
-        [LABELS[rule], f"{m['claimed']:.4f}", f"{m['measured']:.4f} ± {m['standard_error']:.4f}"]
+        [
+            LABELS.get(rule, "root of the tree"),
+            f"{m['claimed']:.4f}",
+            f"{m['measured']:.4f} ± {m['standard_error']:.4f}",
+        ]
         for rule, m in outcome.measured.items()
     ]
     scale = outcome.scale
+    machine = [
+        [LABELS.get(rule, "equal intersection"), f"{error:.4f}", f"{outcome.strong_claimed[rule]:.4f}"]
+        for rule, error in outcome.strong.items()
+    ]
+    sent = [
+        [KINDS[kind][0], f"{p['level']:g}", f"{p['reports']:.3f}", f"{p['error']:.4f}", f"{p['claimed']:.4f}"]
+        for kind, points in outcome.traffic.items()
+        for p in points
+    ]
     sections = [
         Section("What each rule reaches", [
             KeyFigures([
@@ -59,15 +45,32 @@ def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
         ]),
         Section("Is it so?", [
             Table(["rule", "claimed", "measured"], judged,
-                  f"Three rooms, mean square error at step {MEASURED_STEPS} of {RUNS} simulated runs."),
+                  f"Three rooms, and the root of a tree of twelve nodes: mean square error at step {MEASURED_STEPS} "
+                  f"of {RUNS} simulated runs."),
+        ]),
+        Section("Filters that are not linear", [
+            Table(["rule", "root mean squared error", "claimed"], machine,
+                  f"An induction machine behind strong relays, cubature filters, {STRONG_RUNS} runs: all claims are "
+                  "nominal."),
+        ]),
+        Section("What is sent", [
+            Picture(pictures["traffic"], "Reports per step and node against the error, and what is claimed of it",
+                    "Three rooms: the least traffic for a wanted error."),
+            Table(["sent", "level", "reports", "error", "claimed"], sent,
+                  "Silence that is understood bounds the change; taken for a loss, the claim is nominal."),
         ]),
         Section("Trees and many nodes", [
+            Picture(pictures["tree"], "A tree of relays with the covariance of each place's error as an ellipse",
+                    "Who knows what: the error of the point's place, and the trace of its covariance."),
             Text([
                 "Twelve nodes heard by four relays, these by two, these by a root, each forwarding its matrix-"
                 f"weighted estimate: {tree['root']:.4f} at the root, {tree['flat']:.4f} where one centre hears all "
                 f"nodes, {tree['central']:.4f} for the central filter.",
                 f"All cross-covariances and weights of {MANY} nodes took {scale['seconds']:.1f} s and "
                 f"{scale['peak_gb']:.2f} GB: {scale['matrix']:.4f} instead of {scale['local']:.2f} at a node.",
+                f"A tree of {scale['tree_nodes']} nodes in which each relay hears {scale['tree_degree']} took "
+                f"{scale['tree_seconds']:.1f} s and {scale['tree_peak_gb']:.2f} GB: {scale['tree_root']:.4f} at its "
+                "root.",
             ]),
         ]),
     ]  # fmt: skip

@@ -1,5 +1,6 @@
 """The example as a folder of results."""
 
+import math
 from functools import partial
 from pathlib import Path
 
@@ -24,13 +25,23 @@ def example(out: Path, seed: int = 0) -> None:
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
-    from heliograph.examples.fusion.page import fusion_figures, fusion_page
+    from heliograph.examples.fusion.page import fusion_page
+    from heliograph.examples.fusion.pictures import fusion_figures
 
     return Results(fusion_figures(outcome), partial(fusion_page, outcome), summary(outcome), lambda folder: None)
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:
-    """Traces by case and rule, the tree, the scale, and what was measured."""
+    """Traces by case and rule, the tree, the scale, the strong scenario, traffic, and what was measured."""
     cases: dict[str, Json] = {name: dict(numbers) for name, numbers in outcome.cases.items()}
     measured: dict[str, Json] = {rule: dict(numbers) for rule, numbers in outcome.measured.items()}
-    return {**cases, "tree": dict(outcome.tree), "scale": dict(outcome.scale), "measured": measured}
+    traffic: dict[str, Json] = {kind: [dict(point) for point in points] for kind, points in outcome.traffic.items()}
+    strong: dict[str, Json] = {**outcome.strong, "claimed": dict(outcome.strong_claimed)}
+    return {
+        **cases,
+        "tree": dict(outcome.tree),
+        "scale": {name: None if math.isnan(value) else value for name, value in outcome.scale.items()},
+        "measured": measured,
+        "strong": strong,
+        "traffic": traffic,
+    }

@@ -1,0 +1,85 @@
+"""Intersection where part of the correlation is known: split into a part that is and one that is not."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
+from heliograph.fusion.weights import matrix_weights, weighted
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail
+from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+ROUNDS = 30  # of weights for shares and shares for weights, each of which lowers the trace
+LEAST = 1e-12  # share of an estimate that is hardly used
+
+
+class SplitIntersection(AbstractFusion):
+    """Fuse errors e_i = a_i + b_i, a and b uncorrelated, the a_i jointly known, of the b_i nothing but each covariance.
+
+    For every w on the simplex P(w) = P^a + blockdiag(P^b_i / w_i) is above the joint covariance, whatever the b_i have
+    in common: weights are the best for it, shares w_i those with the smallest trace. With nothing known it is
+    covariance intersection, with everything known matrix weights. P^b_i is what an estimate's covariance has beyond
+    P^a_ii; where that is not positive semidefinite the result is NaN.
+
+    `known`: P^a, (node, n, node, n), or (node, n, n) for parts that are independent. Claim: at most "upper".
+
+    Raises:
+        ValueError: a known part that is no joint covariance, or not of as many estimates as are fused.
+    Source: Julier and Uhlmann, General decentralized data fusion with covariance intersection (2001), split form.
+    """
+
+    known: Float[Array, "node n node n"]
+
+    def __init__(self, known: ArrayLike):
+        found = array("known part", known, (None,) * np.ndim(known))
+        if found.ndim == 3 and found.shape[1] == found.shape[2]:
+            nodes, n, _ = found.shape
+            each = np.arange(nodes)
+            joint = np.zeros((nodes, n, nodes, n))
+            joint[each, :, each, :] = found
+            found = joint
+        if found.ndim != 4 or found.shape[:2] != found.shape[2:]:
+            raise fail("known part", "shape (nodes, n, nodes, n) or (nodes, n, n)", f"shape {found.shape}")
+        flat = found.reshape(found.shape[0] * found.shape[1], -1)
+        scale = np.abs(flat).max(initial=0.0)
+        if not np.allclose(flat, flat.T, rtol=0, atol=DEFINITENESS_TOLERANCE * scale) or (
+            np.linalg.eigvalsh(flat)[0] < -DEFINITENESS_TOLERANCE * scale
+        ):
+            raise fail("known part", "a covariance of all parts together", "a matrix that is none")
+        self.known = found
+
+    def check(self, count: int) -> None:
+        """As many parts as estimates."""
+        if len(self.known) != count:
+            raise fail("known part", f"that of {count} estimates", f"that of {len(self.known)}")
+
+    def claim(self, claims: list[Claim]) -> Claim:
+        """At most "upper"."""
+        if "none" in claims:
+            raise fail("fusion by covariances", "estimates that claim one", "the claim 'none'")
+        return weakest([*claims, "upper"])
+
+    def combine(self, means: Means, covariances: Covariances) -> Fused:
+        """Weights for shares, then shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""
+        known = jnp.asarray(self.known)
+        count = len(means)
+        each = jnp.arange(count)
+        unknown = covariances - known[each, :, each, :]
+
+        def above(shares: jax.Array) -> jax.Array:
+            return known.at[each, :, each, :].add(unknown / shares[:, None, None])
+
+        def better(_: int, shares: jax.Array) -> jax.Array:
+            weights = matrix_weights(above(shares))
+            root = jnp.sqrt(jnp.maximum(jnp.einsum("aib,ibc,aic->i", weights, unknown, weights), 0.0))
+            total = root.sum()
+            return jnp.maximum(jnp.where(total > 0, root / jnp.where(total > 0, total, 1.0), shares), LEAST)
+
+        shares = jax.lax.fori_loop(0, ROUNDS, better, jnp.full(count, 1 / count))
+        joint = above(shares / shares.sum())
+        weights = matrix_weights(joint)
+        sound = jnp.all(jnp.isfinite(jax.vmap(cholesky)(unknown)))
+        mean, covariance = jnp.einsum("aib,ib->a", weights, means), weighted(weights, joint)
+        return mean, jnp.where(sound, covariance, jnp.nan)
