@@ -10,10 +10,12 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, fail, instance, probabilities
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 
 
+@readable
 class ReportLink(eqx.Module):
     """A node's report m is sent after every d-th step, arrives as G m + n, and perhaps late.
 

@@ -19,6 +19,7 @@ from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, fail, instance
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.centre import Apart, Centre, Listening, described
 from heliograph.simulation.network import FUSED, Network
@@ -28,6 +29,7 @@ from heliograph.simulation.stepping import Alike
 BLOCK = 1000  # nodes that are followed together
 
 
+@readable
 @dataclass(frozen=True)
 class RelayTree:
     """A tree whose leaves are filters, whose relays forward the matrix-weighted estimate of those below, to a root.

@@ -14,6 +14,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.over_time import OverTime, at, over_time, stack, structure
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.second_moments import SecondOrder
 from heliograph.simulation.centre import described
@@ -31,6 +32,7 @@ class Drawn(NamedTuple):
     delay: Array
 
 
+@readable
 class SentReports(NamedTuple):
     """What became of a node's reports, by the step at which they were sent, and how many steps later they arrived.
 

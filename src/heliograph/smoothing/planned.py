@@ -9,11 +9,13 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.modes import AbstractSmoothing
 from heliograph.smoothing.sweep import planned_with_past, quiet_steps, stepped
 
 
+@readable
 class PlannedSmoother(eqx.Module):
     """What a linear filter and a sweep back over it come to before any data: covariances, and a map from z to means.
 
