@@ -104,6 +104,20 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
             np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+def test_what_is_smoothed_is_turned_too(east_and_west):
+    """Sweeps never wrap, so that the cut is nowhere; what they tell is between -pi and pi. To rounding of 30 steps."""
+    found = [
+        hg.run(network(side, few=True), record.measurements, U, smooth=hg.smoothing.FixedInterval()).smoothed
+        for side, record in zip((1.0, -1.0), east_and_west, strict=True)
+    ]
+    for node, each in found[0].estimates.items():
+        for name, one in each.items():
+            other = np.asarray(found[1].estimates[node][name].mean)
+            turned = wrapped(other - np.asarray(one.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
+            np.testing.assert_allclose(turned, 0.0, atol=1e-7, err_msg=f"{node}/{name}")
+            assert np.all(np.abs(other[:, 2]) <= np.pi)
+
+
 def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_where_something_does(east_and_west):
     east, west = east_and_west
     worst = []

@@ -1,5 +1,6 @@
 """The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
 
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import equinox as eqx
@@ -93,13 +94,14 @@ class GaussianFilter(AbstractFilter):
         plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
-            return moments_retained(after, prior, cross, "nominal")
+            return moments_retained(after, prior, cross, "nominal", plant.angles)
         y = signal_of(plant, sensor, self.transform, prior)
         expected = channel.mean_gain @ y.mean + channel.offset
         z = nearest(jnp.asarray(z), expected, self.heard_angles)
         output, innovation = heard_through(channel.mean_gain, channel.offset, sensor.matrix, y.mean, z)
         total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        return linear_retained(after, prior, plant.matrix, output, innovation, total, self.claim)
+        found = linear_retained(after, prior, plant.matrix, output, innovation, total, self.claim)
+        return replace(found, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""

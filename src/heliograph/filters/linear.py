@@ -278,7 +278,7 @@ class OpenLoop(AbstractFilter):
     ) -> AbstractRetained:
         """The prediction, of which nothing more is ever heard."""
         cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
-        return moments_retained(after, prior, cross, self.claim)
+        return moments_retained(after, prior, cross, self.claim, first(self.plant).angles)
 
 
 def open_loop_filter(

@@ -139,7 +139,7 @@ class MixtureFilter(AbstractFilter):
     ) -> AbstractRetained:
         """The moments around the update."""
         cross = before.covariance @ at(self.plant, k).matrix.T
-        return moments_retained(after, prior, cross, "nominal")
+        return moments_retained(after, prior, cross, "nominal", first(self.plant).angles)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:

@@ -166,7 +166,7 @@ class MultipleModelFilter(AbstractFilter):
         """Moments of the whole mixture around the update; nothing later is said of the modes."""
         own = _whole(before)
         cross = predicted(at(self.plant, k), self.transform, own, jnp.asarray(u)).cross
-        return moments_retained(_whole(after), _whole(prior), cross, "nominal")
+        return moments_retained(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
 
 
 def _whole(state: ModalBeliefs) -> Belief:

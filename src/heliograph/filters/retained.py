@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.small_matrix import (
     congruence,
     diagonal,
@@ -54,7 +55,8 @@ class AbstractRetained(eqx.Module):
     """A step as a sweep back needs it: the estimate after it, of the filter's own state of N numbers.
 
     The plant's state is want y + shift of the filter's state y, y itself without them. claim: of estimates given later
-    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run. surprise: e' S^-1 e of the
+    data too. Stacked along time, and over runs, it is what a filter leaves of a whole run. angles: which of the plant's
+    states are told between -pi and pi; a sweep never wraps them. surprise: e' S^-1 e of the
     step's innovation, expected to be `heard`, the number of components that arrived.
 
     Shapes: mean (N,), covariance (N, N), want (n, N), shift (n,).
@@ -67,6 +69,7 @@ class AbstractRetained(eqx.Module):
     surprise: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
     heard: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
     claim: eqx.AbstractVar[Claim]
+    angles: eqx.AbstractVar[Angles]
 
     def end(self) -> PyTree:
         """At this step, if it is the last."""
@@ -105,7 +108,8 @@ class AbstractRetained(eqx.Module):
         mean, covariance = found.mean, found.covariance
         if self.want is not None:
             mean, covariance = _product(self.want, mean), _congruence(self.want, covariance)
-        return Estimate(mean if self.shift is None else mean + self.shift, covariance, self.claim)
+        mean = mean if self.shift is None else mean + self.shift
+        return Estimate(wrapped(mean, self.angles), covariance, self.claim)
 
 
 class RetainedLinear(AbstractRetained):
@@ -129,6 +133,7 @@ class RetainedLinear(AbstractRetained):
     shift: Float[jax.Array, "*time n"] | None
     surprise: Float[jax.Array, "*time"] | None
     heard: Float[jax.Array, "*time"] | None
+    angles: Angles = eqx.field(static=True)
 
     def end(self) -> Adjoint:
         """Nothing is later."""
@@ -180,6 +185,7 @@ class RetainedMoments(AbstractRetained):
     shift: Float[jax.Array, "*time n"] | None
     surprise: Float[jax.Array, "*time"] | None
     heard: Float[jax.Array, "*time"] | None
+    angles: Angles = eqx.field(static=True)
 
     def end(self) -> Moments:
         """The filter's own."""
@@ -311,7 +317,9 @@ class HasMoments(Protocol):
         """Covariance."""
 
 
-def moments_retained(after: HasMoments, prior: HasMoments, cross: Array, claim: Claim) -> RetainedMoments:
+def moments_retained(
+    after: HasMoments, prior: HasMoments, cross: Array, claim: Claim, angles: Angles = ()
+) -> RetainedMoments:
     """From the states after and before a correction, and Cov(x before the step, x after its prediction)."""
     return RetainedMoments(
         mean=jnp.asarray(after.mean),
@@ -324,6 +332,7 @@ def moments_retained(after: HasMoments, prior: HasMoments, cross: Array, claim: 
         shift=None,
         surprise=None,
         heard=None,
+        angles=angles,
     )
 
 
@@ -363,6 +372,7 @@ def linear_retained(
         shift=None,
         surprise=None,
         heard=None,
+        angles=(),
     )
 
 

@@ -11,7 +11,7 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, GaussianFilter, predicted
 from heliograph.filters.retained import AbstractRetained, moments_retained
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
-from heliograph.model.over_time import alike, at, stack
+from heliograph.model.over_time import alike, at, first, stack
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -73,7 +73,7 @@ class SequentialFilter(AbstractFilter):
         """The moments around all nodes' updates."""
         item = self.filters[0]
         cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
-        return moments_retained(after, prior, cross, self.claim)
+        return moments_retained(after, prior, cross, self.claim, first(item.plant).angles)
 
 
 def _joined(each: Sequence[Innovation]) -> Innovation:

@@ -1,6 +1,6 @@
 """A network's estimates given later data too, from what its filters retained of each step."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.relays import RECEIVER
+from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_run import each_run
@@ -54,10 +55,23 @@ class Smoother(eqx.Module):
             "reports": {},
         }
         if "truth" in found:
-            smoothed["truth"] = self.smoothing.about(found["truth"])
+            truth = self.smoothing.about(found["truth"])
+            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in retained])}
         surprise = tuple(each_run(surprised, steps) for steps in retained)
         centrally = {name: each_run(surprise_sums, steps) for name, steps in found["retained_centrally"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": surprise, "fused": centrally}}
+
+    def _near(self, truth: jax.Array, told: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
+        """Estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
+
+        def near(one: Estimate, which: Angles) -> Estimate:
+            mean = jnp.asarray(one.mean)
+            beside = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), truth.shape[-1])
+            return Estimate(nearest(mean, beside, which), one.covariance, one.claim)
+
+        every = next((which for which in angles if which), ())
+        estimates = tuple(near(one, which) for one, which in zip(told["estimates"], angles, strict=True))
+        return {"estimates": estimates, "fused": {name: near(one, every) for name, one in told["fused"].items()}}
 
     def _estimates(self, steps: AbstractRetained, axes: int) -> Estimate:
         """Of runs (run, time, ...), with so many axes after time; where runs share all matrices, covariances once."""
