@@ -24,6 +24,7 @@ MODES = hg.random_affine.Modes
         (MODES(CHAIN, [CLEAN, hg.erasure(NOISY, 0.2)]), (0,), (0,)),
         (hg.random_affine.known([[0.0, 1.0], [2.0, 0.0]]), (1,), (0,)),
         (hg.model.silent(1), (0,), ()),
+        (hg.model.delayed(CLEAN, 2, told=True), (0,), (0,)),
     ],
 )
 def test_gain_one_noise_and_losses_that_are_told(channel, sent, found):

@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library
 from heliograph.random_affine.delay import of_line
@@ -22,11 +22,10 @@ def with_past(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> tuple[Any
     The channel, a map of all that is sent, draws as the late one does; any filter of linear plants takes the three.
 
     Raises:
-        ValueError: a plant or sensor that is not linear, parts that do not fit, process noise that depends on inputs.
+        ValueError: a plant or sensor that is not linear or has angles, parts that do not fit, process noise that
+            depends on inputs.
     """
-    if not is_linear(plant, sensor):
-        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
-        raise fail("plant and sensor behind a random delay", "a LinearPlant and a LinearSensor", got)
+    check_linear("plant and sensor behind a random delay", plant, sensor)
     check_link(first(sensor), first(channel), len(first(plant).states), late=True)
     past, steps = first(channel).past, steps_covered((plant, sensor))
     if not isinstance(plant, OverTime) and not isinstance(sensor, OverTime):

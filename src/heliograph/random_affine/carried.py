@@ -8,6 +8,7 @@ from heliograph.numerics.traced import is_traced
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.random_affine.delay import Delayed
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Modes, OneStepLate
@@ -36,6 +37,8 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             return tuple(int(start) + i for start, part in each for i in carried(part, sent))
         case Erasure() | OneStepLate():
             return carried(channel.base, sent)
+        case Delayed():  # what arrives is one angle that was sent; the delay itself, where it is told, comes after it
+            return carried(channel.link, sent)
         case Mixture() | Modes():
             found = {carried(part, sent) for part in channel.maps}
             if len(found) == 1:
