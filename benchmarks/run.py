@@ -22,6 +22,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -69,6 +70,23 @@ COMPARISONS = {
             Program("kalman_cuthbert", "cuthbert, vectorised", "cuthbert", target=25),
             Program("kalman_numpy", "NumPy, stacked matrices", target=8),
             Program("kalman_filterpy", "FilterPy, a loop", "filterpy", target=250),
+        ),
+    ),
+    "smoothing": Comparison(
+        problems.smoothing,
+        Program("smoothing_heliograph", "heliograph"),
+        (
+            Program("smoothing_cuthbert", "cuthbert, vectorised", "cuthbert", target=15),
+            Program("smoothing_cuthbert_parallel", "cuthbert, parallel in time", "cuthbert", target=15),
+            Program("smoothing_pykalman", "pykalman, a loop", "pykalman", target=250),
+        ),
+    ),
+    "smoothing_planned": Comparison(
+        partial(problems.smoothing, gains_differ=False),
+        Program("smoothing_planned_heliograph", "heliograph"),
+        (
+            Program("smoothing_cuthbert", "cuthbert, vectorised", "cuthbert", target=15),
+            Program("smoothing_cuthbert_parallel", "cuthbert, parallel in time", "cuthbert", target=15),
         ),
     ),
     "modes": Comparison(

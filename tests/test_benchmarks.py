@@ -81,6 +81,12 @@ def test_a_step_s_least_work_is_that_of_a_scalar_by_hand(bench: ModuleType) -> N
     assert bench.problems.kalman_flops(1, 1) == 21
 
 
+def test_a_sweep_back_s_least_work_is_that_of_a_scalar_by_hand(bench: ModuleType) -> None:
+    # B l - w e: 2 + 2, B L B + w h: 2 + 2 + 2 + 1 | A l, A L A: 2 + 2 + 2 | x - P l: 2 + 1, P - P L P: 2 + 2 + 1.
+    assert bench.problems.smoothing_flops(1, 1) == 11 + 6 + 8
+    assert bench.problems.smoothed_mean_flops(1, 1) == 2 + 4 + 2 + 2 + 2 + 1
+
+
 def test_several_modes_cost_as_many_steps_and_their_mixtures(bench: ModuleType) -> None:
     # One mode: its step, the likelihood (2 + 1 + 2) and three more of the weights, one product, two mixtures of one
     # Gaussian with one state (2 + 1 + 2 each).

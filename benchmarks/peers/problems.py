@@ -42,6 +42,30 @@ def kalman_flops(n: int, m: int) -> int:
     return prediction + innovation + gain + 4 * m * n + half * m  # z - H m, m + K (...), P - K (H P)
 
 
+def smoothing(runs: int = 10_000, steps: int = 100, gains_differ: bool = True) -> Problem:
+    """The Kalman problem's states given all data of their run; with `gains_differ` False all gains are 1."""
+    title, arrays, flops, bytes_ = kalman(runs, steps)
+    if gains_differ:
+        title = title.replace("Kalman step", "Kalman smoothing")
+        return Problem(title, arrays, flops + smoothing_flops(4, 2), bytes_)
+    arrays["gains"] = np.ones_like(arrays["gains"])
+    title = "Kalman smoothing, 4 states, 2 measurements, gains that are the same in every run"
+    return Problem(title, arrays, smoothed_mean_flops(4, 2), 8 * (2 + 4))
+
+
+def smoothing_flops(n: int, m: int) -> int:
+    """A sweep back in the form of Bryson and Frazier after a filter: adjoint vector and matrix, and their use."""
+    half = n * (n + 1)
+    update = 2 * n * n + 2 * n * m + 2 * n**3 + half * n + m * half + half // 2  # B' l - W e, B' L B + W H
+    transition, use = 2 * n * n + 2 * n**3 + half * n, 2 * n * n + n + 2 * n**3 + half * n + half // 2
+    return update + transition + use
+
+
+def smoothed_mean_flops(n: int, m: int) -> int:
+    """Means alone, forward and back: A m, z - C m, m + K e; (B A)' l - (W A)' e, m - P l."""
+    return 2 * n * n + 4 * n * m + 2 * n * n + 2 * n * m + 2 * n * n + n
+
+
 def modes(runs: int = 10_000, steps: int = 100) -> Problem:
     """The Kalman problem's plant behind a link that is good or bad for a while, two gains of one Markov chain."""
     draw = np.random.default_rng(22)
