@@ -12,9 +12,9 @@ from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.system import GrowthSystem
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor, check_sensor, refuse_angles
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -87,9 +87,12 @@ def h_infinity_filter(
         ValueError: a design that is not feasible, or a plant, sensor and system that do not fit.
     Source: H-infinity fusion over amplify-and-forward relays, equation (6).
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
+    instance("design", design, HInfinityDesign, "a design, as recursive_design makes it")
     if not design.feasible:
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
+    instance("plant", first(plant), AbstractPlant, "a plant")
     start, inputs = first(plant), system.output.shape[1]
     n = len(start.states)
     if n != system.states or design.gains.shape != (system.steps, n, system.received):

@@ -26,7 +26,7 @@ from heliograph.model.over_time import OverTime, at, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, nearest, wrapped
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -248,7 +248,7 @@ def _build(
     transform: AbstractTransform | None,
     nodes: int,
 ) -> MultipleModelFilter:
-    start = first(plant)
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)

@@ -15,10 +15,10 @@ from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant
+from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import Angles, wrapped
-from heliograph.numerics.check import check_count
+from heliograph.numerics.check import check_count, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
@@ -143,7 +143,7 @@ def particle_filter(
     Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
         2001.
     """
-    start = first(plant)
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
     check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
     initial, described = describe_modes(channel, nodes)

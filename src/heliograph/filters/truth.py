@@ -13,7 +13,7 @@ from heliograph.model.over_time import at, first
 from heliograph.model.past import with_past
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
-from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -56,6 +56,7 @@ def true_error(
     Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
     """
     check_linear("true error", plant, sensor)
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     start, n = first(plant), len(first(plant).states)
     check_link(first(sensor), first(channel), n, late=True)
     if filter.received != first(channel).outputs or len(filter.states) != n:

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.h_infinity.growth_check import TOLERANCE, GrowthFinding
 from heliograph.h_infinity.system import GrowthSystem, smallest_eigenvalue, symmetric_weight
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance, items, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -63,6 +63,11 @@ def certify_level(
         ValueError: arrays of the wrong shape, weights that are not symmetric, or a level that is not positive.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 (inequalities (18) and (19)).
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
+    level = float(scalar("level", level))
+    growth = items("growth", growth, "findings of check_growth or check_size")
+    for one in growth:
+        instance("growth", one, GrowthFinding, "findings of check_growth or check_size")
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)

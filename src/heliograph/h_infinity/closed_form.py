@@ -5,7 +5,7 @@ from scipy.linalg import block_diag
 
 from heliograph.h_infinity.design import HInfinityDesign
 from heliograph.h_infinity.system import GrowthSystem
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 
 ACCURACY = 1e-10  # relative, of a level found by bisection
@@ -24,6 +24,7 @@ def level_without_measurements(system: GrowthSystem) -> float:
         ValueError: a system with a linear part A, or with a growth constant of zero.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with K = 0 (closed form not in the paper).
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     if np.any(system.transition):
         raise fail("level without measurements", "a system whose dynamics are all in f", "one with a linear part A")
     growth = np.stack([system.growth.state, system.growth.error], axis=1)
@@ -65,6 +66,8 @@ def known_channel_design(system: GrowthSystem, level: float, multipliers: ArrayL
         ValueError: a channel with random gains, multipliers of the wrong shape, a level that is not positive.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 1 with all arrival probabilities 1.
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
+    level = float(scalar("level", level))
     if any(len(link.spreads()) for link in system.channel):
         raise fail("channel of a closed-form design", "gains that are certain", "random gains; use recursive_design")
     if not level > 0:

@@ -29,7 +29,7 @@ from heliograph.h_infinity.step import (
     step_matrices,
 )
 from heliograph.h_infinity.system import GrowthSystem, symmetric_weight
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -80,6 +80,7 @@ def recursive_design(
         ModuleNotFoundError: cvxpy or the solver is not installed.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2 (inequality (32), after a congruence).
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     _check_level(level)
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
@@ -267,5 +268,5 @@ def _smallest(works: Callable[[float], bool], guess: float) -> float | None:
 
 
 def _check_level(level: float) -> None:
-    if not np.isfinite(level) or level <= 0:
+    if float(scalar("level", level)) <= 0:
         raise fail("level", "a positive number", level)

@@ -9,7 +9,8 @@ import numpy as np
 from scipy.stats import qmc
 
 from heliograph.h_infinity.slope_bound import slope_bound
-from heliograph.numerics.check import array, fail, scalar
+from heliograph.numerics.check import array, check_seed, fail, scalar
+from heliograph.numerics.check import function as check_callable
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -107,6 +108,8 @@ def check_growth(
     Source: H-infinity fusion over amplify-and-forward relays, condition (2).
     """
     bottom, top = _check_box(constant, low, high)
+    seed = check_seed("seed", seed)
+    check_callable("function", function, "the state")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)
     starts = bottom + (top - bottom) * qmc.Sobol(len(bottom), seed=seed).random(POINTS)
     points = _climb(tools.slope, starts, bottom, top, random)
@@ -128,6 +131,8 @@ def check_size(
     Source: H-infinity fusion over amplify-and-forward relays, condition (2) with f(0) = 0.
     """
     bottom, top = _check_box(constant, low, high)
+    seed = check_seed("seed", seed)
+    check_callable("function", function, "the state")
     if np.any(bottom > 0) or np.any(top < 0):
         raise fail("region", "a box around 0", f"{bottom.tolist()} and {top.tolist()}")
     tools, random = _Tools(function, float(np.linalg.norm(top - bottom))), np.random.default_rng(seed)

@@ -9,6 +9,7 @@ from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fail, own_units
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
 
 Varying = ArrayLike | OverTime  # the same at all steps, or one for each
@@ -117,6 +118,7 @@ def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) 
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:
+    as_maps("channel", [first(channel)])
     if first(channel).remembers:
         expected = (
             "links that forget: its level is proved step by step, with gains that are independent of the steps before"

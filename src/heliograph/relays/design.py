@@ -63,9 +63,10 @@ def start_moments(network: RelayNetwork) -> Float[np.ndarray, "d d"]:
 
 def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray, "steps Fn R"]:
     """Gains by filter as one block matrix for each step."""
-    if set(gains) != set(network.filters):
+    if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
-    n, length = len(network.states), len(np.asarray(gains[network.filters[0]]))
+    n, first = len(network.states), network.filters[0]
+    length = len(array(f"gains of {first!r}", gains[first], (None, n, network.received[0])))
     joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
     for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
         value = array(f"gains of {name!r}", gains[name], (length, n, heard))

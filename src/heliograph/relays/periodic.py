@@ -49,6 +49,7 @@ def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
     Raises:
         ValueError: what `periodic_steps` refuses, or moments that do not settle.
     """
+    instance("network", network, RelayNetwork, "a RelayNetwork")
     result, change = _settle_own(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that settle", f"a change of {float(change):.2g} after {PERIODS} periods")
@@ -63,6 +64,7 @@ def periodic_given_design(network: RelayNetwork, gains: GainsByFilter) -> RelayD
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
     """
+    instance("network", network, RelayNetwork, "a RelayNetwork")
     joined, steps = _period(network, join_gains(network, gains)), periodic_steps(network)
     result = _steady(steps, joined)
     radius = float(_growth(steps, joined))
@@ -79,6 +81,7 @@ def periodic_behind_relays(network: RelayNetwork, gains: GainsByFilter) -> Float
     Raises:
         ValueError: gains of the wrong shape, or gains under which the second moments diverge.
     """
+    instance("network", network, RelayNetwork, "a RelayNetwork")
     joined, steps = _period(network, relay_gains(network, gains)), periodic_steps(network)
     radius = float(_growth(steps, joined))
     if not radius < 1:

@@ -11,7 +11,7 @@ from heliograph.linear.schedule import Schedule
 from heliograph.linear.system import LinearSystem
 from heliograph.linear.system import Steps as SystemSteps
 from heliograph.model.relays import RECEIVER, RelayNetwork, Steps
-from heliograph.numerics.check import fail, instance, table
+from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Float
 from heliograph.relays.design import GainsByFilter, expected_maps, join_gains, start_moments
@@ -69,11 +69,13 @@ def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray
     Raises:
         ValueError: a relay without gains, gains of the wrong shape, no relays.
     """
+    gains = table("relay gains", gains, "arrays")
     missing = [name for name in network.relays if name not in gains]
     if missing or not network.relays:
         raise fail("relay gains", f"those of {list(network.relays)}", f"none for {missing}" if missing else "no relays")
     relays = {name: gains[name] for name in network.relays}
-    n, length = len(network.states), len(np.asarray(relays[network.relays[0]]))
+    n, first = len(network.states), network.relays[0]
+    length = len(array(f"gains of {first!r}", relays[first], (None, n, network.received[0])))
     return join_gains(network, relays | {RECEIVER: np.zeros((length, n, network.received[-1]))})
 
 

@@ -23,6 +23,9 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
         ValueError: a node whose delays are random and not told, so that nobody knows of which step a value is.
     """
     instance("record", record, Record, "a Record")
+    instance("network", network, Network, "a Network")
+    if set(record.measurements) - set(network.nodes):
+        raise fail("network", f"one with the record's nodes {list(record.measurements)}", list(network.nodes))
     found: list[Arrival] = []
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, 0)]

@@ -11,7 +11,7 @@ from heliograph.fusion.cross_covariance import Factors, advance_factors, initial
 from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import factored_weights, matrix_weights
-from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
@@ -124,6 +124,7 @@ def cross_covariances(network: Network, filter: str, horizon: int, inputs: Array
         ValueError: a network that is not linear, filters whose gains depend on data, channels that remember.
     Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
     """
+    instance("network", network, Network, "a Network")
     fusion = Fusion(filter, MatrixWeights())
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _prepared(alone, horizon, inputs)
@@ -143,6 +144,7 @@ def fused_covariances(
     Raises:
         ValueError: a network without an informed fusion.
     """
+    instance("network", network, Network, "a Network")
     filters, u = _prepared(network, horizon, inputs)
     with jax.enable_x64(True):
         found: dict[str, np.ndarray] = to_numpy(_fused(filters, u))

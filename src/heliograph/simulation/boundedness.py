@@ -20,7 +20,7 @@ from heliograph.linear.told_losses import (
 from heliograph.linear.unseen import Unseen, fastest_unseen, reached
 from heliograph.model.channel import Channel, parallel
 from heliograph.model.over_time import OverTime, first
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
@@ -82,6 +82,7 @@ def certify_boundedness(network: Network) -> Boundedness:
     Source: Sinopoli et al. (2004), Theorems 2 to 5; Xie and Xie, Stability of a random Riccati equation with Markovian
         binary switching (2008); Liu and Goldsmith, Kalman filtering with partial observation losses (2004).
     """
+    instance("network", network, Network, "a Network")
     a, q = plant_matrices(network.plant)
     links = _links(network, len(a))
     growing = _unstable(a)

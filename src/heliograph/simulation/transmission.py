@@ -28,8 +28,8 @@ def transmit(signal: ArrayLike, channel: Channel, seed: int = 0) -> Float[np.nda
     """
     instance("channel", first(channel), AbstractRandomAffine, "a channel, such as hop(...)")
     inputs = first(channel).inputs
-    values = np.asarray(signal)
-    y = array("signal", values[:, None] if values.ndim == 1 and inputs == 1 else values, (None, inputs), missing=True)
+    flat = inputs == 1 and np.ndim(np.asarray(signal, dtype=None if isinstance(signal, np.ndarray) else object)) == 1
+    y = array("signal", signal, (None,) if flat else (None, inputs), missing=True).reshape(-1, inputs)
     if not len(y):
         raise fail("signal", "at least one step", "none")
     check_horizon(len(y), steps_covered(channel))

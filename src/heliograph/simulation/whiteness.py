@@ -9,7 +9,7 @@ from scipy import stats
 from scipy.linalg import toeplitz
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -103,6 +103,7 @@ def whitened_innovations(
     Raises:
         ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
     """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     item = filter
     if item.claim == "none":
         raise fail("filter", "one that claims a covariance", "one that claims none")
