@@ -262,7 +262,7 @@ def kept_quiet():
 
 @pytest.mark.parametrize("interrupt", [in_a_callback, told_as_something_else, kept_quiet])
 def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
-    demo_module(monkeypatch, lambda out, seed: interrupt())
+    demo_module(monkeypatch, lambda out, seed, recording: interrupt())
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert cli.main(["demo", "--out", "results"]) == cli.INTERRUPTED
@@ -428,7 +428,10 @@ def test_a_refusal_in_a_process_of_its_own(folder):
         (["reproduce", "cubature-fusion"], ["reproduce: expected a folder for the results (--out DIR), got none"]),
         (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
         (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
-        (["example", "dmeo", "--out", "o"], ["example: expected one of demo, fusion, late-data", "-drive, got 'dmeo'"]),
+        (
+            ["example", "dmeo", "--out", "o"],
+            ["example: expected one of delays, demo, fusion, late-data", "smoothing, got 'dmeo'"],
+        ),
         (["demo", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0 to 4294967295, got 111"]),
         (["demo", "--out", "o", "--seed", "-1"], ["--seed: expected a whole number from 0 to 4294967295, got -1"]),
         (["reproduce", "all", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0"]),

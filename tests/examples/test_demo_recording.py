@@ -118,7 +118,7 @@ def test_a_beginning_keeps_the_start(recording: PlazaRecording) -> None:
 
 def test_missing_extra_is_one_line_that_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_module, "find_spec", lambda name: None)
-    with pytest.raises(ModuleNotFoundError, match=r"heliograph\[recordings\]") as caught:
+    with pytest.raises(ModuleNotFoundError, match=r"pip install .*\[recordings\]") as caught:
         find_recording()
     assert caught.value.name == "gtsam"
     assert "\n" not in str(caught.value)

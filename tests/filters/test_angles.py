@@ -201,7 +201,7 @@ REFUSED = {
     "polynomial": lambda p, s: hg.polynomial_filter(p, s, hg.perfect(), 2, 5),
     "told": lambda p, s: hg.filters.told_filter(p, s, hg.perfect()),
     "mode known": lambda p, s: hg.filters.mode_known_filter(p, s, hg.perfect()),
-    "boundedness": lambda p, s: hg.certify_boundedness(
+    "boundedness": lambda p, s: hg.simulation.certify_boundedness(
         hg.Network(p, {"a": hg.Node(s, hg.erasure(hg.perfect(), 0.5), {"f": hg.kalman_filter(p, s)})})
     ),
     "relays": lambda p, s: hg.model.RelayNetwork(p, s, ["r"], [{"receiver": {"sensor": hg.perfect()}}]),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.files.recording import recording_of
+from heliograph.files.recording import read_recording
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
 from heliograph.simulation import by_run
@@ -89,10 +89,10 @@ def test_columns_of_what_relays_heard_may_be_left_out():
     network = hg.Network.of_relays(net, schedules, receivers)
     z = np.linspace(0.1, 0.4, 4)
     columns = {"time": np.arange(4.0), "receiver.y0": z}
-    assert list(recording_of(columns, network).measurements) == ["receiver"]
-    both = recording_of(columns | {"relay_1.y0": z}, network)
+    assert list(read_recording(columns, network).measurements) == ["receiver"]
+    both = read_recording(columns | {"relay_1.y0": z}, network)
     assert sorted(both.measurements) == ["receiver", "relay_1"]
     record = hg.run(network, *both)
     assert sorted(record.estimates) == ["receiver", "relay_1"] and record.time[-1] == 3.0
     with pytest.raises(ValueError, match=r"one column 'receiver.y0'"):
-        recording_of({"time": np.arange(4.0), "relay_1.y0": z}, network)
+        read_recording({"time": np.arange(4.0), "relay_1.y0": z}, network)

@@ -37,8 +37,8 @@ class Sweep(eqx.Module):
 
     def start(self, tape: Tape, slot: jax.Array) -> PyTree:
         """The filters' states after a row of the tape."""
-        own, central, _, _ = tape.known(slot)
-        return own, {name: central[name] for name in self.ears.filters.central}, (), ()
+        own, central, *_ = tape.known(slot)
+        return own, {name: central[name] for name in self.ears.filters.central}, (), (), {}
 
     def told(self, steps: Retained, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""

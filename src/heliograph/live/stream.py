@@ -13,6 +13,7 @@ from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.live.mould import Mould, cast
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
+from heliograph.numerics.compiler import understood
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, PyTree
@@ -97,4 +98,4 @@ def _program(mould: Mould) -> Program:
         after, estimate = item.step(state, z, u, k)
         return after, jax.tree.leaves(estimate)
 
-    return jax.jit(step)
+    return jax.jit(step, compiler_options=understood())  # as `run` is compiled, which decides about the last bit

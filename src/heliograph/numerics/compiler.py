@@ -21,7 +21,7 @@ def large_program(function: Callable[P, R], donate: Literal["none", "all-except-
 
     @cache
     def jitted() -> Callable[P, R]:
-        result: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=_understood())  # type: ignore[call-overload]
+        result: Callable[P, R] = eqx.filter_jit(function, donate=donate, compiler_options=understood())  # type: ignore[call-overload]
         return result
 
     @wraps(function)
@@ -32,7 +32,7 @@ def large_program(function: Callable[P, R], donate: Literal["none", "all-except-
 
 
 @cache
-def _understood() -> dict[str, bool | int]:
+def understood() -> dict[str, bool | int]:
     """The options, if this release of the compiler has them: they are not part of its promises."""
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options=OPTIONS)()

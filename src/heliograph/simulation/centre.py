@@ -206,6 +206,7 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
         if first(channel).remembers:
             wanted = f"fusion by {rule}: node {name!r}"
             raise fail(wanted, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
+    refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
     if along_estimates(nodes):
         _check_along_estimates(rule, nodes, shared)
         return "nominal"
@@ -230,7 +231,6 @@ def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
 def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
     if not isinstance(first(plant), LinearPlant):
         raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
-    refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
     seen = set()
     for name, (sensor, _, item) in nodes.items():
         where = f"fusion by {rule}: node {name!r}"

@@ -40,8 +40,6 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
     smoothed: of estimates given later data too, where these were asked for: statistics of their own to save.
     """
 
-    smoothed: "StatisticsByName | None" = None
-
     def __init__(
         self,
         found: Mapping[str, dict[str, ErrorStatistics]],
@@ -50,6 +48,7 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
     ):
         super().__init__(found)
         self.states, self.units = states, dict(units or {})
+        self.smoothed: StatisticsByName | None = None
 
     def with_units(self, units: Mapping[str, str]) -> "StatisticsByName":
         """The same statistics with units, by the state's name, for files, tables and figures.
