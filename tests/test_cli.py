@@ -102,7 +102,10 @@ def test_run_writes_what_the_library_computes(folder, capsys):
 
 
 def test_run_writes_what_later_rows_say_too(folder, capsys):
-    assert cli.main([*run_arguments(), "--smooth", "1"]) == 0
+    assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0
+    assert (folder / "page" / "smoothed_0.png").is_file() and "given later data too" in (
+        folder / "page" / "report.html"
+    ).read_text()
     net, table = load_network("net.py"), read_table("out.csv")
     found = h.run(net, *read_recording("data.csv", net), smooth=h.smoothing.FixedLag(1)).smoothed
     for name, estimate in found.estimates["remote"].items():

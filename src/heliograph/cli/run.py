@@ -1,6 +1,7 @@
 """`heliograph run`: the filters of a network over measured data."""
 
 import sys
+import warnings
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -54,6 +55,7 @@ def run(
         raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
     _check_places(measurements, out, report)
     notes: list[str] = []
+    doubtful: list[str] = []
     with progress(3) as advance:
         advance("starting")
         from heliograph.files.events import run_events
@@ -69,14 +71,17 @@ def run(
         else:
             recording = read_recording(measurements, loaded)
             advance(f"filtering {len(recording.time)} rows")
-            record = heliograph.run(loaded, *recording, smooth=later)
+            with warnings.catch_warnings(record=True) as doubts:
+                warnings.simplefilter("always", UserWarning)
+                record = heliograph.run(loaded, *recording, smooth=later)
+            doubtful += [str(doubt.message) for doubt in doubts]
         if out is not None:
             advance(f"writing {out}")
             write_estimates(record, out)
     if report is not None:
         _write_report(network, loaded, record, recording, report)
-    for failure in record.failures():
-        print(f"heliograph: warning: {visible(failure)}", file=sys.stderr)
+    for line in (*record.failures(), *doubtful):
+        print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
     filters = [
         f"{node}/{name} ({estimate.claim})"
         for node, estimates in record.estimates.items()

@@ -14,6 +14,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
+from heliograph.simulation.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
 MOST = 8  # nodes, filters and links that are drawn; tables and summary hold all
@@ -28,7 +29,10 @@ def run_results(health: Health, network: str) -> Results:
 
 def run_figures(health: Health) -> dict[str, Figure]:
     """Estimates of each node, innovations of each filter, and when links delivered, by file name."""
-    drawn = {f"estimates_{i}": _estimates(health, node) for i, node in enumerate(_nodes(health))}
+    drawn = {f"estimates_{i}": _estimates(health, health.record, node) for i, node in enumerate(_nodes(health.record))}
+    later = health.record.smoothed
+    if later is not None:
+        drawn |= {f"smoothed_{i}": _estimates(health, later, node) for i, node in enumerate(_nodes(later))}
     tested = _tested(health)
     if tested:
         drawn["innovations"] = _innovations(health, tested)
@@ -37,8 +41,8 @@ def run_figures(health: Health) -> dict[str, Figure]:
     return drawn
 
 
-def _nodes(health: Health) -> list[str]:
-    return [node for node, filters in health.record.estimates.items() if filters][:MOST]
+def _nodes(record: Record) -> list[str]:
+    return [node for node, filters in record.estimates.items() if filters][:MOST]
 
 
 def _tested(health: Health) -> list[Listening]:
@@ -46,8 +50,7 @@ def _tested(health: Health) -> list[Listening]:
 
 
 @matplotlib.rc_context(LOOK)
-def _estimates(health: Health, node: str) -> Figure:
-    record = health.record
+def _estimates(health: Health, record: Record, node: str) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(record.states)), layout="constrained")
     grid = figure.subplots(len(record.states), 1, squeeze=False, sharex=True)[:, 0]
     record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=list(grid), sigmas=BAND)
@@ -103,9 +106,10 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     estimates = [
-        Picture(drawings[f"estimates_{i}"], f"Estimates of {visible(node)} over time with bands",
-                f"{visible(node)}: estimates with bands of {BAND:g} claimed deviations on each side.")
-        for i, node in enumerate(_nodes(health))
+        Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
+                f"{visible(node)}: estimates with bands of {BAND:g} claimed deviations on each side{added}.")
+        for kind, each, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
+        for i, node in enumerate([] if each is None else _nodes(each))
     ]  # fmt: skip
     return Page(
         kicker="Heliograph run",
