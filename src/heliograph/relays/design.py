@@ -66,7 +66,7 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
     if set(table("gains", gains, "arrays")) != set(network.filters):
         raise fail("gains", f"those of {list(network.filters)}", list(gains))
     n, first = len(network.states), network.filters[0]
-    length = len(array(f"gains of {first!r}", gains[first], (None, n, network.received[0])))
+    length = len(array(f"gains of {first!r}", gains[first], (None, None, None)))
     joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
     for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
         value = array(f"gains of {name!r}", gains[name], (length, n, heard))

@@ -75,7 +75,7 @@ def relay_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray
         raise fail("relay gains", f"those of {list(network.relays)}", f"none for {missing}" if missing else "no relays")
     relays = {name: gains[name] for name in network.relays}
     n, first = len(network.states), network.relays[0]
-    length = len(array(f"gains of {first!r}", relays[first], (None, n, network.received[0])))
+    length = len(array(f"gains of {first!r}", relays[first], (None, None, None)))
     return join_gains(network, relays | {RECEIVER: np.zeros((length, n, network.received[-1]))})
 
 
