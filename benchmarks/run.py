@@ -77,17 +77,13 @@ COMPARISONS = {
         Program("smoothing_heliograph", "heliograph"),
         (
             Program("smoothing_cuthbert", "cuthbert, vectorised", "cuthbert", target=15),
-            Program("smoothing_cuthbert_parallel", "cuthbert, parallel in time", "cuthbert", target=15),
             Program("smoothing_pykalman", "pykalman, a loop", "pykalman", target=250),
         ),
     ),
     "smoothing_planned": Comparison(
         partial(problems.smoothing, gains_differ=False),
         Program("smoothing_planned_heliograph", "heliograph"),
-        (
-            Program("smoothing_cuthbert", "cuthbert, vectorised", "cuthbert", target=15),
-            Program("smoothing_cuthbert_parallel", "cuthbert, parallel in time", "cuthbert", target=15),
-        ),
+        (Program("smoothing_cuthbert", "cuthbert, vectorised", "cuthbert", target=15),),
     ),
     "modes": Comparison(
         problems.modes,
