@@ -21,6 +21,7 @@ ORDER = [
     [
         "filters.base",
         "filters.retained",
+        "filters.retaining",
         "filters.transform",
         "filters.scalars",
         "filters.correction",

@@ -47,6 +47,13 @@ def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
     assert np.all(np.trace(fused.covariance, axis1=2, axis2=3)[:, :-1] < 0.5)  # of about 1 without measurements
 
 
+def test_saving_says_what_has_to_be_saved_apart(record, tmp_path):
+    with pytest.warns(UserWarning, match="without `smoothed`, which is saved apart"):
+        record.save(tmp_path / "all.nc")
+    record.smoothed.save(tmp_path / "smoothed.nc")  # no warning, which would be an error here
+    assert hg.Record.open(tmp_path / "smoothed.nc") == record.smoothed
+
+
 def test_statistics_of_the_record_and_its_smoothed_part(record):
     for node in GAPS.names:
         for name in FILTERS:

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.retained import AbstractRetained, with_surprise
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import with_surprise
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown

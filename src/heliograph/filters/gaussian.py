@@ -12,7 +12,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal, known_gain_covariance
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, heard_through, linear_retained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, Transformed, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.angle import received_angles

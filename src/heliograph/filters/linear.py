@@ -16,7 +16,8 @@ from heliograph.filters.gaussian import Belief, describe, predicted
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
 from heliograph.filters.modal import modal_filter
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, heard_through, linear_retained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
 from heliograph.filters.told import told_filter
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.uncertain import uncertain_modal_filter

@@ -10,7 +10,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.innovation import log_density, mixed_innovation
-from heliograph.filters.retained import AbstractRetained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import moments_retained
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation

@@ -16,7 +16,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import absent, gain_and_bound
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, linear_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import linear_retained
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack

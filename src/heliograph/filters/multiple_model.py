@@ -15,7 +15,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
 from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
 from heliograph.filters.innovation import mixed_innovation
-from heliograph.filters.retained import AbstractRetained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import moments_retained
 from heliograph.filters.told import Told, by_pattern, pattern_of
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import Polytope

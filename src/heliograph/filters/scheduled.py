@@ -12,7 +12,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, linear_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import linear_retained
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps

@@ -9,7 +9,8 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, GaussianFilter, predicted
-from heliograph.filters.retained import AbstractRetained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import moments_retained
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, at, first, stack
 from heliograph.numerics.check import fail, instance, items

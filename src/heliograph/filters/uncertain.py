@@ -24,7 +24,8 @@ from heliograph.filters.modal import (
     sum_of_modes,
 )
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained, moments_retained
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retaining import moments_retained
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first

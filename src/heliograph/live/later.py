@@ -17,8 +17,9 @@ from heliograph.live.tape import Ears, Tape, at_step, interval
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.gathering import Fused
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.stepping import AllFilters, Fused
+from heliograph.simulation.stepping import AllFilters
 
 Retained: TypeAlias = "tuple[dict[int, AbstractRetained], dict[str, AbstractRetained]]"  # by kind, and by name
 

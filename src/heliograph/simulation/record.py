@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Generic, TypeVar
 
 import equinox as eqx
@@ -20,7 +19,7 @@ from heliograph.simulation.labelled import checked_units
 from heliograph.simulation.labelled_record import record_dataset, record_from
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plots import plot_record
-from heliograph.simulation.saved import opened, save
+from heliograph.simulation.saved import Saved
 from heliograph.simulation.uplinks import SentReports
 
 if TYPE_CHECKING:  # extras
@@ -55,7 +54,7 @@ class Uplink:
 
 @readable
 @dataclass(frozen=True)
-class Record:
+class Record(Saved):
     """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
 
     truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
@@ -154,24 +153,10 @@ class Record:
         """
         return record_of_frame(frame)
 
-    def save(self, path: str | Path) -> None:
-        """Write it to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `Record.open` has it again.
-
-        Raises:
-            ValueError: another ending, or a place that cannot be written.
-            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
-        """
-        save(self.to_xarray(), path)
-
-    @classmethod
-    def open(cls, path: str | Path) -> "Record":
-        """Read what `save` wrote.
-
-        Raises:
-            ValueError: no such file, or another one.
-            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
-        """
-        return cls.from_xarray(opened(path))
+    def apart(self) -> list[str]:
+        """What is saved apart."""
+        there = {"smoothed": self.smoothed is not None, "reports": bool(self.reports)}
+        return [name for name, is_there in there.items() if is_there]
 
     def plot(
         self,

@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
@@ -19,6 +19,46 @@ if TYPE_CHECKING:  # an extra
 
 NETCDF, ZARR = ".nc", ".zarr"
 MARK = "zarr.json"  # what a Zarr folder has, and nothing else
+
+
+class Saved:
+    """What a dataset holds, and so a file: `to_xarray` and `from_xarray` are its own, `save` and `open` follow."""
+
+    def to_xarray(self) -> "xr.Dataset":
+        """It as labelled arrays."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> Self:
+        """It again."""
+        raise NotImplementedError
+
+    def apart(self) -> list[str]:
+        """What is no part of the dataset, being results of their own."""
+        return []
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` has it again.
+
+        Warns of what has to be saved apart, such as `smoothed`.
+
+        Raises:
+            ValueError: another ending, or a place that cannot be written.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        save(self.to_xarray(), path)
+        for name in self.apart():
+            warnings.warn(f"{path}: without `{name}`, which is saved apart", stacklevel=2)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: no such file, or another one.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        return cls.from_xarray(opened(path))
 
 
 def save(dataset: "xr.Dataset", path: str | Path) -> None:

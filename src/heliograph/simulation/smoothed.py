@@ -19,9 +19,10 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_run import each_run
+from heliograph.simulation.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
-from heliograph.simulation.stepping import AllFilters, Fused
+from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing
 

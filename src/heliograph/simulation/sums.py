@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -24,7 +23,7 @@ from heliograph.simulation.lanes import BLOCK
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.plots import plot_statistics
 from heliograph.simulation.record import AbstractReducer, Record, Uplink, by_name, uplinks_of
-from heliograph.simulation.saved import opened, save
+from heliograph.simulation.saved import Saved
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 
 if TYPE_CHECKING:  # extras
@@ -34,7 +33,7 @@ if TYPE_CHECKING:  # extras
 
 
 @readable
-class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
+class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
     """Statistics by node and filter; fused ones under "fused". They know the states' names, and units if given.
 
     smoothed: of estimates given later data too, where these were asked for: statistics of their own to save.
@@ -85,24 +84,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]]):
         """
         return statistics_frame(self)
 
-    def save(self, path: str | Path) -> None:
-        """Write them to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all.
-
-        Raises:
-            ValueError: another ending, or a place that cannot be written.
-            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
-        """
-        save(self.to_xarray(), path)
-
-    @classmethod
-    def open(cls, path: str | Path) -> "StatisticsByName":
-        """Read what `save` wrote.
-
-        Raises:
-            ValueError: no such file, or another one.
-            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
-        """
-        return cls.from_xarray(opened(path))
+    def apart(self) -> list[str]:
+        """What is saved apart."""
+        return [] if self.smoothed is None else ["smoothed"]
 
     def plot(
         self,

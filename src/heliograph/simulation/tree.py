@@ -24,7 +24,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.centre import Apart, Centre, Listening, described
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.stepping import Alike
+from heliograph.simulation.side_by_side import Alike
 
 BLOCK = 1000  # nodes that are followed together
 

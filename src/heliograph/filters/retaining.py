@@ -1,0 +1,133 @@
+"""How a step comes to be retained: from the states around a correction, and what it heard."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.retained import AbstractRetained, RetainedLinear, RetainedMoments
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.small_matrix import (
+    diagonal,
+    runs_last,
+    squared_distance,
+    times,
+    times_vector,
+    transpose,
+)
+from heliograph.numerics.small_matrix import solve as small_solve
+from heliograph.numerics.types import Array, Float
+
+
+def with_surprise(step: AbstractRetained, heard: Innovation) -> AbstractRetained:
+    """The step with how much its innovation surprised the filter, in units of what it believes."""
+    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
+    present = ~jnp.isnan(value)
+    both = present[:, None] & present
+    total = jnp.where(both, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
+    surprise = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
+    return replace(step, surprise=surprise, heard=jnp.sum(present).astype(surprise.dtype))
+
+
+@runs_last
+def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
+    return squared_distance(a, x)
+
+
+class HasMoments(Protocol):
+    """A state of a filter: what it says of the mean (N,) and the covariance (N, N)."""
+
+    @property
+    def mean(self) -> Float[jax.Array, " N"]:
+        """Mean."""
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """Covariance."""
+
+
+def moments_retained(
+    after: HasMoments, prior: HasMoments, cross: Array, claim: Claim, angles: Angles = ()
+) -> RetainedMoments:
+    """From the states after and before a correction, and Cov(x before the step, x after its prediction)."""
+    return RetainedMoments(
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
+        prior_mean=jnp.asarray(prior.mean),
+        prior_covariance=jnp.asarray(prior.covariance),
+        cross=jnp.asarray(cross),
+        claim=claim,
+        want=None,
+        shift=None,
+        surprise=None,
+        heard=None,
+        angles=angles,
+    )
+
+
+def linear_retained(
+    after: HasMoments,
+    prior: HasMoments,
+    transition: Array,
+    output: Array,
+    innovation: Array,
+    total: Array,
+    claim: Claim,
+    want: Array | None = None,
+    solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+) -> RetainedLinear:
+    """From the states after and before a correction, A, H, e, and the S that the gain was made for.
+
+    Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
+    component that others determine is left out.
+    """
+    given = jnp.asarray(prior.covariance), jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    if solve is None:
+        gain, weigh, heard, innovation = _parts(*given)
+    else:
+        heard, total, innovation = _of_what_arrived(*given[1:])
+        weigh = solve(total, heard).T
+        gain = given[0] @ weigh
+    return RetainedLinear(
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
+        transition=jnp.asarray(transition),
+        gain=gain,
+        output=heard,
+        weigh=weigh,
+        innovation=innovation,
+        claim=claim,
+        want=None if want is None else jnp.asarray(want),
+        shift=None,
+        surprise=None,
+        heard=None,
+        angles=(),
+    )
+
+
+@runs_last
+def _parts(prior: jax.Array, output: jax.Array, total: jax.Array, innovation: jax.Array) -> tuple[jax.Array, ...]:
+    heard, total, innovation = _of_what_arrived(output, total, innovation)
+    weigh = transpose(small_solve(total, heard))
+    return times(prior, weigh), weigh, heard, innovation
+
+
+def _of_what_arrived(
+    output: jax.Array, total: jax.Array, innovation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """H, S and e without the rows of what did not arrive, for which S has ones."""
+    present = ~jnp.isnan(innovation)
+    both = present[:, None] & present[None]
+    alone = diagonal(jnp.where(present, 0.0, 1.0))
+    return jnp.where(present[:, None], output, 0.0), jnp.where(both, total, alone), jnp.where(present, innovation, 0.0)
+
+
+@runs_last
+def heard_through(
+    gain: jax.Array, offset: jax.Array, matrix: jax.Array, expected: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """H = M C and e = z - M y - b, from what is expected of y."""
+    return times(gain, matrix), z - times_vector(gain, expected) - offset

@@ -1,0 +1,79 @@
+"""Filters of one kind run side by side: stacked along axes of filters and nodes, and vmapped."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import PyTree
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.retained import AbstractRetained
+from heliograph.model.estimate import Estimate
+
+
+class Told(NamedTuple):
+    """What a filter tells of a step: its estimate, and what it retains of the step if that is asked for."""
+
+    estimate: Estimate
+    retained: AbstractRetained | None
+
+
+def told_step(
+    item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, retains: bool
+) -> tuple[PyTree, Told]:
+    """One step of a filter, and what is told of it."""
+    if not retains:
+        after, estimate = item.step(state, z, u, k)
+        return after, Told(estimate, None)
+    after, retained = item.step_retained(state, z, u, k)
+    return after, Told(item.after_step(after, k), retained)
+
+
+class Alike(eqx.Module):
+    """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
+
+    `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `retains`: each step tells what
+    a sweep back over it needs.
+    """
+
+    filters: AbstractFilter
+    group: int = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+    nodes: int = eqx.field(static=True)
+    retains: bool = eqx.field(static=True, default=False)
+
+    def init(self) -> PyTree:
+        """States before the first step, (filter and node, ...)."""
+        return over_all(started, self.count * self.nodes)(self.filters)
+
+    def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Told]:
+        """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...)."""
+
+        def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Told]:
+            return told_step(item, state, z, u, k, self.retains)
+
+        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
+        after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)))
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
+
+    def matrices(
+        self, read: Callable[..., Any], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+    ) -> Any:
+        """What `read` gives of this step of filter f at each node, from the states before it; (node, ...)."""
+        mine = slice(f * self.nodes, (f + 1) * self.nodes)
+        filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
+        each = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
+        return each(filters, states, z)
+
+
+def started(item: AbstractFilter) -> PyTree:
+    """State of a filter before the first step, on the device."""
+    return jax.tree.map(jnp.asarray, item.init())
+
+
+def over_all(function: Callable[..., PyTree], size: int) -> Callable[..., PyTree]:
+    """A function of one of what is stacked, for all of them; some hold no array that would tell how many."""
+    over: Callable[..., PyTree] = eqx.filter_vmap(function, in_axes=eqx.if_array(0), axis_size=size)
+    return over
