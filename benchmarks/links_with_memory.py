@@ -17,7 +17,7 @@ import heliograph as hg
 RUNS, STEPS, REPEATS = 10_000, 100, 7
 
 
-def filters() -> dict[str, hg.AbstractFilter]:
+def filters() -> dict[str, hg.filters.AbstractFilter]:
     """Planned for STEPS steps."""
     turn = np.array([[0.95, 0.2], [-0.2, 0.95]])
     plant = hg.LinearPlant(np.kron(np.eye(2), turn), 0.1 * np.eye(4), np.zeros(4), np.eye(4))
@@ -30,7 +30,7 @@ def filters() -> dict[str, hg.AbstractFilter]:
     return {name: item.planned(np.zeros((STEPS, 0))) for name, item in items.items()}
 
 
-def means_of(item: hg.AbstractFilter) -> Callable[[jax.Array], jax.Array]:
+def means_of(item: hg.filters.AbstractFilter) -> Callable[[jax.Array], jax.Array]:
     """All estimates of one run."""
 
     def run(z: jax.Array) -> jax.Array:

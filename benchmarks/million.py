@@ -26,7 +26,7 @@ def strong() -> hg.Network:
     """The scenario with one filter."""
     whole = network(STRONG)
     nodes = {name: hg.Node(n.sensor, n.channel, {FILTER: n.filters[FILTER]}) for name, n in whole.nodes.items()}
-    return hg.Network(whole.plant, nodes, {FUSED: hg.Fusion(FILTER, hg.EqualIntersection())})
+    return hg.Network(whole.plant, nodes, {FUSED: hg.Fusion(FILTER, hg.fusion.EqualIntersection())})
 
 
 def measure(runs: int, precision: str) -> dict[str, Any]:

@@ -160,7 +160,7 @@ def linear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> 
         "extended": hg.extended_filter(plant, sensor, channel),
         "zero_mean": hg.cubature_filter(plant, sensor, channel, zero_mean),
         "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
-        "open_loop": hg.open_loop_filter(plant),
+        "open_loop": hg.filters.open_loop_filter(plant),
         "first_degree": hg.polynomial_filter(plant, sensor, channel, HORIZON, 1),
     }
     if n * channel.outputs <= 2:
@@ -187,7 +187,7 @@ def nonlinear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) 
         "moments": hg.filters.gaussian_filter(plant, sensor, channel, moments),
         "zero_mean": hg.cubature_filter(plant, sensor, channel, hg.filters.ZeroMean()),
         "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
-        "open_loop": hg.open_loop_filter(plant),
+        "open_loop": hg.filters.open_loop_filter(plant),
     }
 
 
@@ -197,7 +197,7 @@ def fused(nodes: dict[str, hg.Node], name: str, informed: bool) -> dict[str, Any
     if count < 2:
         return {}
     rules = {
-        "equal": hg.EqualIntersection(),
+        "equal": hg.fusion.EqualIntersection(),
         "smallest": hg.CovarianceIntersection(),
         "inverse": hg.fusion.InverseCovarianceIntersection(),
         "fixed": hg.fusion.FixedIntersection(np.arange(1, count + 1) / (count * (count + 1) / 2)),

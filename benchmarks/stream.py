@@ -20,7 +20,7 @@ def drive(x: Any, u: Any) -> Any:
     return jnp.stack([x[0] + u[1] * x[1], x[1] + u[1] * u[0]])
 
 
-def readme_filter() -> hg.AbstractFilter:
+def readme_filter() -> hg.filters.AbstractFilter:
     """The filter that knows its relay."""
     plant = hg.Plant(
         drive,

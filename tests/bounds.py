@@ -13,4 +13,4 @@ def covariances(seed, count, n, spread=1.0):
 
 def estimates(bounds, claim="upper", seed=0):
     means = np.random.default_rng(seed).normal(size=bounds.shape[:-1])
-    return [hg.Estimate(m, b, claim) for m, b in zip(means, bounds, strict=True)]
+    return [hg.model.Estimate(m, b, claim) for m, b in zip(means, bounds, strict=True)]

@@ -13,7 +13,7 @@ class Model(NamedTuple):
 
     plant: hg.model.OverTime
     sensor: hg.LinearSensor
-    channel: hg.AbstractRandomAffine
+    channel: hg.random_affine.AbstractRandomAffine
 
 
 def support(law):
@@ -34,7 +34,7 @@ def model(s: oracle.System, horizon: int, initial=None) -> Model:
         state = hg.LinearPlant(s.A(t), hg.random_affine.Shaped(s.B, support(s.w)), np.zeros(n), start)
         return hg.model.with_bias(state, s.E(t), bias)
 
-    plant = hg.over_time([at_time(t) for t in range(horizon)])
+    plant = hg.model.over_time([at_time(t) for t in range(horizon)])
     sensor = hg.LinearSensor(s.C @ np.eye(n, n + extra), hg.random_affine.Shaped(s.D, support(s.v)))
     first = hg.random_affine.GainAndNoise(powers(s.l), s.Phi, support(s.varpi))
     second = hg.random_affine.GainAndNoise(powers(s.m), s.theta * s.Psi, support(s.sigma))

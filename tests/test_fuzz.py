@@ -15,6 +15,7 @@ import heliograph as hg
 from heliograph import campaign, cli, examples, filters, fusion, linear, model, random_affine, relays, simulation
 from tests.junk import COIN, ESCAPE, EYE, HOP, KALMAN, NODE, PLANT, SCALAR, SENSOR, check, name_of
 
+KNOWN = hg.model.Estimate(np.zeros(2), EYE, "exact")
 COINS = hg.LinearPlant([[0.9]], COIN, [0.0], 1.0), hg.LinearSensor([[1.0]], COIN)
 RECEIVER = {"receiver": {"s": HOP}}, {"receiver": {"r": HOP}}
 SLOTS = [{"r": {"sensor": HOP}, **RECEIVER[0]}, {"s": {"sensor": HOP}, **RECEIVER[1]}]
@@ -46,17 +47,17 @@ CALLS = [  # what is called, and arguments with which it works
     (hg.parallel, {"channels": [HOP, HOP]}),
     (hg.perfect, {"dimension": 1}),
     (hg.with_direct_link, {"relayed": HOP, "direct": HOP}),
-    (hg.over_time, {"items": [HOP, HOP]}),
+    (hg.model.over_time, {"items": [HOP, HOP]}),
     (hg.cubature_filter, {**LINK, "update": filters.Polytope(), **PRIOR}),
     (hg.extended_filter, LINK),
     (hg.mean_gain_filter, LINK),
     (hg.kalman_filter, {"plant": PLANT, "sensor": SENSOR, **PRIOR}),
     (hg.linear_filter, LINK),
-    (hg.open_loop_filter, {"plant": PLANT, **PRIOR}),
+    (hg.filters.open_loop_filter, {"plant": PLANT, **PRIOR}),
     (hg.polynomial_filter, {**ONE, "horizon": 3, "degree": 1}),
     (hg.mixture_filter, {"plant": COINS[0], "sensor": COINS[1], "channel": hg.perfect(), "resolution": 0.0}),
-    (hg.Fusion, {"filter": "f", "rule": hg.EqualIntersection(), "quantizer": ESCAPE}),
-    (hg.Network, {"plant": PLANT, "nodes": {"a": NODE}, "fused": {"c": hg.Fusion("f", hg.EqualIntersection())}}),
+    (hg.Fusion, {"filter": "f", "rule": hg.fusion.EqualIntersection(), "quantizer": ESCAPE}),
+    (hg.Network, {"plant": PLANT, "nodes": {"a": NODE}, "fused": {"c": hg.Fusion("f", hg.fusion.EqualIntersection())}}),
     (hg.Network.of_relays, {"relays": RELAYS, "schedules": {}, "receivers": {}}),
     (hg.Node, {"sensor": SENSOR, "channel": hg.perfect(), "filters": {"f": KALMAN}}),
     (hg.Stream, {"filter_": KALMAN}),
@@ -114,7 +115,7 @@ CALLS = [  # what is called, and arguments with which it works
     (fusion.WeightedFusion, {"weights": [0.5, 0.5]}),
     (fusion.level_weights, {"levels": [1.0, 2.0]}),
     (fusion.fused_level, {"levels": [1.0, 2.0], "weights": [0.5, 0.5]}),
-    (fusion.fuse, {"rule": hg.EqualIntersection(), "estimates": [hg.Estimate(np.zeros(2), EYE, "exact")] * 2}),
+    (fusion.fuse, {"rule": hg.fusion.EqualIntersection(), "estimates": [KNOWN] * 2}),
     (hg.monte_carlo, {"network": NETWORK, "horizon": 2, "runs": 2, "key": 0, "keep": hg.Statistics(), "inputs": None,
                       "chunk": 2048, "first_run": 0, "precision": "float64"}),
     (hg.run, {"network": NETWORK, "measurements": {"a": [0.0, 1.0]}, "inputs": None, "time": None}),

@@ -31,12 +31,12 @@ MOVING, SEEN = model.with_clocks(
 PAIR = {"plant": MOVING, "sensor": model.joint_sensor(SEEN), "channel": hg.parallel([hg.perfect()] * 2)}
 
 CALLS = [  # what is called, and arguments with which it works
-    (hg.MarkovChain, {"transition": CHAIN, "initial": [0.5, 0.5], "name": "c", "radius": 0.0}),
+    (hg.random_affine.MarkovChain, {"transition": CHAIN, "initial": [0.5, 0.5], "name": "c", "radius": 0.0}),
     (hg.gilbert_elliott, {"good": HOP, "bad": HOP, "fail": 0.1, "recover": 0.2, "name": "g"}),
     (hg.markov_fading, {"gains": [1.0, 0.5], "transition": CHAIN, "noise": 0.1, "name": "m"}),
     (hg.autoregressive_fading, {"mean": 1.0, "deviation": 0.3, "correlation": 0.9, "noise": 0.1, "dimension": 1,
                                 "name": "f"}),
-    (hg.memory_test, {"data": np.ones((30, 1)), "filter": KALMAN, "inputs": None, "lags": 3}),
+    (hg.simulation.memory_test, {"data": np.ones((30, 1)), "filter": KALMAN, "inputs": None, "lags": 3}),
     (hg.transmit, {"signal": np.zeros((3, 1)), "channel": HOP, "seed": 0}),
     (hg.Timeline, {"network": NETWORK, "window": 3, "start": 0.0, "ahead": 0.0, "capacity": 8}),
     (model.Clock, {"offset": 0.5, "drift": 2e-3, "wander": 0.0}),
@@ -47,7 +47,7 @@ CALLS = [  # what is called, and arguments with which it works
     (model.without_memory, {"channel": BURST}),
     (model.memory_matters, {"channel": BURST}),
     (random_affine.Autoregression, {"correlation": 0.9, "name": "a"}),
-    (random_affine.Modes, {"chain": hg.MarkovChain(CHAIN), "maps": [HOP, HOP]}),
+    (random_affine.Modes, {"chain": hg.random_affine.MarkovChain(CHAIN), "maps": [HOP, HOP]}),
     (random_affine.joint_modes, {"channel": BURST, "nodes": None, "order": 1}),
     (random_affine.recorded_noise, {"samples": NOISE, "order": 2}),
     (linear.critical_arrival, {"plant": PLANT, "sensor": SENSOR, "gain": None}),

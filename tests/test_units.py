@@ -30,7 +30,7 @@ def after(item, measurements):
 
 def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_draw():
     plant = hg.Plant(lambda x, u: x, np.diag([1, 1e-14]), np.zeros(2), np.diag([1e6, 1e-9]))
-    open_loop = hg.open_loop_filter(plant)
+    open_loop = hg.filters.open_loop_filter(plant)
     found = open_loop.estimate(open_loop.predict(open_loop.init())).covariance
     np.testing.assert_allclose(np.diag(found), [1e6 + 1, 1e-9 + 1e-14], rtol=1e-13)
     with jax.enable_x64(True):
@@ -50,7 +50,7 @@ def test_an_exact_filter_of_states_in_very_different_units_has_the_scalar_filter
 
 
 RULES = [
-    hg.EqualIntersection(),
+    hg.fusion.EqualIntersection(),
     hg.CovarianceIntersection(),
     hg.fusion.FixedIntersection([0.3, 0.7]),
     hg.fusion.InverseCovarianceIntersection(),
@@ -60,7 +60,7 @@ RULES = [
 @pytest.mark.parametrize("rule", RULES, ids=lambda r: type(r).__name__)
 def test_fusion_in_very_different_units(rule):
     p = np.diag([1e6, 1e-9])
-    found = hg.fusion.fuse(rule, [hg.Estimate(np.array([1.0, 1e-6]), p, "upper")] * 2)
+    found = hg.fusion.fuse(rule, [hg.model.Estimate(np.array([1.0, 1e-6]), p, "upper")] * 2)
     np.testing.assert_allclose(np.diag(found.covariance), [1e6, 1e-9], rtol=1e-7)
     np.testing.assert_allclose(found.mean, [1.0, 1e-6], rtol=1e-7)
 
@@ -73,14 +73,14 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
 
     def fused(p):
         return hg.fusion.fuse(
-            rule, [hg.Estimate(means[0], np.diag([p, 1.0]), "upper"), hg.Estimate(means[1], other, "upper")]
+            rule, [hg.model.Estimate(means[0], np.diag([p, 1.0]), "upper"), hg.model.Estimate(means[1], other, "upper")]
         )
 
     found, near = fused(0.0), fused(1e-7)
     np.testing.assert_array_equal(np.asarray(found.covariance)[0], 0.0)
     np.testing.assert_allclose(found.mean, near.mean, atol=3e-4)  # weights move with the root of p
     np.testing.assert_allclose(found.covariance, near.covariance, atol=3e-4)
-    nothing = hg.fusion.fuse(rule, [hg.Estimate(means[0], np.zeros((2, 2)), "upper")] * 2)
+    nothing = hg.fusion.fuse(rule, [hg.model.Estimate(means[0], np.zeros((2, 2)), "upper")] * 2)
     np.testing.assert_array_equal(nothing.covariance, 0.0)
     np.testing.assert_allclose(nothing.mean, means[0], rtol=1e-12)
 
@@ -143,8 +143,8 @@ def test_an_indefinite_matrix_is_one_in_any_units():
     with pytest.raises(ValueError, match="positive semidefinite"):
         covariance("noise", np.array([[1.0, 1.1], [1.1, 1.0]]) * np.outer(units, units))
     covariance("noise", np.array([[1.0, 1.0], [1.0, 1.0]]) * np.outer(units, units))
-    assert not is_sound(hg.Estimate(np.zeros(2), np.diag([1e6, -1e-9]), "exact"))
-    assert is_sound(hg.Estimate(np.zeros(2), np.diag([1e6, 0.0]), "exact"))
+    assert not is_sound(hg.model.Estimate(np.zeros(2), np.diag([1e6, -1e-9]), "exact"))
+    assert is_sound(hg.model.Estimate(np.zeros(2), np.diag([1e6, 0.0]), "exact"))
 
 
 def test_the_root_that_draws_a_noise_keeps_every_components_digits():

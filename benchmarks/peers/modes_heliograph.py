@@ -10,7 +10,9 @@ import heliograph as hg
 
 def prepare(p: Arrays) -> Contender:
     plant = hg.LinearPlant(p["A"], p["Q"], p["mean"], p["covariance"])
-    chain = hg.MarkovChain(p["chain"], initial=p["law"] @ p["chain"])  # the peer's law is that before the first step
+    chain = hg.random_affine.MarkovChain(
+        p["chain"], initial=p["law"] @ p["chain"]
+    )  # the peer's law is that before the first step
     link = hg.markov_fading(p["gains"], chain, noise=p["R"])
     imm = hg.filters.imm_filter(plant, hg.LinearSensor(p["C"], 0.0 * p["R"]), link)
     start = imm.init()

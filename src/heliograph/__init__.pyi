@@ -10,18 +10,11 @@ from . import (
     smoothing as smoothing,
     fusion as fusion,
     simulation as simulation,
+    learning as learning,
+    planning as planning,
     files as files,
     campaign as campaign,
     testing as testing,
-)
-from .model.over_time import (
-    over_time as over_time,
-)
-from .random_affine.base import (
-    AbstractRandomAffine as AbstractRandomAffine,
-)
-from .random_affine.chain import (
-    MarkovChain as MarkovChain,
 )
 from .random_affine.law import (
     Discrete as Discrete,
@@ -55,12 +48,6 @@ from .model.fading import (
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
 )
-from .model.estimate import (
-    Estimate as Estimate,
-)
-from .filters.base import (
-    AbstractFilter as AbstractFilter,
-)
 from .filters.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
@@ -71,7 +58,6 @@ from .filters.kalman import (
 )
 from .filters.linear import (
     linear_filter as linear_filter,
-    open_loop_filter as open_loop_filter,
 )
 from .filters.polynomial import (
     polynomial_filter as polynomial_filter,
@@ -81,7 +67,6 @@ from .filters.mixture import (
 )
 from .fusion.rules import (
     CovarianceIntersection as CovarianceIntersection,
-    EqualIntersection as EqualIntersection,
     Fusion as Fusion,
 )
 from .simulation.node import (
@@ -99,9 +84,6 @@ from .simulation.transmission import (
 )
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,
-)
-from .simulation.whiteness import (
-    memory_test as memory_test,
 )
 from .simulation.record import (
     Record as Record,

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import heliograph as hg
 
 
-class Bare(hg.AbstractFilter):
+class Bare(hg.filters.AbstractFilter):
     claim: str = eqx.field(static=True, default="none")
     states: tuple = eqx.field(static=True, default=("x",))
     inputs: tuple = eqx.field(static=True, default=())
@@ -32,7 +32,7 @@ class Bare(hg.AbstractFilter):
         return state, hg.model.Innovation(z, jnp.zeros((0, 0)), 0.0)
 
     def estimate(self, state):
-        return hg.Estimate(state, jnp.full((1, 1), jnp.nan), self.claim)
+        return hg.model.Estimate(state, jnp.full((1, 1), jnp.nan), self.claim)
 
 
 def build(gain, noise=0.1, kind="linear"):

@@ -35,7 +35,7 @@ def outcome():
     scores = dict.fromkeys(sorted(FILTERS), score) | {"exact": known}
     told, shadow = {"losses": known, "classes": known}, {"shared": 0.2, "separate_claimed": 0.1, "separate_true": 0.3}
     lags = np.array([0.0, 0.5, 0.9])
-    memory = hg.memory_test(np.random.default_rng(0).normal(size=200))
+    memory = hg.simulation.memory_test(np.random.default_rng(0).normal(size=200))
     return compute.Outcome(scores, scores, told, shadow, lags, 1 + lags, memory)
 
 

@@ -115,7 +115,7 @@ def test_scores_of_made_up_errors():
     bias = np.array([0.0, 0.0, 0.0, 0.0, 0.03])
     mean = truth - bias - 0.04 * rng.standard_normal(truth.shape)
     bound = np.broadcast_to(0.02**2 * np.eye(5), (*truth.shape, 5))
-    estimate = hg.Estimate(mean, bound, "nominal")
+    estimate = hg.model.Estimate(mean, bound, "nominal")
     record = hg.Record(np.arange(50.0), machine.STATES[:5], truth, {}, {"node": {"filter": estimate}})
     score = compute.score(record, "node", "filter")
     # 10,000 draws: a mean square within 4 standard errors of sqrt(2 / 10,000) = 1.4 %, a root within half of it.

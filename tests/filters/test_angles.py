@@ -10,7 +10,7 @@ import heliograph as hg
 from heliograph.numerics.angle import nearest, wrapped
 
 STEPS = 30
-CHAIN = hg.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
+CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 QUIET = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
 NOISY = hg.parallel([hg.hop(1.0, 4.0), hg.hop(1.0, 1e-2)])
 MODES = hg.random_affine.Modes(CHAIN, [QUIET, NOISY])
@@ -43,7 +43,7 @@ def station(angles: bool = True) -> hg.Sensor:
     return hg.Sensor(look, np.diag([0.5**2, 0.02**2]), ("range", "bearing"), ["bearing"] if angles else [])
 
 
-def filters(plant: hg.Plant, sensor: hg.Sensor) -> dict[str, hg.AbstractFilter]:
+def filters(plant: hg.Plant, sensor: hg.Sensor) -> dict[str, hg.filters.AbstractFilter]:
     return {
         "cubature": hg.cubature_filter(plant, sensor, MODES),
         "extended": hg.extended_filter(plant, sensor, MODES),
@@ -51,7 +51,7 @@ def filters(plant: hg.Plant, sensor: hg.Sensor) -> dict[str, hg.AbstractFilter]:
         "gpb1": hg.filters.gpb1_filter(plant, sensor, MODES),
         "gpb2": hg.filters.gpb2_filter(plant, sensor, MODES),
         "particle": hg.filters.particle_filter(plant, sensor, MODES, particles=20),
-        "open_loop": hg.open_loop_filter(plant),
+        "open_loop": hg.filters.open_loop_filter(plant),
     }
 
 
@@ -61,7 +61,9 @@ def network(side: float, angles: bool = True, few: bool = False) -> hg.Network:
     plant, sensor = robot(side, angles), station(angles)
     own = filters(plant, sensor)
     own = {"cubature": own["cubature"]} if few else own
-    fused: dict[str, hg.Fusion | hg.AbstractFilter] = {"equal": hg.Fusion("cubature", hg.EqualIntersection())}
+    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
+        "equal": hg.Fusion("cubature", hg.fusion.EqualIntersection())
+    }
     fused["central"] = hg.filters.sequential_filter([own["cubature"], own["cubature"]])
     nodes = {"a": hg.Node(sensor, hg.erasure(MODES, 0.8), own)}
     nodes["b"] = hg.Node(sensor, hg.erasure(MODES, 0.8), {"cubature": own["cubature"]})
@@ -187,13 +189,13 @@ def test_an_unknown_heading_is_no_smaller_than_known():
 
 def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
     mean = np.array([[3.1, 1.0], [-3.1, 2.0]])
-    two = [hg.Estimate(m, np.eye(2), "nominal") for m in mean]
-    for rule in (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.WeightedFusion([0.5, 0.5])):
+    two = [hg.model.Estimate(m, np.eye(2), "nominal") for m in mean]
+    for rule in (hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.WeightedFusion([0.5, 0.5])):
         found = hg.fusion.fuse(rule, two, angles=[0])
         assert abs(abs(found.mean[0]) - np.pi) < 1e-9 and found.mean[1] == pytest.approx(1.5)
         assert hg.fusion.fuse(rule, two).mean[0] == pytest.approx(0.0)  # numbers on a line
     with pytest.raises(ValueError, match="angles: expected places"):
-        hg.fusion.fuse(hg.EqualIntersection(), two, angles=[2])
+        hg.fusion.fuse(hg.fusion.EqualIntersection(), two, angles=[2])
 
 
 REFUSED = {

@@ -114,7 +114,7 @@ def test_not_told_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
 
 def test_delays_that_are_a_chain():
     rows, initial = np.array([[0.8, 0.2, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 0.7]]), np.array([0.5, 0.3, 0.2])
-    channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), N, delay=hg.MarkovChain(rows, initial))
+    channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), N, delay=hg.random_affine.MarkovChain(rows, initial))
     found = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 10)
     heard = oracle.of_untold(PARTS, in_chain(initial, rows), 0.75, 0.625, N)
     best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, 11)])

@@ -193,8 +193,8 @@ def test_claims_name_what_is_true():
     assert hg.linear_filter(LINEAR, SENSOR, fading).claim == "exact"
     assert hg.linear_filter(LINEAR, SENSOR, uncertain).claim == "upper"
     assert hg.mean_gain_filter(LINEAR, SENSOR, known).claim == "nominal"
-    assert hg.open_loop_filter(LINEAR).claim == "exact"
-    assert hg.open_loop_filter(machine.plant(STRONG)).claim == "nominal"
+    assert hg.filters.open_loop_filter(LINEAR).claim == "exact"
+    assert hg.filters.open_loop_filter(machine.plant(STRONG)).claim == "nominal"
     assert hg.cubature_filter(machine.plant(STRONG), machine.sensor(STRONG, 0), hg.perfect(2)).claim == "nominal"
 
 
@@ -224,7 +224,7 @@ def test_a_missing_component_equals_a_channel_that_is_off(name):
 
 def test_nothing_received_is_open_loop():
     z = np.full((STEPS, 2), np.nan)
-    agree(follow(FILTERS["cubature"](PARALLEL), z), follow(hg.open_loop_filter(LINEAR), z))
+    agree(follow(FILTERS["cubature"](PARALLEL), z), follow(hg.filters.open_loop_filter(LINEAR), z))
 
 
 def test_a_component_known_exactly_is_no_error():
@@ -292,7 +292,7 @@ def test_a_filter_with_an_initial_law_of_its_own_is_not_exact(own):
     filters = {
         "cubature": hg.cubature_filter(plant, sensor, hg.perfect(), **own),
         "kalman": hg.kalman_filter(plant, sensor, **own),
-        "open": hg.open_loop_filter(plant, **own),
+        "open": hg.filters.open_loop_filter(plant, **own),
     }
     central = hg.filters.sequential_filter([filters["kalman"], hg.kalman_filter(plant, sensor)])
     ahead = hg.filters.prediction_of(filters["cubature"])

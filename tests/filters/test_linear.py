@@ -24,7 +24,9 @@ def statistics(channel, filters, runs=4000, horizon=12):
 
 
 def test_exact_claims_match_the_actual_covariance():
-    found = statistics(FADING, {"linear": hg.linear_filter(PLANT, SENSOR, FADING), "open": hg.open_loop_filter(PLANT)})
+    found = statistics(
+        FADING, {"linear": hg.linear_filter(PLANT, SENSOR, FADING), "open": hg.filters.open_loop_filter(PLANT)}
+    )
     for name, s in found.items():
         assert s.claim == "exact", name
         actual, claimed = s.actual(), s.claimed()
@@ -41,7 +43,7 @@ def test_the_linear_filter_beats_the_others_behind_fading():
         {
             "linear": hg.linear_filter(PLANT, SENSOR, FADING),
             "mean_gain": hg.mean_gain_filter(PLANT, SENSOR, FADING),
-            "open": hg.open_loop_filter(PLANT),
+            "open": hg.filters.open_loop_filter(PLANT),
         },
     )
     assert found["linear"].rmse()[0] < 0.9 * found["open"].rmse()[0]
@@ -67,8 +69,8 @@ def test_a_false_claim_is_found():
 
 def test_time_varying_parts_are_read_at_their_step():
     horizon = 5
-    channels = hg.over_time([hg.hop(0.2 + 0.3 * k, 0.05, dimension=2) for k in range(horizon)])
-    plants = hg.over_time(
+    channels = hg.model.over_time([hg.hop(0.2 + 0.3 * k, 0.05, dimension=2) for k in range(horizon)])
+    plants = hg.model.over_time(
         [hg.LinearPlant(PLANT.matrix * (1 - 0.1 * k), 0.05, [1.0, -0.5], 0.4) for k in range(horizon)]
     )
     item = hg.linear_filter(plants, SENSOR, channels)
@@ -86,7 +88,7 @@ def test_time_varying_parts_are_read_at_their_step():
 
 
 def test_a_horizon_beyond_what_varies_is_refused():
-    channels = hg.over_time([hg.hop(1.0, 0.1, dimension=2)] * 3)
+    channels = hg.model.over_time([hg.hop(1.0, 0.1, dimension=2)] * 3)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channels, {"f": hg.linear_filter(PLANT, SENSOR, channels)})})
     with pytest.raises(ValueError, match=r"horizon: expected at most 3 steps, .* got 4"):
         hg.monte_carlo(network, 4, 2, 0)

@@ -96,7 +96,7 @@ def test_what_has_no_atoms_is_refused():
         hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())
 
 
-CHAIN = hg.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
+CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.5, [0.3], 0.5), hg.LinearSensor([[1.0]], TWO)
 MODES = [hg.hop(hg.Discrete([0.5, 1.5], [0.4, 0.6]), 0.2), hg.hop(-0.3, 0.1)]
 

@@ -40,7 +40,7 @@ RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
 
 
 def chain_a(k, name=None):
-    return hg.MarkovChain(CHAIN_A[min(k, 2)], LAW_A, name)
+    return hg.random_affine.MarkovChain(CHAIN_A[min(k, 2)], LAW_A, name)
 
 
 def errors(item, horizon=STEPS):
@@ -69,7 +69,7 @@ def expected(initial, transitions, maps):
 
 
 def filtered(channel):
-    return errors(hg.linear_filter(hg.over_time(PLANTS), hg.over_time(SENSORS), channel))
+    return errors(hg.linear_filter(hg.model.over_time(PLANTS), hg.model.over_time(SENSORS), channel))
 
 
 def constant(maps):
@@ -85,7 +85,7 @@ def one_chain(k, name=None):
 
 
 def other(name=None):
-    return Modes(hg.MarkovChain(CHAIN_B, LAW_B, name), THREE)
+    return Modes(hg.random_affine.MarkovChain(CHAIN_B, LAW_B, name), THREE)
 
 
 CASES = {  # channel at step k; law, transitions and the same channel in each mode, written out
@@ -119,14 +119,14 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_best_over_all_paths(name):
     at_step, law, transitions, maps = CASES[name]
-    channel = hg.over_time([at_step(k) for k in range(STEPS)])
+    channel = hg.model.over_time([at_step(k) for k in range(STEPS)])
     np.testing.assert_allclose(filtered(channel), expected(law, transitions, constant(maps)), **EXACT)
 
 
 def test_maps_may_vary_while_the_chain_does_not():
-    chain = hg.MarkovChain(CHAIN_B, LAW_B)
+    chain = hg.random_affine.MarkovChain(CHAIN_B, LAW_B)
     maps = [[hg.hop((1 + k) * g, 0.1 + 0.1 * k) for g in (0.3, -0.6, 1.2)] for k in range(STEPS)]
-    found = filtered(hg.over_time([Modes(chain, row) for row in maps]))
+    found = filtered(hg.model.over_time([Modes(chain, row) for row in maps]))
     np.testing.assert_allclose(found, expected(LAW_B, [CHAIN_B] * 3, maps), **EXACT)
 
 
@@ -185,7 +185,7 @@ def test_drifting_gains_need_no_grid(name):
             else [t + weight * p for t, p in zip(total, parts, strict=True)]
         )
     channel = build(lambda i: hg.autoregressive_fading(1.1, 0.4, correlations[i], 0.2, name=f"drift {i}"))
-    found = errors(hg.linear_filter(hg.over_time(PLANTS), hg.over_time(SENSORS), channel), steps)
+    found = errors(hg.linear_filter(hg.model.over_time(PLANTS), hg.model.over_time(SENSORS), channel), steps)
     np.testing.assert_allclose(found, oracle.best_linear(SECOND[:steps, :steps], *total), **EXACT)
 
 
@@ -213,7 +213,7 @@ def test_fading_in_bursts():
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
 def test_two_sensors_in_one_shadow_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     links = hg.parallel([bursts(chain if shared else BURSTS) for _ in range(2)])
     assert variances(PLANT, two, links, 400)[-1, 0] == pytest.approx(limit, abs=6e-7)
 
@@ -253,7 +253,7 @@ def test_limits(name):
 
 def test_a_gain_that_never_changes_but_is_unknown():
     """Pi = I against the two known gains weighed, by all paths (there are two)."""
-    channel = Modes(hg.MarkovChain(np.eye(2), [0.3, 0.7]), [GOOD, BAD])
+    channel = Modes(hg.random_affine.MarkovChain(np.eye(2), [0.3, 0.7]), [GOOD, BAD])
     np.testing.assert_allclose(filtered(channel), expected([0.3, 0.7], [np.eye(2)] * 3, constant([GOOD, BAD])), **EXACT)
 
 

@@ -31,7 +31,7 @@ def drawn(seed):
 def test_equal_rows_are_no_memory(seed):
     """Against the mixture of the maps, which the filter of links that forget hears."""
     plant, sensor, maps, _, law = drawn(seed)
-    chain = hg.MarkovChain([law] * 3)
+    chain = hg.random_affine.MarkovChain([law] * 3)
     forgets = hg.random_affine.Mixture(maps, law)
     found = variances(plant, sensor, Modes(chain, maps), 30)
     np.testing.assert_allclose(found, variances(plant, sensor, forgets, 30), rtol=1e-11)
@@ -41,8 +41,8 @@ def test_equal_rows_are_no_memory(seed):
 def test_the_order_of_modes_changes_nothing(seed):
     plant, sensor, maps, rows, law = drawn(seed)
     order = np.random.default_rng(seed + 100).permutation(3)
-    one = Modes(hg.MarkovChain(rows, law), maps)
-    turned = Modes(hg.MarkovChain(rows[np.ix_(order, order)], law[order]), [maps[i] for i in order])
+    one = Modes(hg.random_affine.MarkovChain(rows, law), maps)
+    turned = Modes(hg.random_affine.MarkovChain(rows[np.ix_(order, order)], law[order]), [maps[i] for i in order])
     np.testing.assert_allclose(variances(plant, sensor, one, 30), variances(plant, sensor, turned, 30), rtol=1e-11)
 
 
@@ -50,7 +50,7 @@ def test_the_order_of_modes_changes_nothing(seed):
 def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed):
     """Of the filter itself to rounding; a filter made for other rows is worse at every step."""
     plant, sensor, maps, rows, law = drawn(seed)
-    channel, other = (Modes(hg.MarkovChain(r, law), maps) for r in (rows, rows[::-1]))
+    channel, other = (Modes(hg.random_affine.MarkovChain(r, law), maps) for r in (rows, rows[::-1]))
     own = hg.filters.true_error(hg.linear_filter(plant, sensor, channel), plant, sensor, channel, 30)
     wrong = hg.filters.true_error(hg.linear_filter(plant, sensor, other), plant, sensor, channel, 30)
     np.testing.assert_allclose(own.claimed, own.true, rtol=1e-9, atol=1e-12)
@@ -63,7 +63,7 @@ def test_claims_hold_by_simulation(seed):
     """Sum of both states' squares against the trace, within 4.5 standard errors at each of 12 steps."""
     plant, sensor, maps, rows, law = drawn(seed)
     relay = hg.autoregressive_fading(1.0, 0.5, 0.7, 0.1)
-    channel = hg.amplify_and_forward([Modes(hg.MarkovChain(rows, law), maps), relay])
+    channel = hg.amplify_and_forward([Modes(hg.random_affine.MarkovChain(rows, law), maps), relay])
     item = hg.linear_filter(plant, sensor, channel)
     record = hg.monte_carlo(hg.Network(plant, {"node": hg.Node(sensor, channel, {"f": item})}), 12, 4000, seed)
     squares = np.sum(record.errors("node", "f") ** 2, axis=-1)

@@ -22,7 +22,7 @@ def wide_link(order=(0, 1, 2)):
     """Three modes with a gain that is random in one and two sensors' outputs; in any order."""
     maps = [hg.hop(0.1, [[0.1, 0], [0, 0.1]]), hg.hop(1.0, [[0.3, 0.1], [0.1, 0.2]]), hg.hop(-0.7, 0.2 * np.eye(2))]
     rows = np.array([[0.8, 0.1, 0.1], [0.2, 0.7, 0.1], [0.3, 0.3, 0.4]])
-    chain = hg.MarkovChain(rows[np.ix_(order, order)], initial=np.array([0.5, 0.2, 0.3])[list(order)])
+    chain = hg.random_affine.MarkovChain(rows[np.ix_(order, order)], initial=np.array([0.5, 0.2, 0.3])[list(order)])
     return hg.markov_fading([maps[i] for i in order], chain)
 
 
@@ -85,7 +85,9 @@ def test_until_something_is_merged_they_are_exact(build, steps):
 def test_a_chain_that_varies_leads_from_each_step_to_the_next():
     rows = [np.array([[0.9, 0.1], [0.4, 0.6]]), np.array([[0.2, 0.8], [0.7, 0.3]])]
     law = np.array([0.3, 0.7])
-    links = hg.over_time([hg.markov_fading([0.5, 1.5], hg.MarkovChain(r, law, "link"), noise=0.1) for r in rows])
+    links = hg.model.over_time(
+        [hg.markov_fading([0.5, 1.5], hg.random_affine.MarkovChain(r, law, "link"), noise=0.1) for r in rows]
+    )
     mean, spread, _ = exact(PLANT, SENSOR, (law, [([0.5, 1.5], np.array([[0.1]]), r) for r in rows]), DATA[:2])
     found, _ = stepped(hg.filters.gpb2_filter(PLANT, SENSOR, links), DATA[:2])
     np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
@@ -211,8 +213,8 @@ def test_a_mode_that_losses_reveal_is_known():
 @pytest.mark.parametrize("build", ALL)
 def test_what_varies_in_time_is_followed(build):
     """Equal maps, a plant and a sensor that vary: the linear filter."""
-    plants = hg.over_time([hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5, -0.7)])
-    sensors = hg.over_time([hg.LinearSensor([[c]], 0.1) for c in (1.0, 2.0, 0.5)])
+    plants = hg.model.over_time([hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5, -0.7)])
+    sensors = hg.model.over_time([hg.LinearSensor([[c]], 0.1) for c in (1.0, 2.0, 0.5)])
     same = hg.markov_fading([hg.hop(0.8, 0.1), hg.hop(0.8, 0.1)], CHAIN)
     found, _ = stepped(build(plants, sensors, same), DATA[:3])
     expected, _ = stepped(hg.linear_filter(plants, sensors, hg.hop(0.8, 0.1)), DATA[:3])

@@ -11,7 +11,7 @@ from heliograph.filters.plan import PlannedFilter
 STEPS = 7
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]], [[0.0], [1.0]])
 STILL = hg.LinearPlant(PLANT.matrix, 0.05, PLANT.initial_mean, PLANT.initial_covariance)
-SENSORS = hg.over_time([hg.LinearSensor([[1.0, 0.1 * k], [0.5, 1.0]], 0.02) for k in range(STEPS)])
+SENSORS = hg.model.over_time([hg.LinearSensor([[1.0, 0.1 * k], [0.5, 1.0]], 0.02) for k in range(STEPS)])
 FADING = hg.amplify_and_forward(
     [hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2), hg.hop(hg.random_affine.bernoulli(0.85), 0.01, dimension=2)]
 )

@@ -41,4 +41,4 @@ def test_its_claim_is_the_filters_and_only_gaussian_filters_have_one():
     linear = hg.cubature_filter(PLANT, SENSOR, hg.perfect())
     assert (prediction_of(filtered()).claim, prediction_of(linear).claim) == ("nominal", "exact")
     with pytest.raises(ValueError, match="filter: expected a GaussianFilter, got OpenLoop"):
-        prediction_of(hg.open_loop_filter(PLANT))
+        prediction_of(hg.filters.open_loop_filter(PLANT))

@@ -71,7 +71,7 @@ def test_nothing_arrives_for_a_while():
     s, data = model(EXAMPLE, horizon), measurements(1)[:horizon]
     silent = hg.random_affine.Series([hg.random_affine.known(np.zeros((1, 1))), s.channel])
     live = hg.random_affine.Series([hg.random_affine.known(np.eye(1)), s.channel])
-    varying = hg.over_time([silent if k in gap else live for k in range(horizon)])
+    varying = hg.model.over_time([silent if k in gap else live for k in range(horizon)])
     expected = hg.linear.lmmse(hg.linear.lifted_system(s.plant, s.sensor, varying, 2, horizon)).gains.covariance
     holes = data.copy()
     holes[list(gap)] = np.nan

@@ -41,7 +41,7 @@ def test_flags_that_tell_nothing_change_nothing():
 
 def test_flags_that_reveal_the_mode_make_it_the_kalman_filter_given_the_modes():
     modes = np.array([0, 0, 1, 1, 0, 1, 1, 0])
-    given = hg.over_time([hg.hop((0.2, 1.0)[i], 0.05) for i in modes])
+    given = hg.model.over_time([hg.hop((0.2, 1.0)[i], 0.05) for i in modes])
     found = claims(told_filter(PLANT, SENSOR, bursts(), np.eye(2)), np.column_stack([Z, modes]))
     expected = claims(hg.linear_filter(PLANT, SENSOR, given), Z)
     np.testing.assert_allclose(found, expected, rtol=1e-11)
@@ -56,7 +56,7 @@ def test_a_drift_that_is_known():
     """Given (c_1, c_2) at each step it is the filter of the known gains."""
     told = np.random.default_rng(3).normal(size=(8, 2))
     hops = [[hg.hop(m + 0.4 * c, 0.05) for m, c in zip((1.0, 0.8), row, strict=True)] for row in told]
-    given = hg.over_time([hg.amplify_and_forward(row) for row in hops])
+    given = hg.model.over_time([hg.amplify_and_forward(row) for row in hops])
     found = claims(known_filter(PLANT, SENSOR, DRIFTS), np.column_stack([Z, told]))
     np.testing.assert_allclose(found, claims(hg.linear_filter(PLANT, SENSOR, given), Z), rtol=1e-12)
 
@@ -115,12 +115,12 @@ def test_claims_hold_in_simulation(world, item, known):
 
 def test_arrival_that_varies_and_is_certain_at_some_steps():
     """At a step where everything arrives, a packet lost for another reason tells nothing of the mode."""
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     steps = []
     for sure in (True, False, True):
         hops = zip((0.2, 1.0), (1.0, 1.0) if sure else ARRIVAL, strict=True)
         steps.append(hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in hops], chain))
-    item = hg.linear_filter(PLANT, SENSOR, hg.over_time(steps))
+    item = hg.linear_filter(PLANT, SENSOR, hg.model.over_time(steps))
     found = claims(item, [[0.3], [np.nan], [np.nan]])
     state = item.predict(item.init(), (), 0)
     for k, z in enumerate([[0.3], [np.nan]]):
@@ -131,7 +131,7 @@ def test_arrival_that_varies_and_is_certain_at_some_steps():
 
 
 def test_two_lossy_links_in_one_shadow_keep_their_own_patterns():
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     links = [
         hg.markov_fading([hg.erasure(hg.hop(g, 0.05), a) for g, a in ((0.2, 0.4), (1.0, p))], chain) for p in (0.9, 0.8)
     ]

@@ -33,7 +33,7 @@ def test_two_hops_that_drift():
 
 def test_a_filter_for_two_shadows_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     apart, together = (hg.parallel([bursts(c) for c in (a, b)]) for a, b in ((BURSTS, BURSTS), (chain, chain)))
     found = true_error(hg.linear_filter(PLANT, two, apart), PLANT, two, together, 400)
     assert found.claimed[-1, 0, 0] == pytest.approx(0.148447, abs=6e-7)
@@ -62,8 +62,10 @@ def test_the_exact_filter_claims_its_truth(channel):
     np.testing.assert_allclose(found.claimed, found.true, rtol=1e-12)
 
 
-NOISE_ONLY = Modes(hg.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(1.0, 0.5)])
-ONE_MEAN = Modes(hg.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.05)])
+NOISE_ONLY = Modes(hg.random_affine.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(1.0, 0.5)])
+ONE_MEAN = Modes(
+    hg.random_affine.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.05)]
+)
 
 
 @pytest.mark.parametrize(
@@ -75,7 +77,7 @@ ONE_MEAN = Modes(hg.MarkovChain(BURSTS), [hg.hop(1.0, 0.05), hg.hop(hg.Discrete(
         (HOPS[0], True),
         (RELAY, False),
         (bursts([[0.375, 0.625]] * 2), False),
-        (hg.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)]), True),
+        (hg.model.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)]), True),
     ],
 )
 def test_a_claim_is_lowered_where_memory_matters_and_only_there(channel, matters):
@@ -106,7 +108,7 @@ def test_claims_of_filters_that_assume_no_memory():
 
 def test_of_a_channel_that_varies_each_step_keeps_its_law():
     """Without memory the modes have at step k the law that they have there with it: the first step is the same."""
-    with_it = hg.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)])
+    with_it = hg.model.over_time([Modes(chain_a(k), [GOOD, LINK]) for k in range(4)])
     item = memoryless(PLANT, SENSOR, with_it)
     found, alone = (true_error(item, PLANT, SENSOR, c, 4) for c in (with_it, without_memory(with_it)))
     np.testing.assert_allclose(alone.true, alone.claimed, rtol=1e-12)
@@ -115,7 +117,7 @@ def test_of_a_channel_that_varies_each_step_keeps_its_law():
 
 
 def test_a_start_that_is_not_stationary_is_no_claim_of_the_long_run():
-    late = Modes(hg.MarkovChain(BURSTS, [1.0, 0.0]), [hg.hop(1.0, 0.05), hg.hop(1.0, 0.5)])
+    late = Modes(hg.random_affine.MarkovChain(BURSTS, [1.0, 0.0]), [hg.hop(1.0, 0.05), hg.hop(1.0, 0.5)])
     assert memory_matters(late) and hg.cubature_filter(PLANT, SENSOR, late).claim == "nominal"
 
 

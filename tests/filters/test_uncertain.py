@@ -11,7 +11,7 @@ THREE = np.array([[0.8, 0.15, 0.05], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]])
 
 
 def rough(radius, rows=BURSTS):
-    return bursts(hg.MarkovChain(rows, radius=radius))
+    return bursts(hg.random_affine.MarkovChain(rows, radius=radius))
 
 
 def bound(channel, steps=400):
@@ -43,13 +43,15 @@ def test_it_dominates_the_truth_of_chains_that_wander_within_the_radius(seed):
     """Three modes with atoms, transitions drawn anew at each step, half of them at the ends."""
     generator, radius = np.random.default_rng(seed), 0.03
     law, maps, steps = [0.5, 0.3, 0.2], [GOOD, BAD, hg.hop(0.6, 0.1)], 60
-    item, claimed = bound(Modes(hg.MarkovChain(THREE, law, radius=radius), maps), steps)
+    item, claimed = bound(Modes(hg.random_affine.MarkovChain(THREE, law, radius=radius), maps), steps)
     rows = []
     for _ in range(steps):
         draw = generator.uniform(-1, 1, size=(3, 3)) if generator.random() < 0.5 else generator.choice([-1, 1], (3, 3))
         change = draw - draw.mean(axis=1, keepdims=True)
         rows.append(np.clip(THREE + radius * change / max(np.abs(change).max(), 1), 0, 1))
-    world = hg.over_time([Modes(hg.MarkovChain(r / r.sum(axis=1, keepdims=True), law, "w"), maps) for r in rows])
+    world = hg.model.over_time(
+        [Modes(hg.random_affine.MarkovChain(r / r.sum(axis=1, keepdims=True), law, "w"), maps) for r in rows]
+    )
     true = true_error(item, PLANT, SENSOR, world, steps).true[:, 0, 0]
     assert np.all(true <= claimed * (1 + 1e-12))
 
@@ -58,7 +60,9 @@ def test_it_dominates_the_truth_of_chains_that_wander_within_the_radius(seed):
 def test_it_dominates_the_truth_at_the_corners_and_the_exact_filter_there(corner):
     item, claimed = bound(rough(0.02), 300)
     chain = bursts(
-        hg.MarkovChain(BURSTS + 0.02 * np.array([[-corner[0], corner[0]], [-corner[1], corner[1]]]), [0.375, 0.625])
+        hg.random_affine.MarkovChain(
+            BURSTS + 0.02 * np.array([[-corner[0], corner[0]], [-corner[1], corner[1]]]), [0.375, 0.625]
+        )
     )
     true = true_error(item, PLANT, SENSOR, chain, 300).true[:, 0, 0]
     assert np.all(true <= claimed) and np.all(variances(PLANT, SENSOR, chain, 300)[:, 0] <= true * (1 + 1e-12))
@@ -66,7 +70,7 @@ def test_it_dominates_the_truth_at_the_corners_and_the_exact_filter_there(corner
 
 def test_two_rough_chains_together():
     """|Delta| of a product of chains is at most (Pi_a + r_a) x (Pi_b + r_b) - Pi_a x Pi_b."""
-    a, b = rough(0.01), Modes(hg.MarkovChain(THREE, radius=0.02), [GOOD, BAD, hg.hop(0.6, 0.1)])
+    a, b = rough(0.01), Modes(hg.random_affine.MarkovChain(THREE, radius=0.02), [GOOD, BAD, hg.hop(0.6, 0.1)])
     joint = hg.random_affine.joint_modes(hg.amplify_and_forward([a, b]))
     moved = np.kron(BURSTS + 0.01 * np.array([[1, -1], [-1, 1]]), THREE + 0.02 * np.array([[1, -1, 0]] * 3))
     assert np.all(np.abs(moved - joint.transition) <= joint.radius + 1e-15)

@@ -30,6 +30,6 @@ def test_silence_taken_for_a_loss_needs_a_rule_that_hears_reports():
     nodes = {"a": hg.Node(sensor, hg.perfect(), {"own": hg.kalman_filter(plant, sensor)})}
     sends = hg.fusion.EventSending(0.1, told=False)
     with pytest.raises(ValueError, match="a rule that hears reports"):
-        hg.Network(plant, nodes, {"one": hg.Fusion("own", hg.EqualIntersection(), quantizer=sends)})
+        hg.Network(plant, nodes, {"one": hg.Fusion("own", hg.fusion.EqualIntersection(), quantizer=sends)})
     with pytest.raises(ValueError, match="threshold: expected positive numbers"):
         hg.fusion.EventSending(0.0)

@@ -186,7 +186,7 @@ def test_what_is_not_known_is_refused(make, message):
 
 
 def test_a_covariance_each_is_not_enough():
-    pair = [hg.Estimate(np.zeros(2), np.eye(2), "exact")] * 2
+    pair = [hg.model.Estimate(np.zeros(2), np.eye(2), "exact")] * 2
     with pytest.raises(ValueError, match="fusion by MatrixWeights: expected the errors' joint covariance"):
         hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
 

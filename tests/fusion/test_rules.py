@@ -11,7 +11,7 @@ from tests.oracles import cubature_fusion as oracle
 
 RULES = {
     "optimal": hg.CovarianceIntersection(),
-    "equal": hg.EqualIntersection(),
+    "equal": hg.fusion.EqualIntersection(),
     "fixed": hg.fusion.FixedIntersection([0.2, 0.3, 0.5]),
     "weighted": hg.fusion.WeightedFusion([0.2, 0.3, 0.5]),
     "inverse": hg.fusion.InverseCovarianceIntersection(),
@@ -46,10 +46,10 @@ def test_weighted_fusion_by_hand():
 def test_estimates_that_claim_no_covariance():
     """A weighted mean needs none; rules that weigh by covariances say so."""
     some = estimates(covariances(0, 2, 2), "exact")
-    mixed = [some[0], hg.Estimate(some[1].mean, np.full((2, 2), np.nan), "none")]
+    mixed = [some[0], hg.model.Estimate(some[1].mean, np.full((2, 2), np.nan), "none")]
     fused = hg.fusion.fuse(hg.fusion.WeightedFusion([0.5, 0.5]), mixed)
     assert fused.claim == "none" and np.all(np.isfinite(fused.mean)) and np.all(np.isnan(fused.covariance))
-    rules = (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.InverseCovarianceIntersection())
+    rules = (hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.InverseCovarianceIntersection())
     for rule in (*rules, hg.fusion.FixedIntersection([0.5, 0.5])):
         with pytest.raises(ValueError, match="estimates that claim one, got the claim 'none'"):
             hg.fusion.fuse(rule, mixed)
@@ -57,7 +57,7 @@ def test_estimates_that_claim_no_covariance():
 
 
 @pytest.mark.parametrize(
-    "rule", [hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
+    "rule", [hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
 )
 def test_equal_inputs_are_returned(rule):
     one = estimates(covariances(0, 1, 3))[0]
@@ -78,7 +78,11 @@ def test_optimal_is_best_and_no_worse_than_any_input(seed):
     bounds = covariances(seed, 3, 3)
     trace = {
         type(rule).__name__: np.trace(hg.fusion.fuse(rule, estimates(bounds)).covariance)
-        for rule in (hg.CovarianceIntersection(), hg.EqualIntersection(), hg.fusion.InverseCovarianceIntersection())
+        for rule in (
+            hg.CovarianceIntersection(),
+            hg.fusion.EqualIntersection(),
+            hg.fusion.InverseCovarianceIntersection(),
+        )
     }
     best_input = min(np.trace(b) for b in bounds)
     assert trace["CovarianceIntersection"] <= min(trace["EqualIntersection"], best_input) * (1 + 1e-9)
@@ -116,14 +120,14 @@ def test_a_fused_claim_is_never_stronger_than_its_weakest_input():
     bounds = covariances(0, 2, 2)
     mixed = [*estimates(bounds[:1], "nominal"), *estimates(bounds[1:], "exact")]
     assert hg.fusion.fuse(hg.CovarianceIntersection(), mixed).claim == "nominal"
-    assert hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds, "exact")).claim == "upper"
+    assert hg.fusion.fuse(hg.fusion.EqualIntersection(), estimates(bounds, "exact")).claim == "upper"
     assert hg.fusion.fuse(hg.fusion.InverseCovarianceIntersection(), estimates(bounds, "exact")).claim == "nominal"
 
 
 def test_leading_axes_are_carried_along():
     bounds = np.stack([covariances(s, 3, 2) for s in range(4)])
-    together = hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))
-    alone = hg.fusion.fuse(hg.EqualIntersection(), estimates(bounds[2]))
+    together = hg.fusion.fuse(hg.fusion.EqualIntersection(), estimates(bounds.swapaxes(0, 1)))
+    alone = hg.fusion.fuse(hg.fusion.EqualIntersection(), estimates(bounds[2]))
     np.testing.assert_allclose(together.covariance[2], alone.covariance, rtol=1e-12)
 
 
@@ -166,7 +170,7 @@ def test_fusion_inside_the_scan_is_fusion_outside():
     fading = hg.hop(hg.Rayleigh(0.8), 0.05)
     rules = {
         "optimal": hg.Fusion("linear", hg.CovarianceIntersection()),
-        "equal": hg.Fusion("cubature", hg.EqualIntersection()),
+        "equal": hg.Fusion("cubature", hg.fusion.EqualIntersection()),
     }
     found = network(fading, lambda n: rules)
     record = hg.monte_carlo(found, 5, 4, 0)
@@ -211,7 +215,7 @@ QUANTIZER = hg.fusion.UniformQuantizer(8, 3.0)
 
 
 def quantized(quantizer):
-    fusion = hg.Fusion("linear", hg.EqualIntersection(), quantizer)
+    fusion = hg.Fusion("linear", hg.fusion.EqualIntersection(), quantizer)
     return network(hg.perfect(), lambda n: {"x": fusion})
 
 
@@ -220,7 +224,7 @@ def test_a_claim_through_a_quantizer():
     following = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3)
     assert quantized(following).claims()["fused"]["x"] == "nominal"
     assert quantized({name: following for name in ROWS}).claims()["fused"]["x"] == "nominal"
-    varying = hg.over_time([QUANTIZER, hg.fusion.UniformQuantizer(16, 3.0)])
+    varying = hg.model.over_time([QUANTIZER, hg.fusion.UniformQuantizer(16, 3.0)])
     assert quantized(varying).claims()["fused"]["x"] == "upper"
 
 
@@ -235,13 +239,13 @@ def test_a_claim_through_a_quantizer():
         ),
         (
             lambda: hg.fusion.fuse(
-                hg.EqualIntersection(), [*estimates(covariances(0, 1, 2)), *estimates(covariances(0, 1, 3))]
+                hg.fusion.EqualIntersection(), [*estimates(covariances(0, 1, 2)), *estimates(covariances(0, 1, 3))]
             ),
             "one state dimension",
         ),
-        (lambda: hg.fusion.fuse(hg.EqualIntersection(), []), "one state dimension, got"),
+        (lambda: hg.fusion.fuse(hg.fusion.EqualIntersection(), []), "one state dimension, got"),
         (
-            lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("missing", hg.EqualIntersection())}),
+            lambda: network(hg.perfect(), lambda n: {"x": hg.Fusion("missing", hg.fusion.EqualIntersection())}),
             r"a filter that some node has \['cubature', 'linear'\], got 'missing'",
         ),
         (

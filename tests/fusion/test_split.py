@@ -15,7 +15,7 @@ def parts(seed, nodes=3, n=2):
 
 def estimates(known, unknown):
     blocks = np.einsum("iaib->iab", known) + unknown
-    return [hg.Estimate(np.zeros(blocks.shape[1]), block, "exact") for block in blocks]
+    return [hg.model.Estimate(np.zeros(blocks.shape[1]), block, "exact") for block in blocks]
 
 
 def gain(rule, given):
@@ -24,7 +24,8 @@ def gain(rule, given):
     found = np.zeros((n, nodes, n))
     for i in range(nodes):
         unit = [
-            hg.Estimate(np.eye(n) * (j == i), np.tile(e.covariance, (n, 1, 1)), e.claim) for j, e in enumerate(given)
+            hg.model.Estimate(np.eye(n) * (j == i), np.tile(e.covariance, (n, 1, 1)), e.claim)
+            for j, e in enumerate(given)
         ]
         found[:, i] = hg.fusion.fuse(rule, unit).mean.T
     return found

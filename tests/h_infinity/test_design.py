@@ -143,7 +143,7 @@ def test_what_varies_over_time_and_what_does_not():
         hg.model.OverTime(np.broadcast_to(paper.B, (16, 2, 1))),
         [[paper.D[0]]],
         paper.M,
-        hg.over_time([channel()] * 16),
+        hg.model.over_time([channel()] * 16),
         hg.model.OverTime(constant),
         paper.b[0],
         initial_weight=paper.W,
@@ -209,7 +209,7 @@ def test_a_missing_solver_names_the_extra(monkeypatch):
 
 def test_links_that_remember_are_refused_with_the_reason():
     link = hg.gilbert_elliott(hg.hop(1.0, 0.04), hg.hop(0.2, 0.04), 0.1, 0.2)
-    for links in (link, hg.over_time([link] * 5)):
+    for links in (link, hg.model.over_time([link] * 5)):
         with pytest.raises(
             ValueError, match=r"^channel of an H-infinity design: expected links that forget: its level"
         ):

@@ -74,4 +74,4 @@ def test_bad_input_is_one_line():
     with pytest.raises(
         ValueError, match="boundedness: expected a LinearSensor that does not vary, got one that varies"
     ):
-        hg.linear.critical_arrival(plant([[1.2]]), hg.over_time([sensor([[1.0]])]))
+        hg.linear.critical_arrival(plant([[1.2]]), hg.model.over_time([sensor([[1.0]])]))

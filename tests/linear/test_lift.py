@@ -109,7 +109,7 @@ def test_without_coupling_the_bias_does_not_matter():
     ]
     sensor = hg.LinearSensor(EXAMPLE.C, s.sensor.noise)
     by_itself = hg.linear.lmmse(
-        hg.linear.lifted_system(hg.over_time(plants), sensor, s.channel, 2, horizon)
+        hg.linear.lifted_system(hg.model.over_time(plants), sensor, s.channel, 2, horizon)
     ).gains.covariance
     np.testing.assert_allclose(designed(alone, 2)[:, :2, :2], by_itself, rtol=0, atol=1e-14)
 
@@ -174,7 +174,7 @@ def test_a_large_lift_is_refused_with_the_number_and_what_to_do():
     ],
 )
 def test_bad_input_is_named(change, message):
-    plant = hg.over_time([hg.LinearPlant(np.eye(3), 1.0, np.zeros(3), 1.0)] * 5)
+    plant = hg.model.over_time([hg.LinearPlant(np.eye(3), 1.0, np.zeros(3), 1.0)] * 5)
     usual = {"plant": plant, "sensor": hg.LinearSensor(np.ones((1, 3)), 1.0), "channel": hg.perfect(), "degree": 2,
              "horizon": 5}  # fmt: skip
     with pytest.raises(ValueError, match=message):

@@ -11,7 +11,7 @@ from tests.filters.test_modal import PLANT, SENSOR, bursts, variances
 
 Series, Stack, Modes, known = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Modes", "known"))
 GainAndNoise, Constant = hg.random_affine.GainAndNoise, hg.random_affine.Constant
-CHAIN = hg.MarkovChain([[0.8, 0.2], [0.3, 0.7]], [0.6, 0.4])
+CHAIN = hg.random_affine.MarkovChain([[0.8, 0.2], [0.3, 0.7]], [0.6, 0.4])
 LINKS = [hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5]), 0.1), hg.hop(0.3, hg.Gaussian([[0.4]], [0.1]))]
 BACK = [hg.hop(1.0, 0.05), hg.hop(hg.Rayleigh(0.3), 0.2)]
 A, Q, C, R, K = 0.9, 0.3, 1.0, 0.1, 0.4

@@ -36,9 +36,9 @@ def test_equal_rows_are_a_link_that_forgets():
 def test_a_chain_that_varies_moves_at_its_steps():
     """A chain that leaves its first mode at a known step, against the gains as they are then."""
     stay, leave = np.eye(2), np.array([[0.0, 1.0], [0.0, 1.0]])
-    chains = [hg.MarkovChain(leave if k == 2 else stay, [1.0, 0.0], "c") for k in range(6)]
-    moving = hg.over_time([bursts(chain) for chain in chains])
-    known = hg.over_time([hg.hop(0.2 if k < 3 else 1.0, 0.05) for k in range(6)])
+    chains = [hg.random_affine.MarkovChain(leave if k == 2 else stay, [1.0, 0.0], "c") for k in range(6)]
+    moving = hg.model.over_time([bursts(chain) for chain in chains])
+    known = hg.model.over_time([hg.hop(0.2 if k < 3 else 1.0, 0.05) for k in range(6)])
     np.testing.assert_allclose(errors(moving, 2, 6), errors(known, 2, 6), rtol=1e-9)
 
 
@@ -52,5 +52,5 @@ def test_its_claim_holds_in_simulation():
 
 
 def test_a_rough_chain_is_nominal():
-    rough = bursts(hg.MarkovChain(BURSTS, radius=0.01))
+    rough = bursts(hg.random_affine.MarkovChain(BURSTS, radius=0.01))
     assert hg.polynomial_filter(PLANT, SENSOR, rough, 3, 2).claim == "nominal"

@@ -96,7 +96,7 @@ def test_what_is_no_event_is_told_in_one_line_and_changes_nothing(network):
 
 
 def test_in_steps_times_are_steps():
-    plant = hg.over_time([hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0) for _ in range(4)])
+    plant = hg.model.over_time([hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0) for _ in range(4)])
     node = hg.Node(SENSOR, LINK, {"f": hg.linear_filter(plant, SENSOR, LINK)})
     timeline = hg.Timeline(hg.Network(plant, {"a": node}), 5.0)
     for time in (0.5, -1.0, 4.0):
@@ -121,7 +121,7 @@ def test_a_plant_whose_intervals_cannot_be_cut_is_told(plant, what):
 def test_continuous_time_refuses_what_goes_by_steps():
     bursts = hg.gilbert_elliott(hg.hop(1.0, 0.05), hg.hop(0.3, 0.05), 0.1, 0.3)
     plant = drifting()
-    remembering = hg.Network(plant, {"a": hg.Node(SENSOR, bursts, {"f": hg.open_loop_filter(plant)})})
+    remembering = hg.Network(plant, {"a": hg.Node(SENSOR, bursts, {"f": hg.filters.open_loop_filter(plant)})})
     with pytest.raises(ValueError, match=r"timeline: expected no part that goes by steps .* that remembers, at node"):
         hg.Timeline(remembering, 5.0)
     with pytest.raises(ValueError, match="node names: expected none called 'inputs'"):

@@ -14,7 +14,7 @@ def test_in_steps_it_is_the_smoother_of_the_rows():
     plant = hg.LinearPlant([[1.0, 1.0], [0.0, 0.95]], np.diag([0.01, 0.05]), [0.0, 1.0], np.eye(2))
     sensor, channel = hg.LinearSensor([[1.0, 0.0]], 0.3), hg.hop(hg.Rayleigh(1.0), 0.05)
     own = {"linear": hg.linear_filter(plant, sensor, channel)}
-    fused = {"equal": hg.Fusion("linear", hg.EqualIntersection())}
+    fused = {"equal": hg.Fusion("linear", hg.fusion.EqualIntersection())}
     nodes = {"a": hg.Node(sensor, channel, own), "b": hg.Node(sensor, channel, own)}
     generator = np.random.default_rng(0)
     z = {name: generator.normal(size=(12, 1)) for name in nodes}

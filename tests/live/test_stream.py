@@ -17,7 +17,7 @@ ROW = hg.LinearSensor([[1.0, 0.0]], 0.5)
 PACKAGES = ("heliograph", "jax", "equinox")
 
 
-class Keeping(hg.AbstractFilter):
+class Keeping(hg.filters.AbstractFilter):
     """Its state is the measurement before, and its mean the sum of that one and the present one."""
 
     claim: Claim = eqx.field(static=True, default="none")
@@ -35,7 +35,7 @@ class Keeping(hg.AbstractFilter):
         return jnp.stack([state[1], z]), hg.model.Innovation(z, jnp.eye(64), 0.0)
 
     def estimate(self, state):
-        return hg.Estimate(state[0] + state[1], jnp.full((64, 64), jnp.nan), self.claim)
+        return hg.model.Estimate(state[0] + state[1], jnp.full((64, 64), jnp.nan), self.claim)
 
 
 REFUSED = [
@@ -74,7 +74,7 @@ def test_what_does_not_fit_changes_nothing(name):
 
 
 def test_a_filter_that_hears_nothing_takes_any_measurement():
-    stream = hg.Stream(hg.open_loop_filter(PLANT))
+    stream = hg.Stream(hg.filters.open_loop_filter(PLANT))
     for z in ([1.0], [1.0, 2.0], np.nan):
         stream.push(z, [0.0])
     with pytest.raises(ValueError, match="measurement: expected numbers, got None"):
@@ -82,7 +82,7 @@ def test_a_filter_that_hears_nothing_takes_any_measurement():
 
 
 def test_past_the_end_of_what_varies_it_stops():
-    channels = hg.over_time([hg.hop(1.0, 0.1 * (k + 1), dimension=2) for k in range(3)])
+    channels = hg.model.over_time([hg.hop(1.0, 0.1 * (k + 1), dimension=2) for k in range(3)])
     stream = hg.Stream(hg.linear_filter(PLANT, SENSOR, channels))
     for _ in range(3):
         last = stream.push([1.0, 0.0], [0.0])

@@ -23,14 +23,14 @@ def forgetful() -> hg.Network:
         "linear": hg.linear_filter(*parts),
         "cubature": hg.cubature_filter(*parts),
         "mixture": hg.mixture_filter(*parts),
-        "open_loop": hg.open_loop_filter(PUSHED),
+        "open_loop": hg.filters.open_loop_filter(PUSHED),
     }
     central = hg.filters.sequential_filter([hg.cubature_filter(*parts), hg.cubature_filter(*parts)])
     fused = {
         "central": central,
-        "intersection": hg.Fusion("linear", hg.EqualIntersection()),
+        "intersection": hg.Fusion("linear", hg.fusion.EqualIntersection()),
         "weights": hg.Fusion("linear", hg.fusion.MatrixWeights()),
-        "sent": hg.Fusion("cubature", hg.EqualIntersection(), hg.fusion.EscapeQuantizer(9, 1.0, 0.9, 2.0, 0.1)),
+        "sent": hg.Fusion("cubature", hg.fusion.EqualIntersection(), hg.fusion.EscapeQuantizer(9, 1.0, 0.9, 2.0, 0.1)),
     }
     return hg.Network(PUSHED, {"a": hg.Node(SENSOR, FADING, own), "b": hg.Node(SENSOR, FADING, own)}, fused)
 

@@ -21,12 +21,12 @@ def test_a_number_over_time_is_an_array_at_its_step(k):
     """So that what is read can be stacked again: a NumPy number is no array."""
     read = at(hg.model.OverTime(np.arange(3.0)), k)
     assert isinstance(read, np.ndarray) and read.shape == () and read == 1.0
-    assert np.array_equal(hg.over_time(unstack(hg.over_time([read, read + 1]))).values, [1.0, 2.0])
+    assert np.array_equal(hg.model.over_time(unstack(hg.model.over_time([read, read + 1]))).values, [1.0, 2.0])
 
 
 def test_objects_over_time_come_back_as_given():
     channels = [hg.hop(hg.Rayleigh(s), 0.1) for s in (0.5, 1.0, 2.0)]
-    moved = hg.over_time(channels)
+    moved = hg.model.over_time(channels)
     assert [float(c.law.scale) for c in unstack(moved)] == [0.5, 1.0, 2.0]
     assert float(at(moved, 1).law.scale) == 1.0
 
@@ -39,6 +39,6 @@ def test_objects_of_another_structure_or_shape_do_not_stack(other):
 
 def test_nothing_over_time_is_refused():
     with pytest.raises(ValueError, match="at least one item"):
-        hg.over_time([])
+        hg.model.over_time([])
     with pytest.raises(ValueError, match="leading time axis"):
         hg.model.OverTime(np.float64(3.0))

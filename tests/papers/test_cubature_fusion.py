@@ -143,7 +143,7 @@ def made_up(s, names, fused, steps, runs=64):
         return hg.simulation.ErrorStatistics(deal.sum(0), sums, claimed, np.zeros((batches, steps)), "nominal")
 
     def estimate():
-        return hg.Estimate(rng.normal(size=(1, steps, 5)), np.tile(np.eye(5), (1, steps, 1, 1)), "nominal")
+        return hg.model.Estimate(rng.normal(size=(1, steps, 5)), np.tile(np.eye(5), (1, steps, 1, 1)), "nominal")
 
     by_node = {node: {name: statistics() for name in names} for node in NODES}
     shown = {node: {"cubature_printed_fixed": estimate()} for node in NODES} | {"fused": {"ci_printed": estimate()}}

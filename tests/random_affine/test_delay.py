@@ -8,7 +8,7 @@ import heliograph as hg
 from heliograph.testing import check_random_affine
 
 LAW, LINK = hg.Discrete([0, 2], [0.7, 0.3]), hg.hop(hg.Rayleigh(0.8), 0.1)
-CHAIN = hg.MarkovChain([[0.8, 0.2], [0.4, 0.6]])
+CHAIN = hg.random_affine.MarkovChain([[0.8, 0.2], [0.4, 0.6]])
 delayed = hg.model.delayed
 
 

@@ -18,7 +18,7 @@ NOISY = hg.hop(hg.Rayleigh(0.5), hg.Gaussian([[0.1]], [0.2]))  # another kind of
 
 
 def link(name=None, maps=(GOOD, BAD)):
-    return Modes(hg.MarkovChain(BURSTS, [0.3, 0.7], name), maps)
+    return Modes(hg.random_affine.MarkovChain(BURSTS, [0.3, 0.7], name), maps)
 
 
 def drift(name=None, correlation=0.8):
@@ -47,21 +47,21 @@ def test_the_square_of_a_link():
     check_random_affine(hg.random_affine.square(link()), highest=2)
 
 
-class _Forgets(hg.MarkovChain):
+class _Forgets(hg.random_affine.MarkovChain):
     """A chain that draws its initial law anew at each step: the second draw's law is right, its memory is not."""
 
     def move(self, state, key):
         return self.begin(key)
 
 
-class _Stays(hg.MarkovChain):
+class _Stays(hg.random_affine.MarkovChain):
     def move(self, state, key):
         return state
 
 
 @pytest.mark.parametrize("kind", [_Forgets, _Stays])
 def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
-    right = hg.MarkovChain(BURSTS)
+    right = hg.random_affine.MarkovChain(BURSTS)
     wrong = kind(BURSTS)
     check_random_affine(Modes(right, [GOOD, BAD]))
     with pytest.raises(AssertionError, match=r"^two draws in a row: a moment differs"):
@@ -69,7 +69,7 @@ def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
 
 
 def test_one_object_or_one_name_is_one_memory():
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     own, same = Series([link(), link()]), Series([Modes(chain, [GOOD, BAD]), Modes(chain, [BAD, GOOD])])
     named = Series([link("road"), hg.gilbert_elliott(GOOD, BAD, 0.2, 0.1)])
     assert [len(memories(c)) for c in (own, same, named)] == [2, 1, 2]
@@ -95,8 +95,8 @@ def test_a_map_that_forgets_has_one_mode():
 
 
 def test_a_users_map_needs_no_code_for_modes():
-    class Doubled(hg.AbstractRandomAffine):
-        inside: hg.AbstractRandomAffine
+    class Doubled(hg.random_affine.AbstractRandomAffine):
+        inside: hg.random_affine.AbstractRandomAffine
         outputs = inputs = 1
 
         def sample(self, key):
@@ -139,19 +139,22 @@ def test_two_modes_of_a_drift_are_a_chain():
 
 
 BAD_INPUT = {
-    "rows": (lambda: hg.MarkovChain([[0.5, 0.4], [0, 1]]), "transition from mode 0: expected probabilities"),
-    "shape": (lambda: hg.MarkovChain([[0.5, 0.5]]), "transition matrix: expected a square matrix"),
-    "several stationary laws": (lambda: hg.MarkovChain(np.eye(2)), "initial law: expected one"),
-    "initial law": (lambda: hg.MarkovChain(BURSTS, [0.5, 0.6]), "initial law: expected probabilities"),
-    "name": (lambda: hg.MarkovChain(BURSTS, name=3), "name of a memory: expected a text"),
-    "radius": (lambda: hg.MarkovChain(BURSTS, radius=1.2), "radius of the transition: expected"),
+    "rows": (
+        lambda: hg.random_affine.MarkovChain([[0.5, 0.4], [0, 1]]),
+        "transition from mode 0: expected probabilities",
+    ),
+    "shape": (lambda: hg.random_affine.MarkovChain([[0.5, 0.5]]), "transition matrix: expected a square matrix"),
+    "several stationary laws": (lambda: hg.random_affine.MarkovChain(np.eye(2)), "initial law: expected one"),
+    "initial law": (lambda: hg.random_affine.MarkovChain(BURSTS, [0.5, 0.6]), "initial law: expected probabilities"),
+    "name": (lambda: hg.random_affine.MarkovChain(BURSTS, name=3), "name of a memory: expected a text"),
+    "radius": (lambda: hg.random_affine.MarkovChain(BURSTS, radius=1.2), "radius of the transition: expected"),
     "maps": (lambda: link(maps=(GOOD,)), "maps of the modes: expected 2"),
     "shapes": (lambda: link(maps=(GOOD, hg.hop(1.0, 0.1, dimension=2))), "maps of the modes: expected maps of one"),
     "memory inside": (lambda: link(maps=(GOOD, link())), "map of a mode: expected one that forgets"),
     "gains without noise": (lambda: hg.markov_fading([0.2, 1.0], BURSTS), "noise: expected one"),
     "noise beside channels": (lambda: hg.markov_fading([GOOD, BAD], BURSTS, 0.1), "noise: expected none"),
     "a chain's name": (
-        lambda: hg.markov_fading([GOOD, BAD], hg.MarkovChain(BURSTS), name="x"), "name: expected none"
+        lambda: hg.markov_fading([GOOD, BAD], hg.random_affine.MarkovChain(BURSTS), name="x"), "name: expected none"
     ),
     "fail": (lambda: hg.gilbert_elliott(GOOD, BAD, 1.2, 0.1), "fail: expected a number from 0 to 1"),
     "neither fails nor recovers": (lambda: hg.gilbert_elliott(GOOD, BAD, 0.0, 0.0), "initial law: expected one"),

@@ -75,7 +75,7 @@ import heliograph as hg
 
 plant = hg.LinearPlant(0.9 * np.eye(1), np.eye(1), [0.0], np.eye(1))
 sensor = hg.LinearSensor(np.eye(1), np.eye(1), outputs=["y"])
-node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor), "open": hg.open_loop_filter(plant)})
+node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor), "open": hg.filters.open_loop_filter(plant)})
 network = hg.Network(plant, {"n": node})
 """
 

@@ -232,13 +232,13 @@ def mean_error_of_hidden_modes(fail, recover, arrival, steps=20_000):
 
 
 def test_a_mode_that_is_never_reached_does_not_matter():
-    chain = hg.MarkovChain([[1.0, 0.0], [0.1, 0.9]], initial=[1.0, 0.0])
+    chain = hg.random_affine.MarkovChain([[1.0, 0.0], [0.1, 0.9]], initial=[1.0, 0.0])
     links = hg.markov_fading([hg.perfect(), hg.erasure(hg.perfect(), 0.0)], chain)
     np.testing.assert_allclose(scalar(links).bound, scalar(hg.perfect()).bound, rtol=1e-9)
 
 
 def test_uncertain_transitions_are_refused():
-    chain = hg.MarkovChain([[0.9, 0.1], [0.5, 0.5]], radius=0.01)
+    chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.5, 0.5]], radius=0.01)
     with pytest.raises(ValueError, match="boundedness: expected chains of known transition"):
         scalar(hg.markov_fading([hg.perfect(), hg.erasure(hg.perfect(), 0.0)], chain))
 
@@ -246,6 +246,6 @@ def test_uncertain_transitions_are_refused():
 def test_what_varies_or_filters_is_refused():
     sensor = hg.LinearSensor([[1.0]], 1.0)
     with pytest.raises(ValueError, match="boundedness: expected channels that do not vary"):
-        judged(plant([[0.9]]), (sensor, hg.over_time([hg.perfect()])))
+        judged(plant([[0.9]]), (sensor, hg.model.over_time([hg.perfect()])))
     with pytest.raises(ValueError, match="boundedness: expected a LinearPlant that does not vary, got one that varies"):
-        judged(hg.over_time([plant([[0.9]])]), (sensor, hg.perfect()))
+        judged(hg.model.over_time([plant([[0.9]])]), (sensor, hg.perfect()))

@@ -65,7 +65,7 @@ def records(draw) -> hg.Record:
         names = draw(st.lists(NAMES, min_size=1 if node == nodes[0] else 0, max_size=2, unique=True))
         claims = [draw(st.sampled_from(["exact", "upper", "nominal", "none"])) for _ in names]
         estimates[node] = {
-            name: hg.Estimate(numbers(n), numbers(n, n), claim) for name, claim in zip(names, claims, strict=True)
+            name: hg.model.Estimate(numbers(n), numbers(n, n), claim) for name, claim in zip(names, claims, strict=True)
         }
     uplinks = {
         name: Uplink(tuple(nodes[::-1]), numbers(len(nodes), n) > 0, np.ones((*lead, len(nodes), n), dtype=int))

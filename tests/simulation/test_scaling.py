@@ -17,13 +17,13 @@ def linear_network(channel, **more):
         "kalman": hg.cubature_filter(plant, sensor, channel),
         "linear": hg.linear_filter(plant, sensor, channel),
         "zero_mean": hg.extended_filter(plant, sensor, channel, hg.filters.ZeroMean()),
-        "open": hg.open_loop_filter(plant),
+        "open": hg.filters.open_loop_filter(plant),
         "quadratic": hg.polynomial_filter(plant, sensor, channel, 5, 2),
         "ahead": hg.filters.prediction_of(hg.cubature_filter(plant, sensor, channel)),
     }
     nodes = {name: hg.Node(sensor, channel, filters | more) for name in ("a", "b")}
     fused = {
-        "equal": hg.Fusion("kalman", hg.EqualIntersection()),
+        "equal": hg.Fusion("kalman", hg.fusion.EqualIntersection()),
         "smallest": hg.Fusion("kalman", hg.CovarianceIntersection()),
         "mean": hg.Fusion("linear", hg.fusion.WeightedFusion([0.4, 0.6])),
         "central": hg.filters.sequential_filter([filters["kalman"]] * 2),

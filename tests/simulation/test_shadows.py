@@ -15,14 +15,14 @@ def link(transition=BURSTS, name=None):
 
 def gains(channels, runs=64, horizon=30):
     """What each node hears, (run, time): its gain."""
-    listen = {"silent": hg.open_loop_filter(PLANT)}
+    listen = {"silent": hg.filters.open_loop_filter(PLANT)}
     nodes = {name: hg.Node(SENSOR, channel, listen) for name, channel in channels.items()}
     record = hg.monte_carlo(hg.Network(PLANT, nodes), horizon, runs, 7)
     return {name: record.measurements[name][..., 0] for name in channels}
 
 
 def test_one_chain_is_one_shadow_across_nodes_and_another_is_not():
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     heard = gains({"a": link(chain), "b": link(chain), "c": link(), "d": link(name="road"), "e": link(name="road")})
     np.testing.assert_array_equal(heard["a"], heard["b"])
     np.testing.assert_array_equal(heard["d"], heard["e"])
@@ -45,7 +45,7 @@ def test_a_shared_drift_may_have_another_size_at_each_node():
 
 
 def test_hops_of_one_channel_share_with_another_node():
-    chain = hg.MarkovChain(BURSTS)
+    chain = hg.random_affine.MarkovChain(BURSTS)
     heard = gains({"two hops": hg.amplify_and_forward([link(chain), link(chain)]), "one": link(chain)})
     np.testing.assert_allclose(heard["two hops"], heard["one"] ** 2, rtol=1e-12)
 
@@ -63,6 +63,6 @@ def test_a_chain_that_varies_moves_by_the_step():
     """It switches surely at odd steps and stays at even ones."""
     stay, switch = np.eye(2), np.eye(2)[::-1]
     for name in ("c", None):
-        steps = [hg.MarkovChain(switch if k % 2 else stay, [1.0, 0.0], name) for k in range(6)]
-        heard = gains({"a": hg.over_time([link(chain) for chain in steps])}, runs=2, horizon=6)["a"]
+        steps = [hg.random_affine.MarkovChain(switch if k % 2 else stay, [1.0, 0.0], name) for k in range(6)]
+        heard = gains({"a": hg.model.over_time([link(chain) for chain in steps])}, runs=2, horizon=6)["a"]
         np.testing.assert_array_equal(heard, [[0.2, 0.2, 1.0, 1.0, 0.2, 0.2]] * 2)

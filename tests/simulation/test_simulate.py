@@ -121,7 +121,7 @@ LINKED = hg.Network(
         "static": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
         "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.fusion.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
         "by component": hg.Fusion(
-            "linear", hg.EqualIntersection(), hg.fusion.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
+            "linear", hg.fusion.EqualIntersection(), hg.fusion.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
         ),
     },
 )
@@ -159,7 +159,7 @@ def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
         for i, node in enumerate(NETWORK.nodes):
             p, d = linked.estimates[node][fusion.filter].covariance[run, k], error[k, i]
             s, r = d.sum(), np.sqrt(np.trace(p))
-            local.append(hg.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
+            local.append(hg.model.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
         outside, inside = hg.fusion.fuse(fusion.rule, local), linked.estimates["fused"][name]
         # The same arithmetic in another compilation; searched weights agree to the root of rounding.
         np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
@@ -222,7 +222,7 @@ def test_a_recording_goes_through_the_same_links(linked):
 
 def test_quantizers_over_time_and_the_claim_of_a_static_one():
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
-    each = hg.over_time([hg.fusion.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
+    each = hg.model.over_time([hg.fusion.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
     network = hg.Network(PLANT, LINEAR, {"ci": hg.Fusion("linear", hg.CovarianceIntersection(), each)})
     found = hg.monte_carlo(network, 5, 2000, 3, hg.Statistics(), INPUTS[:5])["fused"]["ci"]
     assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
@@ -232,7 +232,7 @@ def test_quantizers_over_time_and_the_claim_of_a_static_one():
         hg.monte_carlo(network, HORIZON, 2, 3, inputs=INPUTS)
 
 
-class Silent(hg.AbstractFilter):
+class Silent(hg.filters.AbstractFilter):
     """Gives the initial mean and claims nothing."""
 
     claim: str = "none"
@@ -253,7 +253,7 @@ class Silent(hg.AbstractFilter):
         return state, hg.model.Innovation(z, jax.numpy.full((1, 1), jax.numpy.nan), nothing)
 
     def estimate(self, state):
-        return hg.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
+        return hg.model.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
 
 
 def test_a_filter_that_claims_no_covariance_harms_no_other():

@@ -70,7 +70,7 @@ def test_worst_direction_needs_runs():
         statistics(draws(BOUND, runs=2), BOUND).worst_direction()
 
 
-class Breaking(hg.AbstractFilter):
+class Breaking(hg.filters.AbstractFilter):
     """Its covariance is no number where z > 2, from then on."""
 
     claim: str = "exact"
@@ -92,13 +92,13 @@ class Breaking(hg.AbstractFilter):
 
     @hg.filters.in_float64
     def estimate(self, state):
-        return hg.Estimate(jnp.zeros(1), state, self.claim)
+        return hg.model.Estimate(jnp.zeros(1), state, self.claim)
 
 
 def test_runs_that_fail_are_counted_and_no_figure_hides_them():
     plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     network = hg.Network(
-        plant, {"node": hg.Node(sensor, hg.perfect(), {"b": Breaking(), "open": hg.open_loop_filter(plant)})}
+        plant, {"node": hg.Node(sensor, hg.perfect(), {"b": Breaking(), "open": hg.filters.open_loop_filter(plant)})}
     )
     record = hg.monte_carlo(network, 6, 100, 0)
     found = hg.monte_carlo(network, 6, 100, 0, keep=hg.Statistics())

@@ -48,7 +48,7 @@ def test_losses_come_in_bursts_where_the_link_remembers():
 
 
 def test_channels_that_vary_are_read_at_the_step():
-    channel = hg.over_time([hg.hop(float(g), 0.0) for g in range(1, 4)])
+    channel = hg.model.over_time([hg.hop(float(g), 0.0) for g in range(1, 4)])
     np.testing.assert_array_equal(hg.transmit([1.0, 1.0, 1.0], channel)[:, 0], [1, 2, 3])
     with pytest.raises(ValueError, match="at most 3 steps"):
         hg.transmit(np.ones(4), channel)

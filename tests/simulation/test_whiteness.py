@@ -23,7 +23,7 @@ def heard():
 def test_memory_is_found_where_a_filter_assumes_none(heard):
     """Lag 1 is .30 and lag 2 .20; within four standard errors."""
     z, filters = heard
-    found = hg.memory_test(z, filters["memoryless"])
+    found = hg.simulation.memory_test(z, filters["memoryless"])
     assert found.found and found.p_value < 1e-6
     assert np.all(np.abs(found.correlation[:2] - [0.30, 0.20]) < 4 * found.standard_error[:2])
     assert 0.05 < found.predictable < 0.2
@@ -31,7 +31,7 @@ def test_memory_is_found_where_a_filter_assumes_none(heard):
 
 def test_the_exact_filter_leaves_nothing_behind(heard):
     z, filters = heard
-    found = hg.memory_test(z, filters["exact"])
+    found = hg.simulation.memory_test(z, filters["exact"])
     assert not found.found and found.predictable < 0.02
     assert abs(found.power - 1) < 4 * found.power_error
 
@@ -40,10 +40,10 @@ def test_innovations_alone_and_gaps():
     generator = np.random.default_rng(0)
     white = generator.normal(size=(5000, 2)) * [1.0, 30.0]
     white[generator.random(5000) < 0.2] = np.nan
-    assert not hg.memory_test(white).found and np.isnan(hg.memory_test(white).power)
+    assert not hg.simulation.memory_test(white).found and np.isnan(hg.simulation.memory_test(white).power)
     moved = white[1:] + 0.4 * white[:-1]  # a moving average: lag 1 is .4 / 1.16
-    assert hg.memory_test(moved).correlation[0] == pytest.approx(0.4 / 1.16, abs=0.05)
-    assert hg.memory_test(moved[:, 0]).found
+    assert hg.simulation.memory_test(moved).correlation[0] == pytest.approx(0.4 / 1.16, abs=0.05)
+    assert hg.simulation.memory_test(moved[:, 0]).found
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -51,12 +51,12 @@ def test_loud_bursts_alone_are_no_memory(seed):
     """Variance that comes in bursts widens the standard error, and finds nothing."""
     generator = np.random.default_rng(seed)
     loud = np.repeat(generator.choice([0.2, 3.0], 500), 20)
-    found = hg.memory_test(loud * generator.normal(size=10_000))
+    found = hg.simulation.memory_test(loud * generator.normal(size=10_000))
     assert found.p_value > 0.001 and found.standard_error[0] > 1 / np.sqrt(10_000)
 
 
 def test_bad_input():
     with pytest.raises(ValueError, match=r"^data: expected at least 100 steps for 10 lags, got 50"):
-        hg.memory_test(np.zeros(50))
+        hg.simulation.memory_test(np.zeros(50))
     with pytest.raises(ValueError, match=r"^measurements"):
-        hg.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))
+        hg.simulation.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))

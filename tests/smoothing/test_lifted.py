@@ -27,7 +27,7 @@ def test_behind_a_link_that_remembers_it_is_the_best_linear_estimate():
     a, q, mean, p0 = np.array([[0.9, 0.2], [0.0, 0.7]]), np.diag([0.3, 0.0]), np.array([1.0, -0.5]), np.diag([0.5, 0.2])
     plant, sensor = hg.LinearPlant(a, q, mean, p0), hg.LinearSensor([[1.0, 0.5]], 0.1)
     gains, chain, start = np.array([0.2, 1.1]), np.array([[0.8, 0.2], [0.3, 0.7]]), np.array([0.4, 0.6])
-    link = hg.markov_fading(gains, hg.MarkovChain(chain, start), 0.2)
+    link = hg.markov_fading(gains, hg.random_affine.MarkovChain(chain, start), 0.2)
     time, one, empty = 5, np.eye(1), np.zeros(1)
 
     def given(modes):

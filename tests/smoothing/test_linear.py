@@ -33,7 +33,7 @@ def problem(seed):
         steps.append(Step(a, np.zeros(N), q, c, np.zeros(M), r, gains, chances, np.zeros(M), n))
     z = rng.normal(size=(TIME, M))
     z[rng.random((TIME, M)) < 0.3] = np.nan
-    item = hg.linear_filter(hg.over_time(plants), hg.over_time(sensors), hg.over_time(channels))
+    item = hg.linear_filter(hg.model.over_time(plants), hg.model.over_time(sensors), hg.model.over_time(channels))
     return item, stacked(mean, covariance, steps), z
 
 
@@ -66,4 +66,4 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
         np.testing.assert_allclose(planned.estimate.covariance, known.covariance, atol=CLOSE, rtol=0)
         assert planned.estimate.claim == "exact"
     with pytest.raises(ValueError, match=r"filter: expected one whose gains depend on no data, got OpenLoop"):
-        hg.smoothing.planned_smoother(hg.open_loop_filter(PLANT), 3, hg.smoothing.FixedInterval())
+        hg.smoothing.planned_smoother(hg.filters.open_loop_filter(PLANT), 3, hg.smoothing.FixedInterval())

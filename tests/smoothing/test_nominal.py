@@ -26,7 +26,7 @@ def test_a_central_filter_without_random_gains_smooths_as_one_that_hears_all_at_
 
 @pytest.mark.parametrize("kind", ["uncertain chain", "multiple models"])
 def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(kind):
-    road = hg.MarkovChain([[0.95, 0.05], [0.1, 0.9]], radius=0.02 if kind == "uncertain chain" else 0.0)
+    road = hg.random_affine.MarkovChain([[0.95, 0.05], [0.1, 0.9]], radius=0.02 if kind == "uncertain chain" else 0.0)
     link = hg.markov_fading([1.0, 0.3], road, 0.05)
     make = hg.linear_filter if kind == "uncertain chain" else hg.filters.imm_filter
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, link, {"one": make(PLANT, SENSOR, link)})})

@@ -1,6 +1,7 @@
 """Public names of the room; the package loads them when first used."""
 
 from .base import (
+    AbstractFilter as AbstractFilter,
     corrects as corrects,
     in_float64 as in_float64,
     predicts as predicts,
@@ -26,6 +27,7 @@ from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
 from .linear import (
+    open_loop_filter as open_loop_filter,
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )

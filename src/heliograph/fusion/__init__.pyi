@@ -26,6 +26,7 @@ from .report_link import (
     ReportLink as ReportLink,
 )
 from .rules import (
+    EqualIntersection as EqualIntersection,
     AbstractFusion as AbstractFusion,
     FixedIntersection as FixedIntersection,
     InverseCovarianceIntersection as InverseCovarianceIntersection,

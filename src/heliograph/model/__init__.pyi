@@ -11,6 +11,7 @@ from .clock import (
     with_clocks as with_clocks,
 )
 from .estimate import (
+    Estimate as Estimate,
     Innovation as Innovation,
 )
 from .fading import (
@@ -19,6 +20,7 @@ from .fading import (
     without_memory as without_memory,
 )
 from .over_time import (
+    over_time as over_time,
     OverTime as OverTime,
 )
 from .past import (

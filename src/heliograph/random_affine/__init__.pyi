@@ -5,6 +5,7 @@ from .atoms import (
     known as known,
 )
 from .chain import (
+    MarkovChain as MarkovChain,
     Autoregression as Autoregression,
 )
 from .combine import (
@@ -37,4 +38,7 @@ from .noise import (
 )
 from .second_moments import (
     second_order as second_order,
+)
+from .base import (
+    AbstractRandomAffine as AbstractRandomAffine,
 )

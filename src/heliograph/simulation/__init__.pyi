@@ -42,6 +42,7 @@ from .sums import (
     error_statistics as error_statistics,
 )
 from .whiteness import (
+    memory_test as memory_test,
     MemoryTest as MemoryTest,
     whitened_innovations as whitened_innovations,
 )

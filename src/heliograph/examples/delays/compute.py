@@ -67,9 +67,9 @@ def compute(seed: int, advance: Callable[[str], None]) -> Outcome:
     return Outcome(_before(delays), clocks | {"no_true_clock": alone})
 
 
-def late_filters() -> dict[str, dict[str, hg.AbstractFilter]]:
+def late_filters() -> dict[str, dict[str, hg.filters.AbstractFilter]]:
     """What listens behind each link."""
-    own: dict[str, dict[str, hg.AbstractFilter]] = {
+    own: dict[str, dict[str, hg.filters.AbstractFilter]] = {
         name: {name: hg.linear_filter(PLANT, SENSOR, link)} for name, link in LINKS.items()
     }
     own["untold"]["as_current"] = hg.filters.as_current_filter(PLANT, SENSOR, LINKS["untold"])
@@ -100,7 +100,7 @@ def _before(simulated: Mapping[str, Score]) -> dict[str, Score]:
 def _clocks(
     plant: hg.LinearPlant,
     sensors: Mapping[str, hg.model.AbstractSensor],
-    filters: Mapping[str, hg.AbstractFilter],
+    filters: Mapping[str, hg.filters.AbstractFilter],
     seed: int,
 ) -> dict[str, dict[str, Score]]:
     """Of each filter: position, present offset and drift."""
@@ -113,7 +113,7 @@ def _clocks(
     }
 
 
-def _score(errors: np.ndarray, estimate: hg.Estimate, state: int, begin: int) -> Score:
+def _score(errors: np.ndarray, estimate: hg.model.Estimate, state: int, begin: int) -> Score:
     squares = errors**2
     claimed = np.broadcast_to(np.asarray(estimate.covariance)[..., state, state], squares.shape)
     by_run = squares[:, begin:].mean(axis=1)
@@ -129,7 +129,7 @@ def trap() -> float:
     plant = hg.LinearPlant(moved, noise, [*PLANT.initial_mean, *np.zeros(4)], spread)
     sensor = hg.LinearSensor(np.kron(np.eye(3), SENSOR.matrix), 0.3 * np.eye(3))
     choice = hg.random_affine.Mixture([hg.random_affine.known(np.eye(1, 3, d)) for d in range(3)], [0.4, 0.35, 0.25])
-    item: hg.AbstractFilter = hg.linear_filter(plant, sensor, hg.amplify_and_forward([choice, LINK]))
+    item: hg.filters.AbstractFilter = hg.linear_filter(plant, sensor, hg.amplify_and_forward([choice, LINK]))
     state = item.init()
     for k in range(STEPS):
         state = item.correct(item.predict(state, k=k), [0.0], k)[0]

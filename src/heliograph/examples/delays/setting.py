@@ -12,7 +12,7 @@ NOISE = 0.05 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])
 PLANT = hg.LinearPlant([[1.0, 1.0], [0.0, 0.95]], NOISE, [1.0, 0.5], np.diag([1.0, 0.2]))
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3)
 LINK = hg.hop(1.0, 0.05)
-LINKS: Mapping[str, hg.AbstractRandomAffine] = {
+LINKS: Mapping[str, hg.random_affine.AbstractRandomAffine] = {
     "untold": hg.model.delayed(LINK, LAW),
     "told": hg.model.delayed(LINK, LAW, told=True),
     "constant": hg.model.delayed(LINK, 1),
@@ -36,7 +36,9 @@ def moving(
     return larger, dict(sensors)
 
 
-def listeners(plant: hg.LinearPlant, sensors: Mapping[str, hg.model.AbstractSensor]) -> dict[str, hg.AbstractFilter]:
+def listeners(
+    plant: hg.LinearPlant, sensors: Mapping[str, hg.model.AbstractSensor]
+) -> dict[str, hg.filters.AbstractFilter]:
     """Filters that hear both nodes, and two that hear the wrong clock alone."""
     joint, both = hg.model.joint_sensor(sensors), hg.parallel([hg.perfect(), hg.perfect()])
     alone = hg.parallel([hg.model.silent(1, 1, 1.0), hg.perfect()])

@@ -83,7 +83,7 @@ def network_of(drive: Drive) -> hg.Network:
     filters = {
         "relay_aware": hg.cubature_filter(plant, sensor, channel),
         "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
-        "open_loop": hg.open_loop_filter(plant),
+        "open_loop": hg.filters.open_loop_filter(plant),
     }
     return hg.Network(plant, {"robot": hg.Node(sensor, channel, filters)})
 

@@ -71,7 +71,7 @@ def described(name: str) -> tuple[hg.LinearPlant, list[Part]]:
     return moving_point(), [(unit[[0, 2]], 0.3, 0.8, 0.1, 0.2)] * 4
 
 
-def heard(part: Part) -> tuple[hg.LinearSensor, hg.AbstractRandomAffine]:
+def heard(part: Part) -> tuple[hg.LinearSensor, hg.random_affine.AbstractRandomAffine]:
     """Sensor and channel of a node; only mean and variance of the gain matter."""
     matrix, noise, mean, variance, hop_noise = part
     gain = hg.Discrete([mean - np.sqrt(variance), mean + np.sqrt(variance)], [0.5, 0.5])
@@ -219,7 +219,7 @@ def _since(begin: tuple[float, float]) -> tuple[float, float]:
 
 def strong(seed: int) -> tuple[dict[str, float], dict[str, float]]:
     """An induction machine behind strong relays: root mean squared error of each rule, and what it claims."""
-    rules = {"ci_equal": hg.EqualIntersection(), "matrix": RULES["matrix"], "all_reports": RULES["all_reports"]}
+    rules = {"ci_equal": hg.fusion.EqualIntersection(), "matrix": RULES["matrix"], "all_reports": RULES["all_reports"]}
     net = machine.network(OWN, {name: hg.Fusion(OWN, rule) for name, rule in rules.items()})
     found = hg.monte_carlo(net, machine.HORIZON, STRONG_RUNS, seed, hg.Statistics())["fused"]
     claimed = {name: np.trace(item.claimed(), axis1=1, axis2=2).mean() for name, item in found.items()}
@@ -233,7 +233,7 @@ def traffic(seed: int) -> dict[str, list[dict[str, float]]]:
     """Three rooms whose nodes report every d-th step, or on event: reports per step and node, error, and claim."""
     plant, parts = described("three_rooms")
     every = {f"every {d}": hg.fusion.ReportLink(every=d) for d in INTERVALS}
-    fused: dict[str, hg.Fusion | hg.AbstractFilter] = {
+    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
         name: hg.Fusion(OWN, hg.fusion.AllReports(), uplink=link) for name, link in every.items()
     }
     for told in (True, False):

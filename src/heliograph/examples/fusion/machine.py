@@ -41,7 +41,7 @@ def sensor(node: int) -> hg.LinearSensor:
     return hg.LinearSensor([[p, 0, q, 0, 0], [0, p, 0, q, 0]], NOISE * np.eye(2))
 
 
-def channel() -> hg.AbstractRandomAffine:
+def channel() -> hg.random_affine.AbstractRandomAffine:
     """Two hops whose probabilities are known to 0.02."""
     first = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
     second = hg.Discrete([0.8, 0.9, 1.0], [0.2, 0.3, 0.5], 0.02)
@@ -55,7 +55,7 @@ def cubature(node: int) -> GaussianFilter:
     return hg.cubature_filter(plant(), sensor(node), channel(), hg.filters.ZeroMean(), *start)
 
 
-def network(own: str, fused: dict[str, hg.Fusion | hg.AbstractFilter]) -> hg.Network:
+def network(own: str, fused: dict[str, hg.Fusion | hg.filters.AbstractFilter]) -> hg.Network:
     """Four nodes with one filter each, the given fusions of it, and the filter "central" that hears all nodes."""
     filters = [cubature(i) for i in range(len(OUTPUTS))]
     nodes = {f"node {i + 1}": hg.Node(sensor(i), channel(), {own: item}) for i, item in enumerate(filters)}

@@ -56,7 +56,7 @@ class Outcome:
     memory: hg.simulation.MemoryTest
 
 
-Place = tuple[hg.AbstractRandomAffine, Mapping[str, hg.AbstractFilter]]
+Place = tuple[hg.random_affine.AbstractRandomAffine, Mapping[str, hg.filters.AbstractFilter]]
 
 
 def compute(seed: int, advance: Callable[[str], None]) -> Outcome:
@@ -76,7 +76,11 @@ def compute(seed: int, advance: Callable[[str], None]) -> Outcome:
 
 
 def _scores(
-    which: str, plant: hg.LinearPlant, sensor: hg.LinearSensor, channel: hg.AbstractRandomAffine, seed: int
+    which: str,
+    plant: hg.LinearPlant,
+    sensor: hg.LinearSensor,
+    channel: hg.random_affine.AbstractRandomAffine,
+    seed: int,
 ) -> dict[str, Score]:
     """Every filter of one example."""
     own = (plant, sensor, channel)
@@ -144,7 +148,7 @@ def _told(seed: int) -> dict[str, Score]:
     return _simulated(PLANT, SENSOR, places, horizon, begin, RUNS["e1"] // 4, seed)
 
 
-def _memoryless_truth(channel: hg.AbstractRandomAffine) -> hg.filters.TrueError:
+def _memoryless_truth(channel: hg.random_affine.AbstractRandomAffine) -> hg.filters.TrueError:
     item = hg.filters.memoryless_filter(PLANT, SENSOR, channel)
     return hg.filters.true_error(item, PLANT, SENSOR, channel, LONG)
 
@@ -168,4 +172,4 @@ def _found(seed: int) -> hg.simulation.MemoryTest:
     """What one recording of 10,000 steps tells the filter without memory."""
     item = hg.filters.memoryless_filter(PLANT, SENSOR, bursts())
     record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, bursts(), {"it": item})}), 10_000, 1, seed)
-    return hg.memory_test(record.measurements["node"][0], item)
+    return hg.simulation.memory_test(record.measurements["node"][0], item)

@@ -18,7 +18,7 @@ HOP_VARIANCE = 0.05**2  # A^2, at the relay and at the receiver
 STEADY = hg.Discrete([0.8, 0.9, 1.0], [0.2, 0.3, 0.5], 0.02)
 FADING = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
 DEEP_FADING = hg.Discrete([0.4, 0.7, 1.0], [0.2, 0.3, 0.5], 0.02)
-CHANNELS: dict[str, hg.AbstractRandomAffine] = {
+CHANNELS: dict[str, hg.random_affine.AbstractRandomAffine] = {
     "relay_1": hg.amplify_and_forward(
         [hg.hop(FADING, HOP_VARIANCE, dimension=2), hg.hop(STEADY, HOP_VARIANCE, dimension=2)]
     ),
@@ -39,14 +39,14 @@ def network(plant: hg.Plant) -> hg.Network:
     sensor = currents(len(plant.states))
     nodes = {}
     for name, channel in CHANNELS.items():
-        filters: dict[str, hg.AbstractFilter] = {
+        filters: dict[str, hg.filters.AbstractFilter] = {
             "zero_mean": hg.cubature_filter(plant, sensor, channel, hg.filters.ZeroMean()),
             "polytope": hg.cubature_filter(plant, sensor, channel, hg.filters.Polytope()),
             "mean_gain": hg.mean_gain_filter(plant, sensor, channel),
         }
-        wired = {"perfect": hg.cubature_filter(plant, sensor, channel), "open_loop": hg.open_loop_filter(plant)}
+        wired = {"perfect": hg.cubature_filter(plant, sensor, channel), "open_loop": hg.filters.open_loop_filter(plant)}
         nodes[name] = hg.Node(sensor, channel, wired if name == "wired" else filters)
-    optimal, equal = hg.CovarianceIntersection(), hg.EqualIntersection()
+    optimal, equal = hg.CovarianceIntersection(), hg.fusion.EqualIntersection()
     fusions = {name: hg.Fusion(name, optimal) for name in ("zero_mean", "polytope")}
     return hg.Network(plant, nodes, fusions | {"equal_weights": hg.Fusion("zero_mean", equal)})
 
@@ -62,7 +62,7 @@ def received(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
 
 @compiled
 def _send(
-    sensor: hg.LinearSensor, channel: hg.AbstractRandomAffine, truth: np.ndarray, seed: int, place: int
+    sensor: hg.LinearSensor, channel: hg.random_affine.AbstractRandomAffine, truth: np.ndarray, seed: int, place: int
 ) -> jax.Array:
     key = jax.random.key(seed)
 

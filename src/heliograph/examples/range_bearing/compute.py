@@ -61,7 +61,7 @@ class Outcome:
     tails: dict[str, Tails]
 
 
-def nees_of(errors: np.ndarray, estimate: hg.Estimate) -> np.ndarray:
+def nees_of(errors: np.ndarray, estimate: hg.model.Estimate) -> np.ndarray:
     """e' B^-1 e / n, (run, time)."""
     weighed = np.linalg.solve(np.asarray(estimate.covariance), errors[..., None])[..., 0]
     result: np.ndarray = np.sum(errors * weighed, axis=-1) / errors.shape[-1]

@@ -9,7 +9,7 @@ import heliograph as hg
 SPEED, TURN = 1.0, 0.02  # m and rad a step
 STEPS = 40
 BEARING = 0.02  # rad, standard deviation
-CHAIN = hg.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
+CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 QUIET = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
 NOISY = hg.parallel([hg.hop(1.0, 4.0), hg.hop(1.0, 1e-2)])
 LINK = hg.random_affine.Modes(CHAIN, [QUIET, NOISY])
@@ -45,15 +45,18 @@ def passing(side: float, circular: bool = True) -> hg.Network:
     sensor = hg.Sensor(look, np.diag([0.5**2, BEARING**2]), outputs=("range", "bearing"), circular=angles)
     direct = hg.cubature_filter(plant, sensor, QUIET)
     noisy = hg.cubature_filter(plant, sensor, LINK)
-    quiet: dict[str, hg.AbstractFilter] = {"cubature": direct, "extended": hg.extended_filter(plant, sensor, QUIET)}
-    bursts: dict[str, hg.AbstractFilter] = {
+    quiet: dict[str, hg.filters.AbstractFilter] = {
+        "cubature": direct,
+        "extended": hg.extended_filter(plant, sensor, QUIET),
+    }
+    bursts: dict[str, hg.filters.AbstractFilter] = {
         "cubature": noisy,
         "imm": hg.filters.imm_filter(plant, sensor, LINK),
         "gpb1": hg.filters.gpb1_filter(plant, sensor, LINK),
         "gpb2": hg.filters.gpb2_filter(plant, sensor, LINK),
         "particle": hg.filters.particle_filter(plant, sensor, LINK, particles=50),
     }
-    fused: dict[str, hg.Fusion | hg.AbstractFilter] = {
+    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
         "intersection": hg.Fusion("cubature", hg.CovarianceIntersection()),
         "central": hg.filters.sequential_filter([direct, noisy]),
     }
@@ -82,7 +85,7 @@ def close_by() -> hg.Network:
     relay = hg.amplify_and_forward([hg.hop(FADE, 0.02), hg.hop(FADE, 0.02)])
     channel = hg.parallel([relay, hg.hop(1.0, 1e-4)])
     rules = {"second_order": 2, "four_points": 3, "seven_points": 6}  # degree; but for 2 one point more a direction
-    filters: dict[str, hg.AbstractFilter] = {
+    filters: dict[str, hg.filters.AbstractFilter] = {
         "extended": hg.extended_filter(plant, sensor, channel),
         "cubature": hg.cubature_filter(plant, sensor, channel),
     }

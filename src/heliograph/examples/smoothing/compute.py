@@ -101,7 +101,7 @@ def first_run(record: hg.Record) -> hg.Record:
 
     def one(part: hg.Record) -> hg.Record:
         estimates = {
-            node: {name: hg.Estimate(e.mean[0], e.covariance[0], e.claim) for name, e in filters.items()}
+            node: {name: hg.model.Estimate(e.mean[0], e.covariance[0], e.claim) for name, e in filters.items()}
             for node, filters in part.estimates.items()
         }
         heard = {node: z[0] for node, z in part.measurements.items()}

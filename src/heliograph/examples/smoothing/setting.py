@@ -12,7 +12,7 @@ PENDULUM_STEP = 0.05  # s
 SWINGS = {"tame": ((0.4, 0.0), 0.05), "large": ((2.8, 0.0), 0.3)}  # mean angle and speed at the start, variance of both
 
 
-def moving_point() -> tuple[hg.LinearPlant, hg.LinearSensor, hg.AbstractRandomAffine]:
+def moving_point() -> tuple[hg.LinearPlant, hg.LinearSensor, hg.random_affine.AbstractRandomAffine]:
     """Places and speeds in two directions, both places sent with one gain over two Rayleigh hops."""
     direction = np.array([[1.0, 1.0], [0.0, 1.0]])
     noise = 1e-3 * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]])

@@ -82,7 +82,7 @@ class Reproduction:
 def network(s: Setting) -> hg.Network:
     """Four nodes with all filters, and what is made of them together."""
     optimal = hg.CovarianceIntersection()
-    fused: dict[str, hg.Fusion | hg.AbstractFilter] = {
+    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
         "ci_printed": hg.Fusion("cubature_printed_fixed", optimal),
         "ci_open_loop": hg.Fusion("open_loop", optimal),
         "central_polytope": central(s, hg.filters.Polytope()),
@@ -106,28 +106,28 @@ def literal_network(s: Setting) -> hg.Network:
     return _assemble(s, [variants(s, i) for i in range(len(NODES))], {})
 
 
-def zero_mean_fusion(s: Setting) -> dict[str, hg.Fusion | hg.AbstractFilter]:
+def zero_mean_fusion(s: Setting) -> dict[str, hg.Fusion | hg.filters.AbstractFilter]:
     """What is made of the zero-mean filter's estimates, and the central filter with its update."""
     return {
         "ci_optimal": hg.Fusion("cubature_zero_mean", hg.CovarianceIntersection()),
-        "ci_equal": hg.Fusion("cubature_zero_mean", hg.EqualIntersection()),
+        "ci_equal": hg.Fusion("cubature_zero_mean", hg.fusion.EqualIntersection()),
         "central": central(s, hg.filters.ZeroMean()),
     }
 
 
-def central(s: Setting, update: AbstractUpdate) -> hg.AbstractFilter:
+def central(s: Setting, update: AbstractUpdate) -> hg.filters.AbstractFilter:
     """All nodes' measurements in turn, each used as that node's filter would."""
     return hg.filters.sequential_filter([cubature(s, i, update) for i in range(len(NODES))])
 
 
-def _only(s: Setting, name: str) -> list[dict[str, hg.AbstractFilter]]:
+def _only(s: Setting, name: str) -> list[dict[str, hg.filters.AbstractFilter]]:
     return [{name: filters(s, i)[name]} for i in range(len(NODES))]
 
 
 def _assemble(
     s: Setting,
-    parts: list[dict[str, hg.AbstractFilter]],
-    fused: Mapping[str, hg.Fusion | hg.AbstractFilter],
+    parts: list[dict[str, hg.filters.AbstractFilter]],
+    fused: Mapping[str, hg.Fusion | hg.filters.AbstractFilter],
 ) -> hg.Network:
     nodes = {name: hg.Node(sensor(s, i), channel(s), parts[i]) for i, name in enumerate(NODES)}
     return hg.Network(plant(s), nodes, fused)

@@ -23,7 +23,7 @@ class LooseInterval(AbstractUpdate):
     def __init__(self, scalars: hg.filters.Scalars | None = None):
         self.scalars = as_array(scalars)
 
-    def describe(self, channel: hg.AbstractRandomAffine) -> SecondOrder:
+    def describe(self, channel: hg.random_affine.AbstractRandomAffine) -> SecondOrder:
         """Worst cases from intervals.
 
         Raises:

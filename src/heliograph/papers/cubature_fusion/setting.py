@@ -120,7 +120,7 @@ def sensor(s: Setting, node: int) -> hg.LinearSensor:
     return hg.LinearSensor([[p, 0, q, 0, 0], [0, p, 0, q, 0]], s.sensor_noise * np.eye(2))
 
 
-def channel(s: Setting) -> hg.AbstractRandomAffine:
+def channel(s: Setting) -> hg.random_affine.AbstractRandomAffine:
     """ybar = alpha sqrt(E^l E^r) xi gamma y + alpha sqrt(E^r) xi m + n, (3) and (5)."""
     return hg.amplify_and_forward(
         [
@@ -139,13 +139,13 @@ def cubature(
     return hg.filters.gaussian_filter(plant(s), sensor(s, node), channel(s), rule, update, *start)
 
 
-def filters(s: Setting, node: int) -> dict[str, hg.AbstractFilter]:
+def filters(s: Setting, node: int) -> dict[str, hg.filters.AbstractFilter]:
     """All filters of one node: scalars optimal at each step, or fixed where the name says so."""
     start = s.guesses[node], s.claimed_initial_variance * np.eye(5)
     parts = plant(s), sensor(s, node), channel(s)
     fixed = hg.filters.Scalars(*s.beta)
     return {
-        "open_loop": hg.open_loop_filter(parts[0], *start),
+        "open_loop": hg.filters.open_loop_filter(parts[0], *start),
         "mean_gain": hg.mean_gain_filter(*parts, *start),
         "extended_polytope": cubature(s, node, hg.filters.Polytope(), hg.filters.Linearization()),
         "cubature_printed": cubature(s, node, LooseInterval()),

@@ -71,13 +71,15 @@ def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     return found
 
 
-def filters(node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
+def filters(
+    node: str, designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]
+) -> dict[str, hg.filters.AbstractFilter]:
     """All filters of a node but the one that is told of losses; each predicts."""
     believed, sensor, system = structured.plant(False), structured.sensor(node), structured.system(node)
-    found: dict[str, hg.AbstractFilter] = {
+    found: dict[str, hg.filters.AbstractFilter] = {
         name: hg.filters.h_infinity_filter(believed, sensor, system, each[node]) for name, each in designs.items()
     }
-    found["open_loop"] = hg.open_loop_filter(believed)
+    found["open_loop"] = hg.filters.open_loop_filter(believed)
     for name, hop in (("ekf_ignoring", structured.lossless), ("ekf_statistics", structured.lossy)):
         found[name] = prediction_of(hg.extended_filter(believed, sensor, structured.channel(hop)))
     return found

@@ -74,11 +74,13 @@ def simulate(designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]], runs: i
     return _run(nodes, runs, seed)
 
 
-def filters(node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]) -> dict[str, hg.AbstractFilter]:
+def filters(
+    node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]
+) -> dict[str, hg.filters.AbstractFilter]:
     """The filters of one node that hear the losses as they are."""
     return {
         **h_infinity_filters(node, designs),
-        "open_loop": hg.open_loop_filter(believed_plant(), *start(node)),
+        "open_loop": hg.filters.open_loop_filter(believed_plant(), *start(node)),
         "ekf_ignoring": prediction_of(extended(node, setting.lossless)),
         "ekf_statistics": prediction_of(extended(node, setting.lossy)),
     }
@@ -86,7 +88,7 @@ def filters(node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]
 
 def h_infinity_filters(
     node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]
-) -> dict[str, hg.AbstractFilter]:
+) -> dict[str, hg.filters.AbstractFilter]:
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
     return {

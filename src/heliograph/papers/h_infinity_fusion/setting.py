@@ -75,30 +75,32 @@ def sensor(node: int, noise: hg.Gaussian | float) -> hg.LinearSensor:
 
 def disturbed_sensor(node: int) -> hg.model.OverTime:
     """y = h_i(x) + D_i v_s, known to nobody."""
-    return hg.over_time([sensor(node, hg.Gaussian(np.zeros((1, 1)), [FEEDTHROUGH[node] * v])) for v in DISTURBANCES])
+    return hg.model.over_time(
+        [sensor(node, hg.Gaussian(np.zeros((1, 1)), [FEEDTHROUGH[node] * v])) for v in DISTURBANCES]
+    )
 
 
 Noise = float | hg.Gaussian
 Constant = float | hg.model.OverTime  # of growth
-Hop = Callable[[int, Noise], hg.AbstractRandomAffine]  # of a link 0, 1, 2 and its noise
+Hop = Callable[[int, Noise], hg.random_affine.AbstractRandomAffine]  # of a link 0, 1, 2 and its noise
 
 
-def lossy(link: int, noise: Noise) -> hg.AbstractRandomAffine:
+def lossy(link: int, noise: Noise) -> hg.random_affine.AbstractRandomAffine:
     """sqrt(E) beta y + noise, as printed."""
     return hg.hop(hg.random_affine.bernoulli(ARRIVAL[link]), noise, power=POWERS[link])
 
 
-def lossless(link: int, noise: Noise) -> hg.AbstractRandomAffine:
+def lossless(link: int, noise: Noise) -> hg.random_affine.AbstractRandomAffine:
     """The same without losses."""
     return hg.hop(1.0, noise, power=POWERS[link])
 
 
-def told(link: int, noise: Noise) -> hg.AbstractRandomAffine:
+def told(link: int, noise: Noise) -> hg.random_affine.AbstractRandomAffine:
     """The same, lost as often, and the receiver is told."""
     return hg.erasure(lossless(link, noise), ARRIVAL[link])
 
 
-def channel(noises: Sequence[Noise], hop: Hop = lossy) -> hg.AbstractRandomAffine:
+def channel(noises: Sequence[Noise], hop: Hop = lossy) -> hg.random_affine.AbstractRandomAffine:
     """(r, y_2): through the relay and directly, (3) to (5)."""
     links = [hop(link, noise) for link, noise in enumerate(noises)]
     return hg.with_direct_link(hg.amplify_and_forward(links[:2]), links[2])
@@ -107,15 +109,15 @@ def channel(noises: Sequence[Noise], hop: Hop = lossy) -> hg.AbstractRandomAffin
 def disturbed_channel(hop: Hop = lossy) -> hg.model.OverTime:
     """With the noises C rho_s of each step, known to nobody."""
     zero, gain = np.zeros((1, 1)), np.array(NOISE_GAIN)
-    return hg.over_time([channel([hg.Gaussian(zero, [n]) for n in gain * rho], hop) for rho in CHANNEL_NOISES])
+    return hg.model.over_time([channel([hg.Gaussian(zero, [n]) for n in gain * rho], hop) for rho in CHANNEL_NOISES])
 
 
-def unit_channel(hop: Hop = lossy) -> hg.AbstractRandomAffine:
+def unit_channel(hop: Hop = lossy) -> hg.random_affine.AbstractRandomAffine:
     """With noises C rho of unit rho: what designs read."""
     return channel([float(c**2) for c in NOISE_GAIN], hop)
 
 
-def white_channel(hop: Hop = lossy) -> hg.AbstractRandomAffine:
+def white_channel(hop: Hop = lossy) -> hg.random_affine.AbstractRandomAffine:
     """With white noises as strong as C rho_s in the mean over the horizon: what Kalman filters believe."""
     powers = np.array(NOISE_GAIN) ** 2 * np.mean(CHANNEL_NOISES**2, axis=0)
     return channel([float(p) for p in powers], hop)

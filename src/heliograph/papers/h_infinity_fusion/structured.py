@@ -62,22 +62,24 @@ def sensor(node: str) -> hg.LinearSensor:
     return hg.LinearSensor(OUTPUTS[node], 0.0)
 
 
-def lossy(link: int) -> hg.AbstractRandomAffine:
+def lossy(link: int) -> hg.random_affine.AbstractRandomAffine:
     """A link that loses without telling."""
     return hg.hop(hg.random_affine.bernoulli(ARRIVAL[link]), NOISE_GAIN[link] ** 2)
 
 
-def lossless(link: int) -> hg.AbstractRandomAffine:
+def lossless(link: int) -> hg.random_affine.AbstractRandomAffine:
     """The link without losses."""
     return hg.hop(1.0, NOISE_GAIN[link] ** 2)
 
 
-def told(link: int) -> hg.AbstractRandomAffine:
+def told(link: int) -> hg.random_affine.AbstractRandomAffine:
     """A link that loses and tells."""
     return hg.erasure(lossless(link), ARRIVAL[link])
 
 
-def channel(hop: Callable[[int], hg.AbstractRandomAffine] = lossy) -> hg.AbstractRandomAffine:
+def channel(
+    hop: Callable[[int], hg.random_affine.AbstractRandomAffine] = lossy,
+) -> hg.random_affine.AbstractRandomAffine:
     """Through a relay and directly."""
     return hg.with_direct_link(hg.amplify_and_forward([hop(0), hop(1)]), hop(2))
 

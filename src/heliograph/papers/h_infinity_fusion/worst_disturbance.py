@@ -62,7 +62,7 @@ class Worst(NamedTuple):
 
 
 def worst_disturbance(
-    filter: hg.AbstractFilter,
+    filter: hg.filters.AbstractFilter,
     world: World,
     draws: Draws,
     new_draws: Draws,
@@ -88,7 +88,12 @@ def worst_disturbance(
 
 @eqx.filter_jit
 def _climb(
-    filter: hg.AbstractFilter, world: World, draws: Draws, points: Disturbance, energies: np.ndarray, rounds: int
+    filter: hg.filters.AbstractFilter,
+    world: World,
+    draws: Draws,
+    points: Disturbance,
+    energies: np.ndarray,
+    rounds: int,
 ) -> tuple[Disturbance, jax.Array]:
     """Points of each energy and the ratios reached."""
 
@@ -135,7 +140,7 @@ def _raised(world: World, gradient: Disturbance) -> Disturbance:
 
 
 @eqx.filter_jit
-def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
+def _output_energy(filter: hg.filters.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
     """sum |M e|^2 for each draw, (draw,)."""
 
     def one(gains: jax.Array, noises: jax.Array) -> jax.Array:
@@ -155,7 +160,7 @@ def _output_energy(filter: hg.AbstractFilter, world: World, draws: Draws, w: Dis
     return result
 
 
-def _from(filter: hg.AbstractFilter, mean: jax.Array) -> PyTree:
+def _from(filter: hg.filters.AbstractFilter, mean: jax.Array) -> PyTree:
     """The state of a filter that starts from another initial mean."""
     state = jax.tree.map(jnp.asarray, filter.init())
     if isinstance(state, Ahead):

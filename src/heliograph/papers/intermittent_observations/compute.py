@@ -107,7 +107,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     )  # fmt: skip
 
 
-def judge(example: Example, link: hg.AbstractRandomAffine) -> hg.simulation.Boundedness:
+def judge(example: Example, link: hg.random_affine.AbstractRandomAffine) -> hg.simulation.Boundedness:
     """The package's verdict on an example over a link."""
     return hg.simulation.certify_boundedness(example.network(link))
 
@@ -117,7 +117,9 @@ def steady_gain(example: Example) -> np.ndarray:
     return judge(example, setting.lossy(1.0)).gains[(True,) * len(example.output)]
 
 
-def link(example: Example, channel: hg.AbstractRandomAffine, fail: float, recover: float, runs: int, seed: int) -> Link:
+def link(
+    example: Example, channel: hg.random_affine.AbstractRandomAffine, fail: float, recover: float, runs: int, seed: int
+) -> Link:
     """Bounds, quadrature and simulation of one example over one link."""
     record = hg.monte_carlo(example.network(channel), HORIZON, runs, seed)
     heard = ~np.isnan(record.measurements[NODE]).any(axis=2)[:, SETTLED:]

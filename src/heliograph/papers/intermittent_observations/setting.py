@@ -32,7 +32,7 @@ class Example(NamedTuple):
         """All outputs in one packet."""
         return hg.LinearSensor(self.output, NOISE * np.eye(len(self.output)))
 
-    def network(self, link: hg.AbstractRandomAffine) -> hg.Network:
+    def network(self, link: hg.random_affine.AbstractRandomAffine) -> hg.Network:
         """A receiver that is told what is lost, and skips it."""
         told = hg.kalman_filter(self.plant(), self.sensor())
         return hg.Network(self.plant(), {NODE: hg.Node(self.sensor(), link, {FILTER: told})})
@@ -53,11 +53,11 @@ BURSTS = ((0.1, 0.6), (0.3, 0.6), (0.1, 0.9), (0.4, 0.6))  # (fail, recover); th
 BETWEEN = 0.42  # an arrival between the two conditions of the coupled plant
 
 
-def lossy(arrival: float, outputs: int = 1) -> hg.AbstractRandomAffine:
+def lossy(arrival: float, outputs: int = 1) -> hg.random_affine.AbstractRandomAffine:
     """A packet arrives with this probability, independently at each step."""
     return hg.erasure(hg.perfect(outputs), arrival)
 
 
-def bursts(fail: float, recover: float) -> hg.AbstractRandomAffine:
+def bursts(fail: float, recover: float) -> hg.random_affine.AbstractRandomAffine:
     """Arrivals fail and losses end with these probabilities: a chain of two modes, which the losses tell."""
     return hg.gilbert_elliott(hg.perfect(), hg.erasure(hg.perfect(), 0.0), fail, recover)

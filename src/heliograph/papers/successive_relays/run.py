@@ -61,7 +61,7 @@ def write_record(result: Reproduction, folder: Path) -> None:
     assert run.truth is not None
     estimates = {
         NAMES[node]: {
-            name: hg.Estimate(np.asarray(e.mean)[0], np.asarray(e.covariance)[0], e.claim)
+            name: hg.model.Estimate(np.asarray(e.mean)[0], np.asarray(e.covariance)[0], e.claim)
             for name, e in filters.items()
         }
         for node, filters in run.estimates.items()

@@ -1,0 +1,1 @@
+"""Public names of the room; the package loads them when first used."""

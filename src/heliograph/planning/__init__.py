@@ -1,0 +1,5 @@
+"""Networks designed by their own mathematics: powers, sites and schedules, with certificates of how good they are."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
