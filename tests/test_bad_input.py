@@ -48,7 +48,7 @@ def pushed() -> h.Network:
 
 
 def lasting(steps: int) -> h.Network:
-    channel = h.over_time([h.hop(0.5 + k, 0.1) for k in range(steps)])
+    channel = h.model.over_time([h.hop(0.5 + k, 0.1) for k in range(steps)])
     return h.Network(plant(), {"a": h.Node(sensor(), channel, {})})
 
 
@@ -85,7 +85,7 @@ SHAPES = [
     (lambda: h.Discrete([[1.0]], [1.0]), "gain values", "shape (1, 1)"),
     (lambda: h.Discrete([1.0, 2.0], [1.0]), "gain probabilities", "shape (1,)"),
     (lambda: one_per_step(2, 3), "OverTime", "['2', '3']"),
-    (lambda: h.over_time([h.perfect(1), h.perfect(2)]), "stack", "objects that differ"),
+    (lambda: h.model.over_time([h.perfect(1), h.perfect(2)]), "stack", "objects that differ"),
 ]  # fmt: skip
 
 PROBABILITIES = [
@@ -173,7 +173,7 @@ MISSING = [
     (lambda: h.Network(plant(), {}), "network", "none"),
     (lambda: h.amplify_and_forward([]), "series", "none"),
     (lambda: h.parallel([]), "parallel channels", "none"),
-    (lambda: h.over_time([]), "over_time", "none"),
+    (lambda: h.model.over_time([]), "over_time", "none"),
     (lambda: h.linear_filter(h.Plant(still, EYE, [0, 0], EYE), sensor(), h.perfect()), "linear filter", "Plant"),
 ]
 
@@ -208,7 +208,7 @@ def test_one_line_that_names_it(make, name, came):
     assert came in "got " + message.split(", got ", 1)[1]
 
 
-class Losing(h.AbstractFilter):
+class Losing(h.filters.AbstractFilter):
     """A filter whose covariance is indefinite from its third step."""
 
     claim: Claim = eqx.field(static=True, default="nominal")
@@ -226,7 +226,7 @@ class Losing(h.AbstractFilter):
         return state, h.model.Innovation(z, jnp.eye(1), 0.0)
 
     def estimate(self, state):
-        return h.Estimate(0 * state, jnp.diag(state), self.claim)
+        return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
 
 
 def test_a_covariance_that_is_lost_is_flagged_and_kept():

@@ -39,7 +39,7 @@ LOSING = """
 import equinox as eqx
 
 
-class Losing(h.AbstractFilter):
+class Losing(h.filters.AbstractFilter):
     claim: str = eqx.field(static=True, default="nominal")
     states: tuple = eqx.field(static=True, default=("p", "v"))
     inputs: tuple = eqx.field(static=True, default=("push", "dt"))
@@ -55,7 +55,7 @@ class Losing(h.AbstractFilter):
         return state, h.model.Innovation(z, jnp.eye(1), 0.0)
 
     def estimate(self, state):
-        return h.Estimate(0 * state, jnp.diag(state), self.claim)
+        return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
 
 
 network = h.Network(plant, {"remote": h.Node(sensor, link, {"losing": Losing()})})

@@ -27,7 +27,7 @@ def sensed(*outputs: str) -> h.LinearSensor:
     return h.LinearSensor(np.eye(2)[: len(outputs)], 0.1, outputs=outputs)
 
 
-def relayed(dimension: int) -> h.AbstractRandomAffine:
+def relayed(dimension: int) -> h.random_affine.AbstractRandomAffine:
     gain = h.Discrete([0.8, 1.2], [0.5, 0.5])
     return h.amplify_and_forward([h.hop(gain, 0.1, dimension=dimension), h.hop(gain, 0.1, dimension=dimension)])
 
@@ -151,7 +151,7 @@ def test_a_recording_run_at_once_and_sample_by_sample(tmp_path, name):
 
 def record_of(*filters: str, nodes=("a",), states=("p", "v")) -> Record:
     bound = np.array([[[4.0, 1.0], [1.0, 9.0]], [[1.0, 2.0], [2.0, 1.0]], [[-1.0, 0.0], [0.0, 1.0]]])
-    estimate = h.Estimate(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), bound, "upper")
+    estimate = h.model.Estimate(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), bound, "upper")
     estimates = {node: {name: estimate for name in filters} for node in nodes}
     return Record(np.array([0.0, 0.5, 0.7]), states, None, {}, estimates)
 
@@ -169,7 +169,7 @@ def test_columns_of_estimates():
 def test_no_columns_for_a_covariance_that_is_not_claimed():
     record = record_of("silent")
     means = record.estimates["a"]["silent"].mean
-    record.estimates["a"]["silent"] = h.Estimate(means, np.full((3, 2, 2), np.nan), "none")
+    record.estimates["a"]["silent"] = h.model.Estimate(means, np.full((3, 2, 2), np.nan), "none")
     found = estimate_columns(record)
     assert list(found) == ["time", "p", "v", "valid"]
     np.testing.assert_array_equal(found["valid"], np.isfinite(means).all(axis=1))
