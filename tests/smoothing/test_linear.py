@@ -67,3 +67,20 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
         assert planned.estimate.claim == "exact"
     with pytest.raises(ValueError, match=r"filter: expected one whose gains depend on no data, got OpenLoop"):
         hg.smoothing.planned_smoother(hg.filters.open_loop_filter(PLANT), 3, hg.smoothing.FixedInterval())
+
+
+def test_what_a_precise_future_leaves_keeps_its_digits():
+    """Smoothed variances of a start that two precise positions pin down, against the limit R -> 0 of a straight line.
+
+    With Q = 0 the start is found from all z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2)/(T^2 + T).
+    P - P Lambda P is 1e-16 P wrong: more than the whole of the variance of v after the first step.
+    """
+    precise, steps = 1e-6, 6
+    plant = hg.LinearPlant([[1, 1], [0, 1]], 0.0, [0.0, 0.0], [[1e4, 0.0], [0.0, 1e4]])
+    item = hg.kalman_filter(plant, hg.LinearSensor([[1, 0]], [[precise]]))
+    _, retained = hg.smoothing.retained_steps(item, np.zeros((steps, 1)))
+    found = hg.smoothing.FixedInterval().estimates(retained).covariance
+    velocity = precise * 12 / (steps**3 - steps)
+    ends = precise * (4 * steps - 2) / (steps**2 + steps)
+    np.testing.assert_allclose(found[:, 1, 1], velocity, rtol=1e-4)  # of a prior correlated by 1 - 1e-10: 1e-6 remain
+    np.testing.assert_allclose(found[[0, -1], 0, 0], ends, rtol=1e-4)

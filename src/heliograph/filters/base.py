@@ -81,9 +81,9 @@ class AbstractFilter(eqx.Module):
         return _step_retained(self, state, z, u, step_number(self, k))
 
     def retain(
-        self, before: PyTree, prior: PyTree, after: PyTree, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: PyTree, prior: PyTree, after: PyTree, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
-        """What a sweep back over step k needs, from the states before it, after `predict`, and after `correct`.
+        """What a sweep back over step k needs: states before it, after `predict` and `correct`, and the innovation.
 
         Raises:
             ValueError: a filter that keeps no covariance of its own, or does not say how its state moves.
@@ -120,7 +120,7 @@ def _step_retained(
 ) -> tuple[PyTree, AbstractRetained]:
     prior = item.predict(state, u, k)
     after, heard = item.correct(prior, z, k)
-    return after, with_surprise(item.retain(state, prior, after, z, u, k), heard)
+    return after, with_surprise(item.retain(state, prior, after, heard, z, u, k), heard)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:

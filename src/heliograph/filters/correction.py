@@ -14,10 +14,13 @@ from heliograph.filters.scalars import smallest_scalars, young_omega, young_swee
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
+    PRECISE,
     congruence,
     diagonal,
+    rounding,
     runs_last,
     solve,
+    sum_of_squares,
     symmetric,
     times,
     trace,
@@ -31,13 +34,16 @@ from heliograph.random_affine.second_moments import SecondOrder
 class Signal(NamedTuple):
     """The sensor's signal as the filter sees it before the measurement.
 
-    mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m).
+    mean (m,), covariance (m, m) with sensor noise, cross = E[e e_y'] (n, m), second = E[y y'] (m, m). Of a linear
+    sensor y = C x + v also the matrix C (m, n) and Cov v (m, m), with which an update keeps its digits.
     """
 
     mean: jax.Array
     covariance: jax.Array
     cross: jax.Array
     second: jax.Array
+    matrix: jax.Array | None = None
+    noise: jax.Array | None = None
 
 
 @readable
@@ -76,7 +82,12 @@ def young_correction(
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
     if not channel.uncertain:
-        return gain_and_bound(prior, cross, _of_known_gain(channel, w, present) + mean_part)
+        spread = _of_known_gain(channel, w, present)
+        if signal.matrix is None or signal.noise is None:
+            return gain_and_bound(prior, cross, spread + mean_part)
+        heard = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
+        noise = spread + jnp.where(both, congruence(channel.mean_gain, signal.noise), 0.0)
+        return gain_and_covariance(prior, cross, spread + mean_part, heard, noise)
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
@@ -153,9 +164,45 @@ def gain_and_bound(prior: jax.Array, cross: jax.Array, omega: jax.Array) -> tupl
     return transpose(solved), _bound(prior, cross, solved)
 
 
+def gain_and_covariance(
+    prior: jax.Array, cross: jax.Array, omega: jax.Array, output: jax.Array, noise: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The same of z = H x + noise, with H (m, n) and the noise's covariance N (m, m), Omega = H P H' + N.
+
+    Where a measurement is precise, N far below Omega, the difference has lost the digits of what is left:
+    (1 + (m + 2) eps) P - K C is eps Omega / N too large. There P+ = (I - K H) P (I - K H)' + K N K', a sum of squares,
+    which an error dK of the gain changes by dK Omega dK' alone. It takes three times the products, so it is computed
+    for all runs where any needs it, and not otherwise; each run's own numbers decide which of the two it gets.
+
+    Source: Bucy and Joseph, Filtering for stochastic processes (1968).
+    """
+    solved = _solved(omega, cross)
+    return transpose(solved), covariance_after(prior, cross, omega, solved, output, noise)
+
+
 _solved = runs_last(solve)
 
 
-@runs_last
-def _bound(prior: jax.Array, cross: jax.Array, solved: jax.Array) -> jax.Array:
+def _difference(prior: jax.Array, cross: jax.Array, solved: jax.Array) -> jax.Array:
     return symmetric(with_rounding(prior, len(cross)) - times(transpose(cross), solved))
+
+
+_bound = runs_last(_difference)
+
+
+@runs_last
+def covariance_after(
+    prior: jax.Array, cross: jax.Array, omega: jax.Array, solved: jax.Array, output: jax.Array, noise: jax.Array
+) -> jax.Array:
+    """P+ of the gain solved' = C' Omega^-1, in the form that keeps its digits (`gain_and_covariance`)."""
+    own = [noise[i, i] < rounding(PRECISE, prior, 1000) * omega[i, i] for i in range(len(omega))]
+    precise = jnp.any(jnp.stack(own), axis=0)
+
+    def short() -> jax.Array:
+        return _difference(prior, cross, solved)
+
+    def some_squares() -> jax.Array:
+        return jnp.where(precise, sum_of_squares(prior, transpose(solved), output, noise), short())
+
+    chosen: jax.Array = jax.lax.cond(jnp.any(precise), some_squares, short)
+    return chosen

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import Signal, known_gain_covariance
+from heliograph.filters.correction import Signal
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained
@@ -89,19 +89,18 @@ class GaussianFilter(AbstractFilter):
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def retain(
-        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
         """The update itself where it is linear, else the moments around it."""
         plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
             return moments_retained(after, prior, cross, "nominal", plant.angles)
-        y = signal_of(plant, sensor, self.transform, prior)
-        expected = channel.mean_gain @ y.mean + channel.offset
-        z = nearest(jnp.asarray(z), expected, self.heard_angles)
-        output, innovation = heard_through(channel.mean_gain, channel.offset, sensor.matrix, y.mean, z)
-        total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        found = linear_retained(after, prior, plant.matrix, output, innovation, total, self.claim)
+        heard_of = heard_through(channel.mean_gain, sensor.matrix)
+        process = plant.noise_covariance(jnp.asarray(u))
+        found = linear_retained(
+            after, prior, plant.matrix, process, heard_of, heard.value, heard.covariance, self.claim
+        )
         return replace(found, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
@@ -126,7 +125,8 @@ def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractT
         measured = transform.apply(continued(sensor.measure, state.mean, plant.angles, sensor.angles), *state)
     mean = measured.mean + sensor.noise.mean
     spread = measured.covariance + sensor.noise.covariance
-    return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean))
+    known = (sensor.matrix, sensor.noise.covariance) if isinstance(sensor, LinearSensor) else ()
+    return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean), *map(jnp.asarray, known))
 
 
 def corrected(

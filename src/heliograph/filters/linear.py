@@ -89,6 +89,7 @@ class LinearFilter(AbstractFilter):
         """Use what arrived of z."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         y = signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+        y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
         mean, covariance, expected = used(
             state.mean,
@@ -110,7 +111,14 @@ class LinearFilter(AbstractFilter):
         return Estimate(state.mean, state.covariance, self.claim)
 
     def retain(
-        self, before: LinearBelief, prior: LinearBelief, after: LinearBelief, z: ArrayLike, u: ArrayLike, k: Step
+        self,
+        before: LinearBelief,
+        prior: LinearBelief,
+        after: LinearBelief,
+        heard: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
     ) -> AbstractRetained:
         """The update itself, or the moments around it where E[G] is uncertain."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
@@ -118,11 +126,13 @@ class LinearFilter(AbstractFilter):
         if not self.mean_known:
             cross = before.covariance @ transition.T
             return moments_retained(after, prior, cross, "nominal")
-        y = signal(prior, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
-        expected = sensor.matrix @ prior.mean + sensor.noise.mean
-        output, innovation = heard_through(channel.mean_gain, channel.offset, sensor.matrix, expected, z)
-        total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        return linear_retained(after, prior, transition, output, innovation, total, self.claim)
+        total = heard.covariance
+        if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
+            y = signal(prior, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+            total = known_gain_covariance(y, channel, ~jnp.isnan(z))
+        output = heard_through(channel.mean_gain, sensor.matrix)
+        process = at(self.plant, k).noise_covariance(jnp.asarray(u))
+        return linear_retained(after, prior, transition, process, output, heard.value, total, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
@@ -275,7 +285,7 @@ class OpenLoop(AbstractFilter):
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def retain(
-        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
         """The prediction, of which nothing more is ever heard."""
         cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross

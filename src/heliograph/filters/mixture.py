@@ -136,7 +136,14 @@ class MixtureFilter(AbstractFilter):
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def retain(
-        self, before: MixtureBelief, prior: MixtureBelief, after: MixtureBelief, z: ArrayLike, u: ArrayLike, k: Step
+        self,
+        before: MixtureBelief,
+        prior: MixtureBelief,
+        after: MixtureBelief,
+        heard: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
     ) -> AbstractRetained:
         """The moments around the update."""
         cross = before.covariance @ at(self.plant, k).matrix.T

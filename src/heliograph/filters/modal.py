@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import absent, gain_and_bound
+from heliograph.filters.correction import absent, gain_and_covariance
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained
@@ -135,18 +135,25 @@ class ModalFilter(AbstractFilter):
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
 
     def retain(
-        self, before: ModalBelief, prior: ModalBelief, after: ModalBelief, z: ArrayLike, u: ArrayLike, k: Step
+        self,
+        before: ModalBelief,
+        prior: ModalBelief,
+        after: ModalBelief,
+        heard: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
     ) -> AbstractRetained:
         """The update of zeta itself."""
-        heard, added = self._hears(prior, k)
-        total = heard @ prior.covariance @ heard.T + added
+        output, _ = self._hears(prior, k)
         return linear_retained(
             after,
             prior,
             self._moves(before, u, k)[0],
-            heard,
-            jnp.asarray(z) - heard @ prior.mean,
-            total,
+            None,
+            output,
+            heard.value,
+            heard.covariance,
             self.claim,
             sum_of_modes(len(self.states), len(self.initial)),
         )
@@ -173,8 +180,12 @@ def heard_linearly(
     both = present[:, None] & present
     cross, expected = heard @ covariance, heard @ mean
     total = cross @ heard.T + added
-    gain, after = gain_and_bound(
-        covariance, jnp.where(present[:, None], cross, 0.0), jnp.where(both, total, 0.0) + absent(present)
+    gain, after = gain_and_covariance(
+        covariance,
+        jnp.where(present[:, None], cross, 0.0),
+        jnp.where(both, total, 0.0) + absent(present),
+        jnp.where(present[:, None], heard, 0.0),
+        jnp.where(both, added, 0.0) + absent(present),
     )
     return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
 

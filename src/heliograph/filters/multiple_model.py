@@ -162,7 +162,14 @@ class MultipleModelFilter(AbstractFilter):
         return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
 
     def retain(
-        self, before: ModalBeliefs, prior: ModalBeliefs, after: ModalBeliefs, z: ArrayLike, u: ArrayLike, k: Step
+        self,
+        before: ModalBeliefs,
+        prior: ModalBeliefs,
+        after: ModalBeliefs,
+        heard: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
     ) -> AbstractRetained:
         """Moments of the whole mixture around the update; nothing later is said of the modes."""
         own = _whole(before)

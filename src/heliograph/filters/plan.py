@@ -89,11 +89,18 @@ class PlannedFilter(AbstractFilter):
         return self._estimate(state.mean, 2 * k + 2)
 
     def retain(
-        self, before: PlannedMean, prior: PlannedMean, after: PlannedMean, z: ArrayLike, u: ArrayLike, k: Step
+        self,
+        before: PlannedMean,
+        prior: PlannedMean,
+        after: PlannedMean,
+        heard: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
     ) -> AbstractRetained:
         """What was planned, with the mean and the innovation of these data."""
         if self.past is None:
-            return super().retain(before, prior, after, z, u, k)
+            return super().retain(before, prior, after, heard, z, u, k)
         p, planned = at(self.steps, k), cast(AbstractRetained, at(self.past, k))
         innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
         return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)

@@ -107,13 +107,13 @@ class PolynomialFilter(AbstractFilter):
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
     def retain(
-        self, before: Centred, prior: Centred, after: Centred, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Centred, prior: Centred, after: Centred, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
         """The inner filter's, on the lifted system, about the mean."""
         z = jnp.asarray(z)
         z = z if self.centre is None else z - at(self.centre, k).heard @ prior.mean
-        inner = prior.inner, after.inner, monomials(z, self.degree)[:-1]
-        return replace(self.inner.retain(before.inner, *inner, u, k), shift=jnp.asarray(after.mean))
+        inner = before.inner, prior.inner, after.inner, heard, monomials(z, self.degree)[:-1]
+        return replace(self.inner.retain(*inner, u, k), shift=jnp.asarray(after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """The inner filter planned."""

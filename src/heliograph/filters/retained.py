@@ -15,7 +15,9 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.small_matrix import (
     congruence,
+    inner,
     runs_last,
+    sum_of_squares,
     symmetric,
     times,
     times_vector,
@@ -24,6 +26,8 @@ from heliograph.numerics.small_matrix import (
 )
 from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Float, PyTree
+
+SHARP = 1e-3  # of the filter's variance: below it P - P Lambda P leaves fewer digits than a sum of squares
 
 
 class Adjoint(NamedTuple):
@@ -84,6 +88,13 @@ class AbstractRetained(eqx.Module):
         """An earlier state given this step's data too."""
         raise NotImplementedError
 
+    def before(self, one: "AbstractRetained", earlier: PyTree, known: Moments) -> Moments:
+        """The state after step `one`, the one before this, given all later data.
+
+        `earlier` is what `back` makes of them; `known` is the state after this step given the same.
+        """
+        return one.smoothed(earlier)
+
     def start(self) -> Point:
         """The state after this step as one to be carried ahead."""
         n = self.mean.shape[-1]
@@ -112,8 +123,9 @@ class AbstractRetained(eqx.Module):
 class RetainedLinear(AbstractRetained):
     """A linear update: y- = A y + ..., y = y- + K e, e = z - H y- - ..., K = P- H' S^-1, nothing else inverted.
 
-    transition A, gain K, output H, weigh H' S^-1, innovation e; of what did not arrive nothing. With B = I - K H,
-    lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both through A'.
+    transition A, process Q (None: not known apart), gain K, output H, weigh H' S^-1, innovation e; of what did not
+    arrive nothing. With B = I - K H, lambda- = B' lambda - H' S^-1 e and Lambda- = B' Lambda B + H' S^-1 H, then both
+    through A'.
 
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
     """
@@ -121,6 +133,7 @@ class RetainedLinear(AbstractRetained):
     mean: Float[jax.Array, "*time N"]
     covariance: Float[jax.Array, "*time N N"]
     transition: Float[jax.Array, "*time N N"]
+    process: Float[jax.Array, "*time N N"] | None
     gain: Float[jax.Array, "*time N m"]
     output: Float[jax.Array, "*time m N"]
     weigh: Float[jax.Array, "*time N m"]
@@ -150,6 +163,16 @@ class RetainedLinear(AbstractRetained):
     def ahead(self, point: Point) -> Point:
         """Pi- = Pi A', g = Pi- H' S^-1: x_j + g e, P_j - g H Pi-', and Pi = Pi- B'; Pi is Cov(y_j, y)."""
         return Point(*_point_ahead(*point, self.transition, self.gain, self.output, self.weigh, self.innovation))
+
+    def before(self, one: AbstractRetained, earlier: Adjoint, known: Moments) -> Moments:
+        """P_s = (I - J A) P (I - J A)' + J (Q + P_s+) J', J = P A' (P-)^+, where P - P Lambda P loses its digits.
+
+        A sum of squares, by Rauch, Tung and Striebel with P - J P- J' in Joseph's form; one inverse more.
+        """
+        if self.process is None:
+            return one.smoothed(earlier)
+        given = one.covariance, earlier.matrix, self.transition, self.process, known.covariance
+        return Moments(one.mean - _product(one.covariance, earlier.vector), _left(*given))
 
     def without_data(self) -> AbstractRetained:
         """Without mean and innovation."""
@@ -261,9 +284,27 @@ def _point_ahead(
 
 
 @runs_last
-def _less(p: jax.Array, factor: jax.Array, inner: jax.Array) -> jax.Array:
+def _less(p: jax.Array, factor: jax.Array, middle: jax.Array) -> jax.Array:
     """P - F M F', known to rounding of P alone, which is added."""
-    return symmetric(with_rounding(p, len(p)) - congruence(factor, inner))
+    return symmetric(with_rounding(p, len(p)) - congruence(factor, middle))
+
+
+@runs_last
+def _left(p: jax.Array, matrix: jax.Array, transition: jax.Array, process: jax.Array, later: jax.Array) -> jax.Array:
+    half = times(p, matrix)
+    own = [p[i, i] - inner(half[i : i + 1], p[i : i + 1]) < SHARP * p[i, i] for i in range(len(p))]
+    lost = jnp.any(jnp.stack(own), axis=0)
+
+    def short() -> jax.Array:
+        return symmetric(with_rounding(p, len(p)) - times(half, p))
+
+    def some_squares() -> jax.Array:
+        moved = times(transition, p)
+        back = transpose(small_solve(times(moved, transpose(transition)) + process, moved))
+        return jnp.where(lost, sum_of_squares(p, back, transition, process + later), short())
+
+    chosen: jax.Array = jax.lax.cond(jnp.any(lost), some_squares, short)
+    return chosen
 
 
 @runs_last

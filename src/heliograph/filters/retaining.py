@@ -15,7 +15,6 @@ from heliograph.numerics.small_matrix import (
     runs_last,
     squared_distance,
     times,
-    times_vector,
     transpose,
 )
 from heliograph.numerics.small_matrix import solve as small_solve
@@ -72,6 +71,7 @@ def linear_retained(
     after: HasMoments,
     prior: HasMoments,
     transition: Array,
+    process: Array | None,
     output: Array,
     innovation: Array,
     total: Array,
@@ -79,7 +79,7 @@ def linear_retained(
     want: Array | None = None,
     solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
 ) -> RetainedLinear:
-    """From the states after and before a correction, A, H, e, and the S that the gain was made for.
+    """From the states after and before a correction, A, Q (None: not known apart), H, e, and the gain's S.
 
     Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
     component that others determine is left out.
@@ -95,6 +95,7 @@ def linear_retained(
         mean=jnp.asarray(after.mean),
         covariance=jnp.asarray(after.covariance),
         transition=jnp.asarray(transition),
+        process=None if process is None else jnp.asarray(process),
         gain=gain,
         output=heard,
         weigh=weigh,
@@ -126,8 +127,6 @@ def _of_what_arrived(
 
 
 @runs_last
-def heard_through(
-    gain: jax.Array, offset: jax.Array, matrix: jax.Array, expected: jax.Array, z: jax.Array
-) -> tuple[jax.Array, jax.Array]:
-    """H = M C and e = z - M y - b, from what is expected of y."""
-    return times(gain, matrix), z - times_vector(gain, expected) - offset
+def heard_through(gain: jax.Array, matrix: jax.Array) -> jax.Array:
+    """H = M C."""
+    return times(gain, matrix)

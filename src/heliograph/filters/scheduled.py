@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.correction import covariance_after
 from heliograph.filters.gaussian import Belief
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
@@ -21,8 +22,6 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
-from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -172,10 +171,12 @@ class LinearSystemFilter(AbstractFilter):
         present = ~jnp.isnan(z)
         expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
-        gain = pseudo_solve(jnp.where(present[:, None] & present, total, 0.0), cross).T
+        heard, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
+        used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
+        solved = pseudo_solve(used, cross)
         after = Belief(
-            mean + gain @ jnp.where(present, z - expected, 0.0),
-            symmetrize(with_rounding(spread, len(z)) - gain @ cross),
+            mean + solved.T @ jnp.where(present, z - expected, 0.0),
+            covariance_after(spread, cross, used, solved, heard, noise),
         )
         return after, gaussian_innovation(z, expected, total)
 
@@ -186,14 +187,14 @@ class LinearSystemFilter(AbstractFilter):
         return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
 
     def retain(
-        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
         """The update itself."""
         s: Steps = at(self.steps, k)
         innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
         total = s.output @ prior.covariance @ s.output.T + s.noise
         return linear_retained(
-            after, prior, s.transition, s.output, innovation, total, self.claim, self.want, pseudo_solve
+            after, prior, s.transition, s.process, s.output, innovation, total, self.claim, self.want, pseudo_solve
         )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:

@@ -69,7 +69,7 @@ class SequentialFilter(AbstractFilter):
         return Estimate(told.mean, told.covariance, self.claim)
 
     def retain(
-        self, before: Belief, prior: Belief, after: Belief, z: ArrayLike, u: ArrayLike, k: Step
+        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
     ) -> AbstractRetained:
         """The moments around all nodes' updates."""
         item = self.filters[0]

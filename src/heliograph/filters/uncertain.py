@@ -119,6 +119,7 @@ class UncertainModalFilter(AbstractFilter):
         before: UncertainBelief,
         prior: UncertainBelief,
         after: UncertainBelief,
+        heard: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,

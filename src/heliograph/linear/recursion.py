@@ -9,7 +9,7 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance
-from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.small_matrix import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
@@ -31,8 +31,16 @@ def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
     """
     predicted = s.transition @ spread @ s.transition.T + s.process
     cross = s.output @ predicted
-    gain = solve_innovation(cross @ s.output.T + s.noise, cross).T
-    after = with_rounding(predicted, len(cross)) - gain @ cross
+    total = cross @ s.output.T + s.noise
+    gain = solve_innovation(total, cross).T
+    rounded = with_rounding(predicted, len(cross))
+    own = np.diag(s.noise)
+    if np.all(own >= 0) and np.any(own < PRECISE * np.diag(total)):  # P - G C P lost digits
+        keep, units = np.eye(len(gain)) - gain @ s.output, np.diag(rounded - predicted) ** 2
+        known = np.diag(units / np.where(units > 0, np.diag(predicted), 1.0))
+        after = keep @ predicted @ keep.T + gain @ s.noise @ gain.T + known
+    else:
+        after = rounded - gain @ cross
     return Corrected(gain, predicted, (after + after.T) / 2)
 
 

@@ -20,6 +20,7 @@ from heliograph.numerics.types import Array, PyTree
 UNROLL_LIMIT = 8  # above this size the library factorisation is faster and compiles in less time
 PIVOT_TOLERANCE = 1e-14  # of a component's own variance: what is left of it, given those before it, is zero
 NEGATIVE_TOLERANCE = 1e-10  # of the same: a pivot this far below zero is rounding of a singular matrix
+PRECISE = 1e-7  # of a measurement's variance: noise below it costs the short form P - K C half of the digits
 OFF_SUPPORT = 1e-6  # standard deviations, and
 OFF_VALUE = 1e-9  # of its size: how far a component that the others determine may be from what they say
 
@@ -133,6 +134,15 @@ def with_rounding(p: A, terms: int) -> A:
     """
     units = (terms + 2) * float(np.finfo(p.dtype).eps)
     return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
+
+
+def sum_of_squares(prior: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array) -> jax.Array:
+    """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added."""
+    n = len(prior)
+    kept = jnp.eye(n).reshape(n, n, *[1] * (prior.ndim - 2)) - times(gain, output)
+    own = jnp.stack([prior[i, i] for i in range(n)])
+    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own)
+    return symmetric(congruence(kept, prior) + congruence(gain, noise)) + rounded
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:

@@ -89,21 +89,23 @@ def _means(steps: AbstractRetained) -> jax.Array:
 def _back(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
     """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
 
-    def told(step: AbstractRetained, later: PyTree) -> tuple[jax.Array, jax.Array]:
-        found = step.told(step.smoothed(later))
+    def told(step: AbstractRetained, moments: Moments) -> tuple[jax.Array, jax.Array]:
+        found = step.told(moments)
         return jnp.asarray(found.mean), jnp.asarray(found.covariance)
 
-    def body(later: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, Any]:
-        before, step = item
+    def body(carry: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, Any]:
+        (later, known), (before, step) = carry, item
         earlier = step.back(later, before.mean, before.covariance)
-        return earlier, told(before, earlier)
+        moments = step.before(before, earlier, known)
+        return (earlier, moments), told(before, moments)
 
     last = row(steps, -1)
     rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
-    shapes, _ = jax.eval_shape(body, last.end(), row(rows, -1))  # of what runs share, their axis is 1 long
-    end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), last.end(), shapes)
+    start = last.end(), last.smoothed(last.end())
+    shapes, _ = jax.eval_shape(body, start, row(rows, -1))  # of what runs share, their axis is 1 long
+    end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
     _, found = jax.lax.scan(body, end, rows, reverse=True)
-    mean, covariance = (jnp.concatenate([part, one[None]]) for part, one in zip(found, told(last, end), strict=True))
+    mean, covariance = (jnp.concatenate([part, one[None]]) for part, one in zip(found, told(last, end[1]), strict=True))
     return mean, covariance
 
 

@@ -1,0 +1,66 @@
+"""Precise sensors: what is left of a wide prior keeps its digits, against rational arithmetic."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+
+A, C = [[1, 1], [0, 1]], [[1, 0]]
+STEPS = 4
+
+
+def exact(transition, noise, measured, start):
+    """Diagonals of P_1 ... P_STEPS in fractions, for one measured component with this variance."""
+    a, q, p = ([[Fraction(x) for x in row] for row in m] for m in (transition, noise, start))
+    r, found = Fraction(measured), []
+    for _ in range(STEPS):
+        moved = [[sum(a[i][k] * p[k][j] for k in range(2)) for j in range(2)] for i in range(2)]
+        p = [[sum(moved[i][k] * a[j][k] for k in range(2)) + q[i][j] for j in range(2)] for i in range(2)]
+        total = p[0][0] + r
+        p = [[p[i][j] - p[i][0] * p[0][j] / total for j in range(2)] for i in range(2)]
+        found.append([float(p[0][0]), float(p[1][1])])
+    return np.array(found)
+
+
+def claimed(item):
+    """The same of a filter."""
+    state, found = item.init(), []
+    for k in range(STEPS):
+        state, _ = item.correct(item.predict(state, (), k), [0.0], k)
+        found.append(np.diag(np.asarray(item.estimate(state).covariance)))
+    return np.array(found)
+
+
+@pytest.mark.parametrize(("wide", "precise"), [(1e4, 1e-9), (1e8, 1e-12), (1e6, 1e-3), (1e2, 1.0)])
+def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
+    """A difference P - K C P is 1e-16 P wrong: 7e4 times what is left in the second case.
+
+    What remains is the rounding of a prior with correlation 1 - 1e-11, of 1e-16 / 1e-11 at the second step.
+    """
+    start, noise = [[wide, 0.0], [0.0, wide / 10]], [[1e-3, 2e-3], [2e-3, 5e-3]]
+    plant, sensor = hg.LinearPlant(A, noise, [0.0, 0.0], start), hg.LinearSensor(C, [[precise]])
+    expected = exact(A, noise, precise, start)
+    for item in (hg.kalman_filter(plant, sensor), hg.linear_filter(plant, sensor, hg.perfect(1))):
+        np.testing.assert_allclose(claimed(item), expected, rtol=2e-5)
+    system = hg.linear.lifted_system(plant, sensor, hg.perfect(1), 1, STEPS)
+    covariance = hg.linear.lmmse(system).gains.covariance
+    np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
+
+
+def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
+    """Beside a precise one or alone, a run's bits are the same."""
+    import jax
+
+    plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
+
+    def variance(noise):
+        item = hg.linear_filter(plant, hg.LinearSensor(C, noise), hg.perfect(1))
+        return item.correct(item.predict(item.init()), np.zeros(1))[0].covariance
+
+    with jax.enable_x64(True):
+        together = jax.jit(jax.vmap(variance))(np.array([[[1e-9]], [[1.0]]]))
+        apart = jax.jit(jax.vmap(variance))(np.array([[[1.0]], [[1.0]]]))
+    np.testing.assert_array_equal(together[1], apart[1])
+    assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
