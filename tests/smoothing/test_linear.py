@@ -72,7 +72,7 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
 def test_what_a_precise_future_leaves_keeps_its_digits():
     """Smoothed variances of a start that two precise positions pin down, against the limit R -> 0 of a straight line.
 
-    With Q = 0 the start is found from all z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2)/(T^2 + T).
+    With Q = 0 all is found from z by least squares: Var v = R 12 / (T^3 - T), Var x_T = R (4 T - 2) / (T^2 + T).
     P - P Lambda P is 1e-16 P wrong: more than the whole of the variance of v after the first step.
     """
     precise, steps = 1e-6, 6
