@@ -1,0 +1,44 @@
+"""`heliograph serve`: the filters of a network kept running, from messages to estimates."""
+
+from typing import Annotated
+
+from cyclopts import Parameter
+
+
+def serve(
+    network: str | None = None,
+    /,
+    *,
+    window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0,
+    ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0,
+    leap: Annotated[float | None, Parameter(help="How much later than all before it; any, unless given.")] = None,
+    schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
+) -> None:
+    """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
+
+    Parameters
+    ----------
+    network:
+        A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
+        holds several.
+    """
+    import asyncio
+    import json
+
+    from heliograph.files.network_file import load_network
+    from heliograph.numerics.check import fail
+    from heliograph.serving.fleet import Options
+    from heliograph.serving.loop import keep_running
+    from heliograph.serving.message import schema as message_schema
+    from heliograph.serving.output import schema as output_schema
+    from heliograph.serving.pipe import Pipe
+    from heliograph.serving.service import Service
+
+    if schema:
+        print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
+        return
+    if network is None:
+        raise fail("serve", "a network, such as my_network.py", "none")
+    options = Options(window, ahead, float("inf") if leap is None else leap)
+    service = Service(load_network(network), options)
+    asyncio.run(keep_running(service, Pipe()))
