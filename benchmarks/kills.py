@@ -23,7 +23,7 @@ from heliograph.serving.identity import identity
 from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
-from heliograph.serving.store import JOURNAL, Store
+from heliograph.serving.store import Store
 
 NETWORK = """
 import jax.numpy as jnp
@@ -124,8 +124,7 @@ def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict
         plants = {name: plant_from(name, kept.body, fleet) for name, kept in place.load(names).items()}
         for plant in plants.values():
             plant.links = {}  # what came again was counted
-        with place._engine.connect() as connection:
-            rows = {row.id: json.loads(row.body) for row in connection.execute(JOURNAL.select()).all()}
+        rows = {each.number: json.loads(each.body) for each in place.entries()}
         finals = sorted(
             (one["plant"], one["time"], one["estimates"]) for one in rows.values() if one["kind"] == "final"
         )
