@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from time import sleep
@@ -83,8 +84,12 @@ class Running:
 
     def end(self) -> int:
         """Wait for its end; its exit code."""
+        assert self.process.stdin is not None and self.process.stdout is not None
         code = self.process.wait()
         self._reader.join()
+        self.process.stdout.close()
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
         return code
 
 
@@ -128,6 +133,7 @@ def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict
         finals = sorted(
             (one["plant"], one["time"], one["estimates"]) for one in rows.values() if one["kind"] == "final"
         )
+        place.close()
         both.append(({name: plant_bytes(plant, fleet) for name, plant in plants.items()}, finals))
     (states, finals), (killed_states, killed_finals) = both
     moments = [(plant, time) for plant, time, _ in killed_finals]

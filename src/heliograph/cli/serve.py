@@ -1,5 +1,6 @@
 """`heliograph serve`: the filters of a network kept running, from messages to estimates."""
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -50,7 +51,10 @@ def serve(
         return
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
-    fleet = Fleet(Lanes(load_network(network)), Options(window, ahead, float("inf") if leap is None else leap))
+    lanes = Lanes(load_network(network))
+    if lanes.uneven:
+        print(f"heliograph: warning: predictions depend on when others are asked for: {lanes.uneven}", file=sys.stderr)
+    fleet = Fleet(lanes, Options(window, ahead, float("inf") if leap is None else leap))
     kept = _kept(fleet, store, process, from_snapshot)
     try:
         asyncio.run(keep_running(Service(fleet, kept), Pipe()))

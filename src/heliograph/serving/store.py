@@ -23,7 +23,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import InputError, fail
 from heliograph.serving.identity import Identity, check_same
 from heliograph.serving.keeping import ConflictError, Entry, Kept
 from heliograph.serving.output import Output
@@ -36,6 +36,7 @@ JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, 
 NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger))
 WHOSE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
 TOLD, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
+IDENTITY = "identity"
 AT_ONCE = 500  # names in one question
 
 
@@ -57,15 +58,23 @@ class Store:
         self._engine = _engine(self.url)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         try:
-            TABLES.create_all(self._engine)
-            with self._engine.begin() as connection:
-                found = dict(connection.execute(select(WHOSE.c.name, WHOSE.c.value)).all())
-                if not found:
-                    connection.execute(self._insert(WHOSE), [{"name": "identity", "value": json.dumps(mine)}])
+            check_same(f"store {self.name}", mine, self._whose(mine))
         except DBAPIError as error:
+            self.close()
             raise fail(f"store {self.name}", "a database that can be written", str(error.orig)) from None
-        if found:
-            check_same(f"store {self.name}", mine, json.loads(found["identity"]))
+        except InputError:
+            self.close()
+            raise
+
+    def _whose(self, mine: Identity) -> Identity:
+        """What the store is of: of this network, if it is new."""
+        TABLES.create_all(self._engine)
+        with self._engine.begin() as connection:
+            kept = connection.execute(select(WHOSE.c.value).where(WHOSE.c.name == IDENTITY)).scalar()
+            if kept is None:
+                connection.execute(self._insert(WHOSE), [{"name": IDENTITY, "value": json.dumps(mine)}])
+        found: Identity = mine if kept is None else json.loads(kept)
+        return found
 
     @property
     def name(self) -> str:
