@@ -23,8 +23,8 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
+from heliograph.live.identity import Identity, check_same
 from heliograph.numerics.check import InputError, fail
-from heliograph.serving.identity import Identity, check_same
 from heliograph.serving.keeping import ConflictError, Entry, Kept
 from heliograph.serving.output import Output
 
