@@ -21,6 +21,15 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "dask": "cluster",
     "distributed": "cluster",
     "gym_electric_motor": "motor",
+    "pydantic": "live",
+    "pydantic_core": "live",
+    "sqlalchemy": "live",
+    "prometheus_client": "live",
+    "starlette": "live",
+    "uvicorn": "live",
+    "aiomqtt": "live",
+    "nats": "live",
+    "psycopg": "postgres",
 }
 
 

@@ -1,0 +1,164 @@
+"""Plants of one network: each takes its events as a timeline does; what is due is stepped for all of them at once."""
+
+from collections.abc import Iterable
+from datetime import datetime
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.live.rows import BEFORE, HeldRow, Rows
+from heliograph.model.over_time import steps_covered
+from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.plant import Plant
+from heliograph.serving.pool import Pool
+
+FAR = 10_000  # steps that an event may be after the newest one: each of them has to be computed, while others wait
+
+
+class Options(NamedTuple):
+    """`window`: how late an event may be; `ahead`: how much later than its arrival its time may be; `leap`: how much
+    later than what arrived before; `capacity`: rows that a plant holds at most.
+    """
+
+    window: float = 10.0
+    ahead: float = 0.0
+    leap: float = np.inf
+    capacity: int = 1000
+
+
+class Settled(NamedTuple):
+    """A plant's rows that are final now, and its newest; `left`: slots to give back when these were read."""
+
+    plant: Plant
+    final: list[HeldRow]
+    newest: HeldRow
+    left: list[int]
+
+
+class Fleet:
+    """Events are taken one after another, and `settle` steps what they left to be done.
+
+    Estimates are those of a `Timeline` for each plant, with the same verdicts; the order of what is final is that
+    of time in each plant. Which plants share a fleet, and how events are cut into batches, changes no bit.
+    """
+
+    def __init__(self, lanes: Lanes, options: Options):
+        network = self.network = lanes.network
+        self.options, self.lanes = _checked(options), lanes
+        self.pool = Pool(lanes)
+        self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
+        self._sizes[INPUTS] = -1, self.lanes.given
+        sizes = [size for _, size in self._sizes.values()]
+        self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
+        self._width = self._places[-1].stop
+        covered = steps_covered(network)
+        self._end = np.inf if covered is None else covered - 1
+        self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
+        self._joint = self.lanes.dt is None or network.common is not None
+
+    def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
+        """A new plant, whose continuous time starts at `time`."""
+        begun = -1.0 if self.lanes.dt is None else time
+        slot = self.pool.take()
+        self.pool.start(slot, begun)
+        base = HeldRow((begun, BEFORE, 0), slot, self._width)
+        base.numbers[-1] = begun
+        return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
+
+    def end(self, plant: Plant) -> None:
+        """Let go of a plant: its slots are free."""
+        self.pool.give([row.slot for row in plant.rows.held])
+
+    def size(self, place: int) -> int:
+        """How many numbers an event of the node at this place has."""
+        part = self._places[place]
+        return part.stop - part.start
+
+    def rows(self, base: HeldRow) -> Rows:
+        """Rows that begin with this one."""
+        return Rows(base, self._joint, self._places, self.options.capacity)
+
+    def known(self, node: str, sequence: int, time: float, values: list[float | None], arrival: float) -> Known:
+        """An event as numbers.
+
+        Raises:
+            ValueError: an unknown node, another number of values than the node's, a time that is no step.
+        """
+        place, size = self._sizes.get(node, (0, -1))
+        if size < 0:
+            raise fail("message, node", f"one of {', '.join(self._sizes)}", repr(node)[:60])
+        if len(values) != size:
+            raise fail(f"message of {node!r}, values", f"{size} numbers", len(values))
+        if self.lanes.dt is None and not (0 <= time <= self._end and time == int(time)):
+            end = "" if self._end == np.inf else f" to {self._end:g}"
+            raise fail("message, time", f"a step, a whole number from 0{end}", time)
+        return Known(place, sequence, time, np.array(values, dtype=np.float64), arrival)
+
+    def take(self, plant: Plant, event: Known) -> Verdict:
+        """Judge an event and hold it if it is used."""
+        if event.time > plant.now + self._leap:
+            return "future"
+        rows, now = plant.rows, max(plant.now, event.arrival)
+        verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
+        if verdict != "used":
+            return verdict
+        place, row = rows.find(event)
+        if row is None:
+            row = HeldRow(rows.key(event), self.pool.take(), self._width)
+            rows.insert(place, row)
+        rows.fill(row, event)
+        plant.dirty = place if plant.dirty is None else min(plant.dirty, place)
+        plant.now = now
+        return verdict
+
+    def settle(self, touched: Iterable[Plant], all_: bool = False) -> list[Settled]:
+        """Step what is due, and let what is older than the window, or all, become final."""
+        plants = list(touched)
+        chains = [chain for plant in plants if (chain := plant.chain())]
+        for chain in chains:
+            slots = [row.slot for row in chain]
+            self.pool.table[slots, self.pool.numbers] = np.array([row.numbers for row in chain])
+        for before, after, at in _rounds(chains, self.lanes.dt is None):
+            self.pool.step(np.array(before), np.array(after), np.array(at))
+        back = -np.inf if all_ else self.options.window
+        ends = [(plant, *plant.settle(plant.now - back)) for plant in plants]
+        return [Settled(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
+
+    def told(self, slots: list[int]) -> list[list[float]]:
+        """What the filters told after the rows in these slots."""
+        found: list[list[float]] = self.pool.table[slots, self.pool.told].tolist() if slots else []
+        return found
+
+    def forget(self, settled: Iterable[Settled]) -> None:
+        """Give slots back, once what was told there is read."""
+        for each in settled:
+            self.pool.give(each.left)
+
+
+def _checked(options: Options) -> Options:
+    leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
+    window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))
+    return Options(window, ahead, float(leap), check_count("capacity", options.capacity))
+
+
+Round = tuple[list[int], list[int], list[float]]  # slots to step from, slots to step into, and the number of the step
+
+
+def _rounds(chains: Iterable[list[HeldRow]], by_steps: bool) -> list[Round]:
+    """The steps along each chain, those that come at the same turn together: at most one of each chain."""
+    rounds: list[Round] = []
+    for chain in chains:
+        turn = 0
+        for one, two in pairwise(chain):
+            before, last = one.slot, two.key[0]
+            for at in range(int(one.key[0]) + 1, int(last) + 1) if by_steps else (last,):
+                if turn == len(rounds):
+                    rounds.append(([], [], []))
+                rounds[turn][0].append(before)
+                rounds[turn][1].append(two.slot)
+                rounds[turn][2].append(at)
+                before, turn = two.slot, turn + 1
+    return rounds

@@ -1,0 +1,70 @@
+"""What comes in: one event of one plant, as JSON; its schema is the documentation that a sender needs."""
+
+from datetime import datetime
+from typing import Annotated, Any
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from heliograph.numerics.check import fail, shown
+
+Name = Annotated[str, Field(max_length=200)]
+Moment = float | AwareDatetime
+MOMENT = "a finite number, or an ISO 8601 date with a zone"
+LONGEST = 1 << 20  # bytes of a message; what is longer is refused unread
+
+
+class Message(BaseModel):
+    """What a node of a plant measured, and the plant's inputs at that time, which may be left out.
+
+    A node, its number there and a time name an event: sent again it is a duplicate and changes nothing.
+    """
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+
+    plant: Name = Field("", description="Which of the plants that are of this network; one needs no name.")
+    node: Name = Field(description='A node of the network, or "inputs": then the values are the plant\'s inputs.')
+    sequence: int = Field(ge=0, lt=2**63, description="The node's own count; gaps in it are what was lost.")
+    time: Moment = Field(description="When it was measured: steps, seconds, or an ISO 8601 date with a zone.")
+    values: list[float | None] = Field(default=[], description="What was heard; null did not arrive.")
+    inputs: list[float | None] | None = Field(None, description="The plant's inputs without dt; null stays as it was.")
+    arrival: Moment | None = Field(None, description="When it was heard; at once if left out.")
+
+
+_READER = TypeAdapter(Message)
+
+
+def read_message(payload: bytes) -> Message:
+    """The message in a line of JSON.
+
+    Raises:
+        ValueError: what is no message; one line that names the part.
+    """
+    if len(payload) > LONGEST:
+        raise fail("message", f"at most {LONGEST} bytes", len(payload))
+    try:
+        return _READER.validate_json(payload)
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_context=False)[0]
+        part = str(first["loc"][0]) if first["loc"] else ""
+        wanted = MOMENT if part in ("time", "arrival") else first["msg"][:1].lower() + first["msg"][1:]
+        raise fail(f"message, {part}" if part else "message", wanted, shown(first["input"])) from None
+
+
+def seconds(moment: float | datetime, origin: datetime | None) -> float:
+    """A time as a number: of dates the seconds since `origin`, exact to the microsecond before they are one.
+
+    Raises:
+        ValueError: a date where times are numbers, or a number where they are dates.
+    """
+    if isinstance(moment, datetime):
+        if origin is None:
+            raise fail("message, time", "a number, as this plant's times are", moment.isoformat())
+        return (moment - origin).total_seconds()
+    if origin is not None:
+        raise fail("message, time", "a date, as this plant's times are", moment)
+    return moment
+
+
+def schema() -> dict[str, Any]:
+    """JSON schema of a message."""
+    return Message.model_json_schema()

@@ -1,0 +1,67 @@
+"""The rows that all plants hold, in one table: what was heard, what the filters knew after it, what they told."""
+
+import numpy as np
+
+from heliograph.serving.lanes import Lanes
+
+FEWEST = 1024  # rows of the table at first; it doubles when it is full
+
+
+class Pool:
+    """A row in each slot: (state, told, inputs held, step, heard, inputs given, time); slots are taken and given back.
+
+    `numbers` are the last columns, as a timeline's rows have them.
+    """
+
+    def __init__(self, lanes: Lanes):
+        self.lanes = lanes
+        ends = np.cumsum([lanes.state.size, lanes.told.size, lanes.given, 1, lanes.received + lanes.given + 1])
+        self.state, self.told, self.held, self.at, self.numbers = (
+            slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
+        )
+        self.table = np.zeros((FEWEST, int(ends[-1])))
+        self._free = list(range(FEWEST - 1, -1, -1))
+
+    @property
+    def used(self) -> int:
+        """How many slots are taken."""
+        return len(self.table) - len(self._free)
+
+    def take(self) -> int:
+        """A slot of one's own."""
+        if not self._free:
+            count = len(self.table)
+            self.table = np.concatenate([self.table, np.zeros_like(self.table)])
+            self._free = list(range(2 * count - 1, count - 1, -1))
+        return self._free.pop()
+
+    def give(self, slots: list[int]) -> None:
+        """Slots that nobody needs any more."""
+        self._free += slots
+
+    def start(self, slot: int, time: float) -> None:
+        """What is known before anything was heard."""
+        row = self.table[slot]
+        row[:] = 0.0
+        row[self.state], row[self.at], row[self.numbers] = self.lanes.start, -1.0, np.nan
+        row[-1] = time
+
+    def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
+        """Step from the rows in these slots into others. `at`: the number of the step where time counts steps.
+
+        There a row is stepped into as often as there are steps since the row before; it is heard at the last.
+        """
+        lanes, table = self.lanes, self.table
+        numbers, held = table[after, self.numbers], table[before, self.held]
+        heard, given = numbers[:, : lanes.received], numbers[:, lanes.received : -1]
+        now_held = np.where(np.isnan(given), held, given)
+        if lanes.dt is None:
+            there = (at == numbers[:, -1])[:, None]
+            heard, u = np.where(there, heard, np.nan), np.where(there, now_held, held)
+            now_held, k = u, at
+        else:
+            u = np.insert(held, lanes.dt, numbers[:, -1] - table[before, -1], axis=1)
+            k = table[before, self.at.start] + 1
+        done = lanes.step(np.concatenate([table[before, self.state], heard, u, k[:, None]], axis=1))
+        table[after, : self.told.stop] = done
+        table[after, self.held], table[after, self.at.start] = now_held, k

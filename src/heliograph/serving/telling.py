@@ -1,0 +1,37 @@
+"""Estimates and refusals as lines of JSON."""
+
+from typing import Any
+
+from pydantic_core import to_json
+
+from heliograph.serving.lanes import Lanes, Place
+
+
+class Teller:
+    """Writes what a network's filters tell as lines; what is no finite number is null."""
+
+    def __init__(self, lanes: Lanes):
+        self._n = len(lanes.network.states)
+        self._nodes: dict[str, list[Place]] = {}
+        for place in lanes.places:
+            self._nodes.setdefault(place.node, []).append(place)
+
+    def estimates(self, kind: str, plant: str, time: float | str, told: list[float]) -> bytes:
+        """The filters' estimates after a row, from the numbers that they told there."""
+        found = {
+            node: {place.filter: self._filter(place, told) for place in places} for node, places in self._nodes.items()
+        }
+        return line({"kind": kind, "plant": plant, "time": time, "estimates": found})
+
+    def _filter(self, place: Place, told: list[float]) -> dict[str, Any]:
+        n, mean, begin, surprise = self._n, place.mean, place.covariance, place.surprise
+        covariance = None if place.claim == "none" else [told[i : i + n] for i in range(begin, begin + n * n, n)]
+        found: dict[str, Any] = {"mean": told[mean : mean + n], "covariance": covariance, "claim": place.claim}
+        if surprise is not None:
+            found["nis"], found["heard"] = told[surprise], int(told[surprise + 1])
+        return found
+
+
+def line(parts: dict[str, Any]) -> bytes:
+    """One line of JSON, without its end."""
+    return to_json(parts, inf_nan_mode="null")
