@@ -9,7 +9,7 @@ from .certificate import (
 from .criterion import (
     Error as Error,
 )
-from .network_design import (
+from .outcome import (
     NetworkDesign as NetworkDesign,
 )
 from .sent import (
