@@ -41,9 +41,16 @@ def one_hop(amplification):
     return hg.Network(PLANT, {"node": hg.Node(SUM, hg.hop(FADING, 0.3, amplification=amplification), {})})
 
 
+def uncertain(amplification):
+    """The mean gain is anything from .76 to 1.16."""
+    law = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3], radius=[0.1, 0.0, 0.1])
+    return hg.Network(PLANT, {"node": hg.Node(SUM, hg.hop(law, 0.3, amplification=amplification), {})})
+
+
 CASES = {
     "shared gain": (shared, {"amplifications": ([0.7, 1.3], 0.1, 5.0)}),
     "told losses": (told_losses, {"amplification": (1.2, 0.1, 5.0), "arrival": (0.6, 0.1, 0.9)}),
+    "uncertain": (uncertain, {"amplification": (1.2, 0.1, 5.0)}),
     "told modes": (told_modes, {"amplification": (1.2, 0.1, 5.0), "stays": (0.6, 0.1, 0.9)}),
 }
 
@@ -56,9 +63,10 @@ def problem(request):
 
 def test_gradients_are_those_of_differences(problem):
     _, one = problem
-    x, h = one.numbers.start, 2e-3
+    x, relative = one.numbers.start, 2e-3
     slopes = one.at(x)[2]
     for i in range(len(x)):
+        h = relative * x[i]
         ends = [one.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
         errors = [np.sum(one.weight * end[1].parts.sum(axis=0)) for end in ends]
         for each, slope in ((errors, slopes.error[i]), ([end[0].powers for end in ends], slopes.powers[:, i])):
@@ -103,6 +111,30 @@ def test_told_losses_are_bounded_by_what_drawn_losses_leave():
         total.append(np.trace(p))
     mean = np.mean(total[100:])
     assert mean <= bound <= 1.05 * mean
+
+
+def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
+    """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
+    found = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
+    node = found.network.nodes["node"]
+    one = Problem(uncertain, as_numbers({"amplification": (1.2, 1.2, 1.2)}), Error().matrix)
+    k = one.at(np.append(1.2, found.numbers["young"]))[1].gains[0]
+    a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
+    for p in (0.2, 0.3, 0.4):
+        values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])
+        z = np.zeros((4, 4))
+        for _ in range(400):  # E (x, e)(x, e)', e+ = (I - K c) e - K (g - 1) c x - K (g v + n)
+            moved = np.block([[a, np.zeros((2, 2))], [np.zeros((2, 2)), a]]) @ z
+            moved = moved @ np.block([[a, np.zeros((2, 2))], [np.zeros((2, 2)), a]]).T + np.kron(np.ones((2, 2)), q)
+            z = np.zeros((4, 4))
+            for g, share in zip(values, law, strict=True):
+                f = np.block([[np.eye(2), np.zeros((2, 2))], [-(g - 1) * k @ c, np.eye(2) - k @ c]])
+                noise = np.zeros((4, 4))
+                noise[2:, 2:] = k @ k.T * (0.2 * (1.2 * g) ** 2 + 0.3)
+                z += share * (f @ moved @ f.T + noise)
+        assert np.linalg.eigvalsh(found.covariance[0] - z[2:, 2:])[0] > 0
+    filters = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((300, 0)))
+    assert found.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
 def test_a_relay_is_placed_where_the_closed_form_puts_it():

@@ -5,7 +5,6 @@ through the moments of channels and through the powers; a sequential quadratic p
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,7 +15,7 @@ from scipy.optimize import Bounds, NonlinearConstraint, minimize, nnls
 from heliograph.numerics.check import array, fail, instance, items, table
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Float
-from heliograph.planning.measuring import measured, transmitters_of
+from heliograph.planning.measuring import means_are_known, measured, transmitters_of
 from heliograph.planning.modes_told import Measured, Settled, settled, touched
 from heliograph.simulation.network import Network
 
@@ -25,6 +24,7 @@ Vector = Float[np.ndarray, "x"]
 
 ITERATIONS, FINE = 300, 1e-13
 AT = 1e-7  # relative: how near a limit is one that is reached
+YOUNG = "young"  # the scalar in the bound of an uncertain mean gain
 
 
 class Number(NamedTuple):
@@ -33,6 +33,9 @@ class Number(NamedTuple):
     start: np.ndarray
     low: np.ndarray
     high: np.ndarray
+
+
+SCALAR = Number(np.array(0.1), np.array(1e-6), np.array(1e3))
 
 
 class Numbers(NamedTuple):
@@ -86,6 +89,8 @@ def as_numbers(free: object) -> Numbers:
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
         found[name] = Number(start, low, high)
+    if YOUNG in found:
+        raise fail("free", f"names other than {YOUNG!r}, which stands for a scalar of the bound", YOUNG)
     if not found:
         raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
     return Numbers(found)
@@ -102,21 +107,30 @@ class Problem:
     """Error and powers of a network by the numbers that it is a function of, each point computed once."""
 
     def __init__(self, build: Build, numbers: Numbers, weight_of: Callable[[tuple[str, ...]], np.ndarray]):
-        self.build, self.numbers = build, numbers
+        self.build, self.numbers, self.young = build, numbers, False
         network = self.network(numbers.start)
+        if not means_are_known(network):
+            self.young, self.numbers = True, Numbers(numbers.each | {YOUNG: SCALAR})
         self.names, self.weight = transmitters_of(network), weight_of(network.states)
-        self._measured = compiled(partial(_measure, self._traced))
-        self._slopes = compiled(partial(_slopes, self._traced))
+        self._measured = compiled(self._measure)
+        self._slopes = compiled(self._differentiate)
         self._last: tuple[bytes, Measured, Settled, Slopes] | None = None
 
     def network(self, x: Vector) -> Network:
         """The network at these numbers."""
-        values = {name: float(v) if np.ndim(v) == 0 else v for name, v in self.numbers.named(x).items()}
+        named = self.numbers.named(x).items()
+        values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
 
-    def _traced(self, x: Array) -> Network:
-        return self.build(**self.numbers.named(x))
+    def _measure(self, x: Array) -> Measured:
+        values = self.numbers.named(jnp.asarray(x))
+        young = values.pop(YOUNG) if self.young else jnp.zeros(())
+        return measured(self.build(**values), young)
+
+    def _differentiate(self, x: Array, fixed: Settled) -> Slopes:
+        error = jax.grad(lambda free: touched(self._measure(free), fixed))(jnp.asarray(x))
+        return Slopes(error, jax.jacrev(lambda free: self._measure(free).powers)(jnp.asarray(x)))
 
     def at(self, x: Vector) -> tuple[Measured, Settled, Slopes]:
         """Everything at a point."""
@@ -138,16 +152,6 @@ class Problem:
     def powers(self, x: Vector) -> Float[np.ndarray, "hops"]:
         """What each transmitter sends."""
         return np.asarray(self.at(x)[0].powers)
-
-
-def _measure(traced: Callable[[Array], Network], x: Array) -> Measured:
-    return measured(traced(jnp.asarray(x)))
-
-
-def _slopes(traced: Callable[[Array], Network], x: Array, fixed: Settled) -> Slopes:
-    x = jnp.asarray(x)
-    error = jax.grad(lambda free: touched(measured(traced(free)), fixed))(x)
-    return Slopes(error, jax.jacrev(lambda free: measured(traced(free)).powers)(x))
 
 
 class Ended(NamedTuple):

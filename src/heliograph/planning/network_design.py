@@ -55,8 +55,8 @@ def design(
 
     Numbers of any kind are free where `network` is a function of them that returns a network, and `free` says
     {name: (start, low, high)}: amplifications, weights, places. Channels may then share gains, tell of their modes or
-    losses, or have uncertain probabilities that leave the mean gain as it is (the error is an upper bound then); the
-    error is steady.
+    losses, or have uncertain probabilities: the error is an upper bound then, with "young" among the numbers found, the
+    scalar in it. The error is steady.
 
     With one free hop a path the problem is convex, and the certificate is a gap. With more it is not: descents begin
     from every choice of the paths that send, if there are no more than `starts`, else from drawn ones (`seed`), and the
@@ -69,9 +69,8 @@ def design(
     """
     error = Error() if error is None else instance("error", error, Error, "an Error")
     if not isinstance(network, Network) and callable(network):
-        return design_numbers(
-            network, free, error, budget, wanted, check_count("starts", starts), check_seed("seed", seed)
-        )
+        count, draws = check_count("starts", starts), check_seed("seed", seed)
+        return design_numbers(network, free, error, budget, wanted, count, draws)
     instance("network", network, Network, "a Network, or a function of free numbers that returns one")
     if budget is None and wanted is None:
         raise fail("design", "a budget of power or a wanted error", "neither")

@@ -28,12 +28,11 @@ def design_numbers(
     """
     if error.steps > 1 or error.horizon is not None or error.worst:
         raise fail("error of a network of free numbers", "a steady weighted trace", "another")
-    numbers = as_numbers({} if free is None else free)
-    problem = Problem(build, numbers, error.matrix)
+    problem = Problem(build, as_numbers({} if free is None else free), error.matrix)
     rows, most = _limits(problem, budget)
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
     draws = np.random.default_rng(seed)
-    begin = [numbers.start, *(numbers.drawn(draws) for _ in range(starts - 1))]
+    begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
     best = min((descend_numbers(problem, x, rows, most, least) for x in begin), key=lambda one: one.value)
     if not np.isfinite(best.value):
         raise _unmet(problem, budget, wanted)
