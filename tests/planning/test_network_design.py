@@ -8,8 +8,9 @@ from heliograph.planning import Budget, Error
 from heliograph.planning.criterion import Error as Criterion
 from heliograph.planning.envelope import Whole, envelope, split
 from heliograph.planning.objective import of_hops
+from heliograph.planning.paths import heard
 from heliograph.planning.reading import paths_of
-from tests.planning.published import KAPPA, NAMES, NOISES, ROWS, one_hop, two_hops
+from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, two_hops
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +138,29 @@ def test_the_designed_network_claims_the_designed_error(single):
     found = hg.design(single, budget=10)
     settled = settled_covariance(found.network.fused["best"])
     assert np.trace(settled) == pytest.approx(found.error, rel=1e-9)
+
+
+def test_drawn_runs_have_the_designed_error_and_power(single):
+    """The filter's gain on runs drawn here: hops with gains of two values, noise, and the powers as amplifications."""
+    found, runs, draws = hg.design(single, budget=10), 5_000, np.random.default_rng(5)
+    p, power = found.covariance[0], np.array([found.powers[f"{n}.hop1"][0] for n in NAMES])
+    pi = np.linalg.solve(np.eye(9) - np.kron(A, A), Q.ravel()).reshape(3, 3)
+    amplify = np.sqrt(power / (np.einsum("ia,ab,ib->i", ROWS, pi, ROWS) + NOISES))
+    paths, _ = paths_of(single, Error())
+    told = heard(paths, power[None]).information[0]
+    gain, mean = p @ ROWS.T * told, FIRST**-1.5
+    x = draws.multivariate_normal(np.zeros(3), pi, runs)
+    e = draws.multivariate_normal(np.zeros(3), p, runs)
+    for _ in range(40):  # from the right variance to the right joint law: .95^40
+        w = draws.multivariate_normal(np.zeros(3), Q, runs)
+        x, e = x @ A.T + w, e @ A.T + w
+        y = x @ ROWS.T + draws.normal(size=(runs, 6)) * np.sqrt(NOISES)
+        sent = amplify * y
+        g = mean * (1 + np.sqrt(KAPPA - 1) * draws.choice([-1, 1], size=(runs, 6)))
+        z = (g * sent + draws.normal(size=(runs, 6))) / (mean * amplify)
+        e = e - (z - (x - e) @ ROWS.T) @ gain.T
+    for drawn, expected in ((np.sum(e**2, axis=1), found.error), (np.sum(sent**2, axis=1), found.total)):
+        assert abs(drawn.mean() - expected) < 3 * drawn.std() / np.sqrt(runs)
 
 
 def test_an_untold_loss_is_fading(single):
