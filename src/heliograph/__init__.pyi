@@ -91,11 +91,26 @@ from .simulation.record import (
 from .simulation.sums import (
     Statistics as Statistics,
 )
+from .learning.parameters import (
+    free as free,
+)
+from .learning.fitting import (
+    fit as fit,
+)
+from .learning.identification import (
+    identifiable as identifiable,
+)
 from .live.stream import (
     Stream as Stream,
 )
 from .live.timeline import (
     Timeline as Timeline,
+)
+from .planning.network_design import (
+    design as design,
+)
+from .planning.sent import (
+    power as power,
 )
 from .report.progress import (
     show_progress as show_progress,
