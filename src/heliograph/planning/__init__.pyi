@@ -7,6 +7,14 @@ from .allocation import (
 from .budget import (
     Budget as Budget,
 )
+from .coherent import (
+    CoherentDesign as CoherentDesign,
+    CoherentSum as CoherentSum,
+    coherent_least_power as coherent_least_power,
+    coherent_powers as coherent_powers,
+    coherent_programme as coherent_programme,
+    coherent_sum as coherent_sum,
+)
 from .criterion import (
     Error as Error,
 )
@@ -23,4 +31,9 @@ from .paths import (
 from .semidefinite import (
     semidefinite_least_power as semidefinite_least_power,
     semidefinite_powers as semidefinite_powers,
+)
+from .splits import (
+    path_noise as path_noise,
+    power_for_noise as power_for_noise,
+    split_power as split_power,
 )
