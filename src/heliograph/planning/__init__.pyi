@@ -7,6 +7,14 @@ from .allocation import (
 from .budget import (
     Budget as Budget,
 )
+from .bursts import (
+    Bursts as Bursts,
+    burst_sending as burst_sending,
+)
+from .choose import (
+    Choice as Choice,
+    choose_sensors as choose_sensors,
+)
 from .coherent import (
     CoherentDesign as CoherentDesign,
     CoherentSum as CoherentSum,
@@ -27,6 +35,15 @@ from .independent import (
 )
 from .paths import (
     Paths as Paths,
+)
+from .relay_line import (
+    RelayLine as RelayLine,
+    best_relays as best_relays,
+    relay_line as relay_line,
+)
+from .schedules import (
+    SendingSchedule as SendingSchedule,
+    best_schedule as best_schedule,
 )
 from .semidefinite import (
     semidefinite_least_power as semidefinite_least_power,
