@@ -41,6 +41,12 @@ from .relay_line import (
     best_relays as best_relays,
     relay_line as relay_line,
 )
+from .relay_sites import (
+    Radio as Radio,
+    RelayMap as RelayMap,
+    RelayScene as RelayScene,
+    relay_map as relay_map,
+)
 from .schedules import (
     SendingSchedule as SendingSchedule,
     best_schedule as best_schedule,

@@ -68,11 +68,11 @@ def relay_line(
     hops = check_count("relays", relays, 0) + 1
     if hops * least > 1:
         raise fail("relays", f"hops of {least:g} of the way each", f"{hops} of them")
-    short = _short(r, e, hops, max(least, SHORTEST))
-    lengths = np.append(np.full(hops - 1, short), 1 - (hops - 1) * short)
+    shortest = max(least, SHORTEST) if hops > 1 else 1.0
     equal = np.full(hops, 1 / hops)
     even = path_noise(r * equal**e, 1.0)
-    lengths = min((equal, lengths), key=lambda d: path_noise(r * d**e, 1.0))
+    tried = [_lengths(hops, short) for short in (_short(r, e, hops, shortest), min(shortest, 1 / hops))]
+    lengths = min((equal, *tried), key=lambda d: path_noise(r * d**e, 1.0))
     shares = split_power(r * lengths**e, 1.0) if r else lengths.copy()
     return RelayLine(lengths, shares, k**hops * path_noise(r * lengths**e, 1.0), k**hops * even, k * (1 + r))
 
@@ -98,7 +98,7 @@ def _short(rho: float, exponent: float, hops: int, least: float) -> float:
         return 1 / hops
 
     def noise(short: float) -> float:
-        return _log_noise(rho, exponent, np.append(np.full(hops - 1, short), 1 - (hops - 1) * short))
+        return float(np.log1p(rho * _lengths(hops, short) ** (exponent - 1)).sum())
 
     tried = np.unique(np.append(np.geomspace(least, 1 / hops, GRID), np.linspace(least, 1 / hops, GRID)))
     values = np.array([noise(x) for x in tried])
@@ -108,5 +108,6 @@ def _short(rho: float, exponent: float, hops: int, least: float) -> float:
     return float(found.x) if found.fun < values[at] else float(tried[at])
 
 
-def _log_noise(rho: float, exponent: float, lengths: Float[np.ndarray, "H"]) -> float:
-    return float(np.log1p(rho * lengths ** (exponent - 1)).sum())
+def _lengths(hops: int, short: float) -> Float[np.ndarray, "H"]:
+    """All hops but one of this length."""
+    return np.append(np.full(hops - 1, short), 1 - (hops - 1) * short)
