@@ -11,6 +11,9 @@ from .bursts import (
     Bursts as Bursts,
     burst_sending as burst_sending,
 )
+from .certificate import (
+    Certificate as Certificate,
+)
 from .choose import (
     Choice as Choice,
     choose_sensors as choose_sensors,
@@ -33,8 +36,14 @@ from .fixed_point import (
 from .independent import (
     independent_paths as independent_paths,
 )
+from .network_design import (
+    NetworkDesign as NetworkDesign,
+)
 from .paths import (
     Paths as Paths,
+)
+from .reading import (
+    paths_of as paths_of,
 )
 from .relay_line import (
     RelayLine as RelayLine,
@@ -54,6 +63,9 @@ from .schedules import (
 from .semidefinite import (
     semidefinite_least_power as semidefinite_least_power,
     semidefinite_powers as semidefinite_powers,
+)
+from .sent import (
+    SentPower as SentPower,
 )
 from .splits import (
     path_noise as path_noise,
