@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import covariances
 from heliograph.planning.allocation import Allocation, LeastPower
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 LINEAR = 1e-12  # a, of s kappa, below which j = p / b
 KEPT = 1e-14  # eigenvalue of W or Q, of the largest, that counts
+LOUD = 1e3  # of a hop's noise: powers are measured in no larger units
+TINY = float(np.finfo(np.float64).tiny)
 FLAT = 1e-9  # of a variance: directions in which the error is smaller are not scaled up to it
 
 
@@ -53,7 +55,7 @@ def semidefinite_powers(
 
 def semidefinite_least_power(
     paths: Paths,
-    wanted: float,
+    wanted: ArrayLike,
     budget: Budget | None = None,
     error: Error | None = None,
     states: tuple[str, ...] | None = None,
@@ -64,7 +66,7 @@ def semidefinite_least_power(
         ValueError: an error that no power reaches, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
-    worst = error is not None and error.worst
+    worst, wanted = error is not None and error.worst, float(scalar("wanted error", wanted, 0.0))
     problem = swapped(paths, budget, error, states)
 
     def value(p: Powers) -> float:
@@ -130,8 +132,8 @@ class _Programme:
         paths = self.problem.paths
         free = np.minimum(self.problem.allowed.peak, self.problem.allowed.each)
         total = self.problem.allowed.total / free.shape[1]
-        self.size = np.minimum(free, total if np.isfinite(total) else np.maximum(paths.alpha, np.finfo(float).tiny))
-        self.size = np.where(self.size > 0, self.size, 1.0)
+        self.size = np.minimum(free, total if np.isfinite(total) else np.maximum(paths.alpha, TINY))
+        self.size = np.where(self.size > 0, np.minimum(self.size, LOUD * np.maximum(paths.alpha, TINY)), 1.0)
         p = covariances(paths.plants, informations(paths, heard(paths, self.size).information)).mean(axis=0)
         unit = np.sqrt(np.diagonal(p))
         unit = np.where(unit > 0, unit, 1.0)
