@@ -54,6 +54,7 @@ from .relay_sites import (
     Radio as Radio,
     RelayMap as RelayMap,
     RelayScene as RelayScene,
+    choose_relays as choose_relays,
     relay_map as relay_map,
 )
 from .schedules import (

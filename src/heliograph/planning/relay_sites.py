@@ -8,6 +8,8 @@ any site gives a sensor: with it for every sensor the error is below that of any
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
+from math import comb
 
 import numpy as np
 from scipy.optimize import minimize
@@ -16,6 +18,7 @@ from heliograph.numerics.check import array, check_count, covariance, fail, inst
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants, covariances
+from heliograph.planning.choose import COMPARED, Choice, greedy, swapped
 from heliograph.planning.criterion import Error
 from heliograph.planning.independent import at_least, independent_paths, steady_moment
 from heliograph.planning.paths import Paths
@@ -204,6 +207,31 @@ def relay_map(
     error, sites = min(found, key=lambda pair: pair[0])
     direct = scene.error(np.zeros((0, 2)), power)
     return RelayMap(scene, power, xs, ys, errors, direct, sites, error, min(scene.bound(power), error), len(begun))
+
+
+def choose_relays(
+    scene: RelayScene, total: ArrayLike, sites: ArrayLike, count: int, compared: int = COMPARED
+) -> Choice:
+    """The `count` sites (R, 2) for relays at which the steady error is least, at a total power.
+
+    All choices are compared if they are no more than `compared`; else greedy choice is bettered by swaps. The bound is
+    the error with relays at all the sites.
+
+    Raises:
+        ValueError: no power, more relays than sites.
+    """
+    power = float(scalar("total power", total, np.finfo(float).tiny))
+    places = array("sites of relays", sites, (None, 2))
+    if check_count("relays to choose", count) > len(places):
+        raise fail("relays to choose", f"at most the {len(places)} sites there are", count)
+
+    def of(chosen: tuple[int, ...]) -> float:
+        return scene.error(places[list(chosen)], power)
+
+    exact = comb(len(places), count) <= compared
+    every = combinations(range(len(places)), count)
+    best = min(every, key=of) if exact else swapped(of, len(places), greedy(of, len(places), count))
+    return Choice(best, of(best), min(scene.error(places, power), of(best)), exact)
 
 
 def _completed(
