@@ -36,7 +36,7 @@ from .fixed_point import (
 from .independent import (
     independent_paths as independent_paths,
 )
-from .network_design import (
+from .outcome import (
     NetworkDesign as NetworkDesign,
 )
 from .paths import (

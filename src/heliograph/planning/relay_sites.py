@@ -23,6 +23,7 @@ from heliograph.planning.criterion import Error
 from heliograph.planning.independent import at_least, independent_paths, steady_moment
 from heliograph.planning.paths import Paths
 from heliograph.planning.relay_line import relay_line
+from heliograph.planning.splits import path_noise
 
 FOUND = 1e-9  # relative, of a minimum found by search, by which the bound stays below
 
@@ -139,8 +140,12 @@ class RelayScene:
         least = []
         for d in _distance(self.sensors, self.receiver):
             rho = float(radio.noise(d)) / power
-            near = d <= 2 * radio.nearest  # both hops may be as short as counts
-            relayed = radio.kappa if near else relay_line(rho, radio.exponent, 1, radio.kappa, radio.nearest / d).noise
+            if d <= 2 * radio.nearest:  # both hops may be as short as counts
+                relayed = radio.kappa**2 * path_noise(
+                    np.full(2, float(radio.noise(np.zeros(()))) / power), 1.0
+                )
+            else:
+                relayed = relay_line(rho, radio.exponent, 1, radio.kappa, radio.nearest / d).noise
             least.append(min(relayed, radio.kappa * (1 + rho)))
         return self.error_of(np.array(least)) * (1 - FOUND)
 
