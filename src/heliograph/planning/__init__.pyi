@@ -50,10 +50,12 @@ from .relay_line import (
     best_relays as best_relays,
     relay_line as relay_line,
 )
-from .relay_sites import (
+from .relay_scene import (
     Radio as Radio,
-    RelayMap as RelayMap,
     RelayScene as RelayScene,
+)
+from .relay_sites import (
+    RelayMap as RelayMap,
     choose_relays as choose_relays,
     relay_map as relay_map,
 )
