@@ -91,6 +91,15 @@ from .simulation.record import (
 from .simulation.sums import (
     Statistics as Statistics,
 )
+from .learning.parameters import (
+    free as free,
+)
+from .learning.fitting import (
+    fit as fit,
+)
+from .learning.identification import (
+    identifiable as identifiable,
+)
 from .live.stream import (
     Stream as Stream,
 )

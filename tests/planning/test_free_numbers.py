@@ -183,11 +183,23 @@ def test_powers_and_amplifications_agree():
     assert capped.powers["node.hop1"][0] == pytest.approx(0.5, rel=1e-6) and capped.error > by_power.error
 
 
+def test_numbers_marked_where_they_stand_are_free():
+    def marked():
+        law = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3])
+        link = hg.hop(law, 0.3, amplification=hg.free(0.5, "amplification", "positive"))
+        return hg.Network(PLANT, {"node": hg.Node(SUM, link, {})})
+
+    found = hg.design(marked, budget=2, starts=1)
+    assert found.error == pytest.approx(hg.design(one_hop(1.0), budget=2).error, rel=1e-9)
+    assert hg.power(found.network).total == pytest.approx(2, rel=1e-9) and found.numbers["amplification"] > 0.5
+
+
 @pytest.mark.parametrize(
     ("free", "message"),
     [
-        ({}, "free: expected at least one number"),
-        (None, "free: expected at least one number"),
+        ({}, "free: expected the arguments of the function.*missing a required argument: 'amplification'"),
+        (None, "free: expected the arguments of the function"),
+        ({"amplification": (1.0, 0.0, 2.0), "b": (1.0, 0.0, 2.0)}, "free: expected .*unexpected keyword argument 'b'"),
         ({"amplification": (3.0, 0.0, 1.0)}, "free number 'amplification': expected a start between its ends"),
         ({"amplification": 3.0}, r"free number 'amplification': expected a list of \(start, low, high\)"),
     ],

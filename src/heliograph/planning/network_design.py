@@ -54,7 +54,8 @@ def design(
     one is given too).
 
     Numbers of any kind are free where `network` is a function of them that returns a network, and `free` says
-    {name: (start, low, high)}: amplifications, weights, places. Channels may then share gains, tell of their modes or
+    {name: (start, low, high)}: amplifications, weights, places; or of a function without arguments in which `hg.free`
+    marks them. Channels may then share gains, tell of their modes or
     losses, or have uncertain probabilities: the error is an upper bound then, with "young" among the numbers found, the
     scalar in it. The error is steady.
 

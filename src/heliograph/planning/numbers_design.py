@@ -1,14 +1,19 @@
 """Designs of networks that are functions of free numbers."""
 
+from inspect import signature
+from typing import Any
+
 import numpy as np
 
-from heliograph.numerics.check import fail, scalar
+from heliograph.learning.parameters import describe
+from heliograph.numerics.check import fail, scalar, table
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, allowed, as_budget
 from heliograph.planning.certificate import Certificate
 from heliograph.planning.criterion import Error
-from heliograph.planning.free_numbers import Build, Ended, Problem, as_numbers, descend_numbers
+from heliograph.planning.free_numbers import Build, Ended, Number, Numbers, Problem, as_numbers, descend_numbers
 from heliograph.planning.outcome import NetworkDesign
+from heliograph.simulation.network import Network
 
 
 def design_numbers(
@@ -28,7 +33,8 @@ def design_numbers(
     """
     if error.steps > 1 or error.horizon is not None or error.worst:
         raise fail("error of a network of free numbers", "a steady weighted trace", "another")
-    problem = Problem(build, as_numbers({} if free is None else free), error.matrix)
+    _check_arguments(build, free)
+    problem = Problem(*(_marked(build) if free is None else (build, as_numbers(free))), error.matrix)
     rows, most = _limits(problem, budget)
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
     draws = np.random.default_rng(seed)
@@ -37,6 +43,31 @@ def design_numbers(
     if not np.isfinite(best.value):
         raise _unmet(problem, budget, wanted)
     return _designed(problem, best, error, starts, least is not None)
+
+
+def _check_arguments(build: Build, free: object) -> None:
+    """Raise ValueError unless the function takes the free numbers by name, or without any no arguments."""
+    names = list(table("free", free, "(start, low, high)")) if free is not None else []
+    try:
+        signature(build).bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
+
+
+def _marked(build: Build) -> tuple[Build, Numbers]:
+    """A function without arguments as one of the numbers that `hg.free` marks in it, each anywhere it may be."""
+    description = describe(build)
+    found = {}
+    for one in description.parameters.every:
+        if one.domain.kind != "interval":
+            raise fail(f"free number {one.name!r}", "one between two limits", f"a {one.domain.kind}")
+        ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
+        found[one.name] = Number(np.asarray(one.start), *ends)
+
+    def built(**values: Any) -> Network:
+        return description.at(values)
+
+    return built, Numbers(found)
 
 
 def _limits(
