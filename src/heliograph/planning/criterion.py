@@ -24,7 +24,7 @@ class Error(eqx.Module):
     transmitters may have another power.
 
     Raises:
-        ValueError: a horizon and a period, an end without a horizon, a weight that is no covariance.
+        ValueError: a horizon and a period, an end without a horizon, a weight that is no covariance or weighs nothing.
     """
 
     weight: np.ndarray | dict[str, float] | None
@@ -67,13 +67,17 @@ class Error(eqx.Module):
         n = len(states)
         if self.weight is None:
             return np.eye(n)
-        if not isinstance(self.weight, dict):
-            return np.asarray(array(WEIGHT, self.weight, (n, n)))
-        unknown = sorted(set(self.weight) - set(states))
-        if unknown or not self.weight:
-            raise fail(WEIGHT, f"numbers for some of the states {list(states)}", unknown or "none")
-        diagonal = [self.weight.get(name, 0.0) for name in states]
-        return np.asarray(covariance(WEIGHT, np.diag(np.asarray(diagonal, dtype=float)), n))
+        if isinstance(self.weight, dict):
+            unknown = sorted(set(self.weight) - set(states))
+            if unknown:
+                raise fail(WEIGHT, f"numbers for some of the states {list(states)}", unknown)
+            diagonal = np.array([float(self.weight.get(name, 0.0)) for name in states])
+            matrix = covariance(WEIGHT, np.diag(diagonal), n)
+        else:
+            matrix = array(WEIGHT, self.weight, (n, n))
+        if not np.any(matrix):
+            raise fail(WEIGHT, "one that weighs something", "zero")
+        return np.asarray(matrix)
 
     def over(self) -> Float[np.ndarray, "time"]:
         """The share of each step in the error."""

@@ -94,7 +94,7 @@ class Envelope(NamedTuple):
 def envelope(whole: Whole, cap: PathPowers) -> Envelope:
     """Where the ray touches: D (1 - P l) = t, by bisection in log l, since the left side falls with l."""
     alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
-    largest = np.maximum(alpha.max(axis=-1), np.finfo(float).tiny)
+    largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
     low, high = np.log(1e-30 / largest), np.log(1e30 / largest)
     for _ in range(120):
         middle = (low + high) / 2

@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, shown
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.planning.budget import MET, Allowed, Budget, allowed, as_budget
@@ -17,6 +18,7 @@ from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.paths import Paths
 from heliograph.planning.reading import paths_of
 from heliograph.planning.relaxation import relaxed
+from heliograph.planning.relays_design import design_relays
 from heliograph.planning.search import is_convex, least_power, search, supports
 from heliograph.planning.transmitters import selected
 from heliograph.simulation.network import Network
@@ -37,7 +39,7 @@ class _Task(NamedTuple):
 
 
 def design(
-    network: Network | Build,
+    network: Network | RelayNetwork | Build,
     free: Sequence[str] | Mapping[str, object] | None = None,
     error: Error | None = None,
     budget: Budget | ArrayLike | None = None,
@@ -59,6 +61,9 @@ def design(
     losses, or have uncertain probabilities: the error is an upper bound then, with "young" among the numbers found, the
     scalar in it. The error is steady.
 
+    Of a `RelayNetwork` the gains are free with which its relays filter what they hear; they decide what each relay
+    sends, and the budget is what all relays together may send in each slot.
+
     With one free hop a path the problem is convex, and the certificate is a gap. With more it is not: descents begin
     from every choice of the paths that send, if there are no more than `starts`, else from drawn ones (`seed`), and the
     certificate is the global bound of the convex envelopes.
@@ -72,7 +77,9 @@ def design(
     if not isinstance(network, Network) and callable(network):
         count, draws = check_count("starts", starts), check_seed("seed", seed)
         return design_numbers(network, free, error, budget, wanted, count, draws)
-    instance("network", network, Network, "a Network, or a function of free numbers that returns one")
+    if isinstance(network, RelayNetwork):
+        return design_relays(network, free, error, budget, wanted)
+    instance("network", network, Network, "a Network, a RelayNetwork or a function that returns a Network")
     if budget is None and wanted is None:
         raise fail("design", "a budget of power or a wanted error", "neither")
     if isinstance(free, Mapping):
@@ -160,7 +167,7 @@ def _least(task: _Task, wanted: float) -> tuple[Float[np.ndarray, "time free"], 
         raise fail("wanted error", f"at least {least:.6g}, the least found within the budget", f"{wanted:.6g}")
     convex, (objective, own) = is_convex(task.paths.path[task.free]), (task.objective, limits)
     near = found.powers
-    stationarity = 1 - least_total(objective, own, near, wanted) / found.error
+    stationarity = 1 - least_total(objective, own, near, wanted) / found.error if found.error > 0 else 0.0
     if not convex:
         objective, own = relaxed(task.paths, task.objective, limits, task.free, task.held)
         lower = least_power(objective, own, wanted, [_of_paths(task, near)])

@@ -37,6 +37,8 @@ def routes(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], pref
         ValueError: a channel that is not made of independent chains, each for one number.
     """
     match channel:
+        case GainAndNoise() if not transmits(channel):  # a wire tells each number as it is
+            return [Route(row, {}) for row in np.asarray(channel.matrix) @ chosen]
         case Stack():
             return [
                 route for i, part in enumerate(channel.maps, 1) for route in routes(part, chosen, f"{prefix}part{i}.")
@@ -76,10 +78,11 @@ def _chain(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], pref
             hops[f"{prefix}hop{len(hops) + 1}"] = _hop(part)
         elif part.inputs != 1 or part.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
-    if not hops:
-        raise _unfit("a wire (give it a node of its own)")
-    last = list(hops)[-1]
-    hops[last] = (hops[last][0] * fading, hops[last][1])
+    if hops:
+        last = list(hops)[-1]
+        hops[last] = (hops[last][0] * fading, hops[last][1])
+    elif fading > 1:
+        raise _unfit("a wire that loses what it carries")
     return Route(row, hops)
 
 
@@ -133,8 +136,10 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     if first(plant).inputs:
         raise fail("plant of a design", "no inputs", list(first(plant).inputs))
     refuse_angles("design", plant)
-    if network.relays is not None or network.common is not None:
-        raise _unfit("relays that filter" if network.relays is not None else "nodes that share a channel")
+    if network.relays is not None:
+        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
+    if network.common is not None:
+        raise _unfit("nodes that share a channel (give a function of free numbers)")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
@@ -166,6 +171,8 @@ def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"
             found.rows.append(route.chosen @ np.asarray(sensor.matrix))
             found.second.append(float(route.chosen @ y[:-1, :-1] @ route.chosen))
             found.signal.append(found.second[-1] - float(route.chosen @ noise @ route.chosen))
+            if not route.hops and not found.second[-1] > found.signal[-1]:
+                raise fail(f"sensor of {name!r}", "noise, since a wire adds none", "none")
             for hop, (kappa, alpha) in route.hops.items():
                 found.kappa.append(kappa)
                 found.alpha.append(alpha)

@@ -60,6 +60,9 @@ def least_power(objective: Objective, limits: Allowed, wanted: float, starts: li
     Each start is raised until it does; a sequential quadratic programme lowers the total at that error. The best is
     mended on the budget itself: Newton's method for the total, whose price is the largest slope of the error.
     """
+    nothing = np.zeros(starts[0].shape)
+    if objective.value(nothing) <= wanted:
+        return Found(nothing, 0.0)
     found = []
     for start in starts:
         raised = _raised(objective, limits, wanted, start)
