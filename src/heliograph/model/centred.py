@@ -1,5 +1,7 @@
 """Signals that cost less: what sender and receiver both expect is taken off before sending and added back after."""
 
+from typing import overload
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +17,12 @@ from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+
+
+@overload
+def centred(channel: AbstractRandomAffine, reference: ArrayLike) -> AbstractRandomAffine: ...
+@overload
+def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel: ...
 
 
 def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel:
