@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.filters import fed_back_filter
 from heliograph.model import over_time
-from heliograph.planning import fed_back_channel, feedback_limit, path_noise
+from heliograph.planning import fed_back_channel, feedback_limit
+from heliograph.planning.feedback import noise_of_hops
 
 PLANT = hg.LinearPlant([[1.1]], 1.0, [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[1.0]], 0.5)
@@ -17,9 +18,9 @@ HOP = hg.hop(GAIN, 0.2 * 1.02)  # alpha = 0.2
 
 
 def test_noise_of_a_path_is_that_of_the_hops() -> None:
-    assert path_noise([HOP], [1.0]) == pytest.approx(1.02 * 1.2, rel=1e-14)
-    assert path_noise([HOP, HOP], [1.0, 2.0]) == pytest.approx(1.02**2 * 1.2 * 1.1, rel=1e-14)
-    assert path_noise([hg.hop(1.0, 0.0)], 5.0) == 1.0
+    assert noise_of_hops([HOP], [1.0]) == pytest.approx(1.02 * 1.2, rel=1e-14)
+    assert noise_of_hops([HOP, HOP], [1.0, 2.0]) == pytest.approx(1.02**2 * 1.2 * 1.1, rel=1e-14)
+    assert noise_of_hops([hg.hop(1.0, 0.0)], 5.0) == 1.0
 
 
 def test_unit_power_keeps_an_unstable_plant_for_ever() -> None:
@@ -95,6 +96,6 @@ def test_bad_input_is_one_clear_line() -> None:
     with pytest.raises(ValueError, match="shows every unstable mode"):
         feedback_limit(blind, hg.LinearSensor([[1.0, 0.0]], 0.1), [HOP], 1.0)
     with pytest.raises(ValueError, match="powers: expected positive numbers"):
-        path_noise([HOP], 0.0)
+        noise_of_hops([HOP], 0.0)
     with pytest.raises(ValueError, match="single hops of one number"):
-        path_noise([hg.parallel([HOP, HOP])], 1.0)
+        noise_of_hops([hg.parallel([HOP, HOP])], 1.0)

@@ -4,5 +4,4 @@ from .feedback import (
     FeedbackLimit as FeedbackLimit,
     fed_back_channel as fed_back_channel,
     feedback_limit as feedback_limit,
-    path_noise as path_noise,
 )

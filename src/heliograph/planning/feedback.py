@@ -71,7 +71,7 @@ def feedback_limit(
     a, q = plant_matrices(plant)
     c, r = sensor_matrices(sensor, len(a))
     _check_seen(a, c)
-    noise = path_noise(hops, powers)
+    noise = noise_of_hops(hops, powers)
     unstable = np.abs(np.linalg.eigvals(a))
     lam = float(np.prod(unstable[unstable > 1] ** 2))
     limit = lam / (lam - 1) if lam > 1 else np.inf
@@ -95,7 +95,7 @@ def fed_back_channel(
     a, q = plant_matrices(plant)
     c, r = sensor_matrices(sensor, len(a))
     links, p = _links(hops), _powers(powers, len(hops))
-    noise, steps = path_noise(hops, powers), check_count("horizon", horizon)
+    noise, steps = noise_of_hops(hops, powers), check_count("horizon", horizon)
     relays = [np.sqrt(then / (one.second * sent + one.noise)) for one, sent, then in zip(links, p, p[1:], strict=False)]
     filtered, channels = np.asarray(plant.initial_covariance), []
     for _ in range(steps):
@@ -111,7 +111,7 @@ def fed_back_channel(
     return over_time(channels)
 
 
-def path_noise(hops: Sequence[GainAndNoise], powers: ArrayLike) -> float:
+def noise_of_hops(hops: Sequence[GainAndNoise], powers: ArrayLike) -> float:
     """D = prod_h kappa_h (1 + alpha_h / p_h): the second moment of what arrives, over that of what was sent.
 
     Raises:
