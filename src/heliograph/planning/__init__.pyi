@@ -1,7 +1,44 @@
 """Public names of the room; the package loads them when first used."""
 
+from .allocation import (
+    Allocation as Allocation,
+    LeastPower as LeastPower,
+)
+from .budget import (
+    Budget as Budget,
+)
+from .coherent import (
+    CoherentDesign as CoherentDesign,
+    CoherentSum as CoherentSum,
+    coherent_least_power as coherent_least_power,
+    coherent_powers as coherent_powers,
+    coherent_programme as coherent_programme,
+    coherent_sum as coherent_sum,
+)
+from .criterion import (
+    Error as Error,
+)
 from .feedback import (
     FeedbackLimit as FeedbackLimit,
     fed_back_channel as fed_back_channel,
     feedback_limit as feedback_limit,
+)
+from .fixed_point import (
+    least_power as least_power,
+    water_filling as water_filling,
+)
+from .independent import (
+    independent_paths as independent_paths,
+)
+from .paths import (
+    Paths as Paths,
+)
+from .semidefinite import (
+    semidefinite_least_power as semidefinite_least_power,
+    semidefinite_powers as semidefinite_powers,
+)
+from .splits import (
+    path_noise as path_noise,
+    power_for_noise as power_for_noise,
+    split_power as split_power,
 )
