@@ -97,6 +97,12 @@ from .live.stream import (
 from .live.timeline import (
     Timeline as Timeline,
 )
+from .planning.network_design import (
+    design as design,
+)
+from .planning.sent import (
+    power as power,
+)
 from .report.progress import (
     show_progress as show_progress,
 )

@@ -7,6 +7,9 @@ from .allocation import (
 from .budget import (
     Budget as Budget,
 )
+from .certificate import (
+    Certificate as Certificate,
+)
 from .coherent import (
     CoherentDesign as CoherentDesign,
     CoherentSum as CoherentSum,
@@ -30,12 +33,18 @@ from .fixed_point import (
 from .independent import (
     independent_paths as independent_paths,
 )
+from .network_design import (
+    NetworkDesign as NetworkDesign,
+)
 from .paths import (
     Paths as Paths,
 )
 from .semidefinite import (
     semidefinite_least_power as semidefinite_least_power,
     semidefinite_powers as semidefinite_powers,
+)
+from .sent import (
+    SentPower as SentPower,
 )
 from .splits import (
     path_noise as path_noise,

@@ -54,10 +54,10 @@ def fixed(one: Fraction) -> Float[np.ndarray, "n n"]:
     with np.errstate(over="ignore", invalid="ignore"):
         for _ in range(DOUBLINGS):
             two = then(one, one)
-            if np.abs(two.h - one.h).max() <= SETTLED * np.abs(two.h).max():
-                return two.h
             if not np.all(np.isfinite(two.h)):
                 break
+            if np.abs(two.h - one.h).max() <= SETTLED * np.abs(two.h).max():
+                return two.h
             one = two
     raise fail("steady error", "one that settles (the plant is unstable in what nobody hears)", "one that grows")
 

@@ -9,6 +9,8 @@ from heliograph.numerics.check import array, check_count, covariance, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
+WEIGHT = "weight of the error"
+
 
 @readable
 class Error(eqx.Module):
@@ -39,13 +41,10 @@ class Error(eqx.Module):
         at_end: bool = False,
         period: int = 1,
     ):
-        self.weight = (
-            dict(weight)
-            if isinstance(weight, Mapping)
-            else None
-            if weight is None
-            else covariance("weight of the error", weight)
-        )
+        if isinstance(weight, Mapping):
+            self.weight = dict(weight)
+        else:
+            self.weight = None if weight is None else covariance(WEIGHT, weight)
         self.worst, self.at_end = bool(worst), bool(at_end)
         self.horizon = None if horizon is None else check_count("horizon of the error", horizon)
         self.period = check_count("period of the error", period)
@@ -69,12 +68,12 @@ class Error(eqx.Module):
         if self.weight is None:
             return np.eye(n)
         if not isinstance(self.weight, dict):
-            return np.asarray(array("weight of the error", self.weight, (n, n)))
+            return np.asarray(array(WEIGHT, self.weight, (n, n)))
         unknown = sorted(set(self.weight) - set(states))
         if unknown or not self.weight:
-            raise fail("weight of the error", f"numbers for some of the states {list(states)}", unknown or "none")
+            raise fail(WEIGHT, f"numbers for some of the states {list(states)}", unknown or "none")
         diagonal = [self.weight.get(name, 0.0) for name in states]
-        return np.asarray(covariance("weight of the error", np.diag(np.asarray(diagonal, dtype=float)), n))
+        return np.asarray(covariance(WEIGHT, np.diag(np.asarray(diagonal, dtype=float)), n))
 
     def over(self) -> Float[np.ndarray, "time"]:
         """The share of each step in the error."""
