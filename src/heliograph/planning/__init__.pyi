@@ -7,8 +7,16 @@ from .allocation import (
 from .budget import (
     Budget as Budget,
 )
+from .bursts import (
+    Bursts as Bursts,
+    burst_sending as burst_sending,
+)
 from .certificate import (
     Certificate as Certificate,
+)
+from .choose import (
+    Choice as Choice,
+    choose_sensors as choose_sensors,
 )
 from .coherent import (
     CoherentDesign as CoherentDesign,
@@ -38,6 +46,21 @@ from .network_design import (
 )
 from .paths import (
     Paths as Paths,
+)
+from .relay_line import (
+    RelayLine as RelayLine,
+    best_relays as best_relays,
+    relay_line as relay_line,
+)
+from .relay_sites import (
+    Radio as Radio,
+    RelayMap as RelayMap,
+    RelayScene as RelayScene,
+    relay_map as relay_map,
+)
+from .schedules import (
+    SendingSchedule as SendingSchedule,
+    best_schedule as best_schedule,
 )
 from .semidefinite import (
     semidefinite_least_power as semidefinite_least_power,
