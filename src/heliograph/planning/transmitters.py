@@ -33,8 +33,7 @@ def transmits(atom: Hop) -> bool:
     if isinstance(atom, Faded):
         return True
     one = isinstance(atom.law, Constant) and float(atom.law.value) == 1.0
-    quiet = not np.any(np.asarray(atom.noise.covariance)) and not np.any(np.asarray(atom.noise.mean))
-    return not (one and quiet)
+    return not (one and not np.any(np.asarray(atom.noise.covariance)))
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
