@@ -58,6 +58,9 @@ from .purchases import (
     Purchase as Purchase,
     purchases_of as purchases_of,
 )
+from .reading import (
+    paths_of as paths_of,
+)
 from .relay_line import (
     RelayLine as RelayLine,
     best_relays as best_relays,

@@ -14,7 +14,7 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.allocation import Allocation, LeastPower
 from heliograph.planning.budget import Allowed, Budget
 from heliograph.planning.criterion import Error
-from heliograph.planning.one_hop import OneHop, Point, one_hop
+from heliograph.planning.one_hop import OneHop, Point, inside, one_hop
 from heliograph.planning.paths import Paths, Powers
 
 CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
@@ -91,7 +91,7 @@ def _water(problem: OneHop, here: Point) -> Powers:
     ])  # fmt: skip
     highest = np.broadcast_to(level, dry.shape)
     y = _level(rise.ravel(), dry.ravel(), room.peak.ravel(), highest.ravel(), room.total * steps)
-    return _at_level(np.minimum(y, highest), rise, dry, room.peak)
+    return inside(_at_level(np.minimum(y, highest), rise, dry, room.peak), room)
 
 
 def _at_level(

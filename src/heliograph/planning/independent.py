@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from heliograph.numerics.check import array, covariance, fail, names
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants
 from heliograph.planning.criterion import Error
 from heliograph.planning.paths import Paths
+
+DOUBLINGS = 60
+EPS = float(np.finfo(np.float64).eps)
 
 
 def independent_paths(
@@ -75,7 +77,13 @@ def steady_moment(transition: Float[np.ndarray, "n n"], process: Float[np.ndarra
     if radius >= 1:
         expected = "a stable plant, since what its sensors send grows without limit (a horizon bounds it)"
         raise fail("steady powers", expected, f"an eigenvalue of size {radius:.6g}")
-    return np.asarray(solve_discrete_lyapunov(transition, process))
+    total, power = process, transition
+    for _ in range(DOUBLINGS):  # sum_k A^k Q A'^k, twice as many terms each time: in any units of the states
+        more = power @ total @ power.T
+        total, power = total + more, power @ power
+        if np.all(np.abs(more) <= EPS * np.abs(total)):
+            break
+    return np.asarray((total + total.T) / 2)
 
 
 def moments(

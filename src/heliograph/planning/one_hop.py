@@ -63,3 +63,12 @@ def one_hop(paths: Paths, budget: object, error: Error | None, states: tuple[str
     weights = error.over()[:, None, None] * matrix
     everyone = np.ones(hops, dtype=bool)
     return OneHop(paths, weights, allowed(as_budget(budget), paths.names, everyone, np.zeros((steps, hops))))
+
+
+def inside(p: Powers, room: Allowed) -> Powers:
+    """Powers that may leave the budget by rounding or a solver's accuracy, made smaller where they do."""
+    p = np.clip(p, 0.0, room.peak)
+    mean = p.mean(axis=0)
+    p = p * np.minimum(1.0, np.divide(room.each, mean, out=np.ones_like(mean), where=mean > 0))
+    total = float(p.mean(axis=0).sum())
+    return np.asarray(p * min(1.0, room.total / total) if total > 0 else p)

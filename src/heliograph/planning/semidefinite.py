@@ -12,21 +12,24 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import covariances
 from heliograph.planning.allocation import Allocation, LeastPower
 from heliograph.planning.budget import Allowed, Budget
 from heliograph.planning.criterion import Error
 from heliograph.planning.fixed_point import cheapest, fill, swapped, unlimited, unreachable
-from heliograph.planning.one_hop import OneHop, one_hop
+from heliograph.planning.one_hop import OneHop, inside, one_hop
 from heliograph.planning.paths import Paths, Powers, heard, informations
 
 if TYPE_CHECKING:
     from cvxpy import Constraint
 
 LINEAR = 1e-12  # a, of s kappa, below which j = p / b
-KEPT = 1e-12  # eigenvalue of W or Q, of the largest, that counts
+KEPT = 1e-14  # eigenvalue of W or Q, of the largest, that counts
+LOUD = 1e3  # of a hop's noise: powers are measured in no larger units
+TINY = float(np.finfo(np.float64).tiny)
+FLAT = 1e-9  # of a variance: directions in which the error is smaller are not scaled up to it
 
 
 def semidefinite_powers(
@@ -44,7 +47,7 @@ def semidefinite_powers(
     problem = one_hop(paths, budget, error, states)
     programme = _Programme(problem, worst)
     programme.solve(programme.error, programme.within(problem.allowed))
-    p = _inside(programme.powers, problem.allowed)
+    p = inside(programme.powers, problem.allowed)
     bound = fill(problem._replace(weights=programme.weights))[2].bound
     value = worst_of(problem, p) if worst else problem.at(p).value
     return Allocation(p, value, min(bound, value), "semidefinite programme")
@@ -52,7 +55,7 @@ def semidefinite_powers(
 
 def semidefinite_least_power(
     paths: Paths,
-    wanted: float,
+    wanted: ArrayLike,
     budget: Budget | None = None,
     error: Error | None = None,
     states: tuple[str, ...] | None = None,
@@ -63,7 +66,7 @@ def semidefinite_least_power(
         ValueError: an error that no power reaches, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
-    worst = error is not None and error.worst
+    worst, wanted = error is not None and error.worst, float(scalar("wanted error", wanted, 0.0))
     problem = swapped(paths, budget, error, states)
 
     def value(p: Powers) -> float:
@@ -91,8 +94,7 @@ def semidefinite_least_power(
 def worst_of(problem: OneHop, powers: Powers) -> float:
     """Largest eigenvalue of W^1/2 P W^1/2, in the mean over the steps that count."""
     p = covariances(problem.paths.plants, informations(problem.paths, heard(problem.paths, powers).information))
-    factors = [_factor(w) for w in problem.weights]
-    return sum(float(np.linalg.eigvalsh(f.T @ one @ f)[-1]) for f, one in zip(factors, p, strict=True) if f.size)
+    return sum(float(np.max(np.linalg.eigvals(w @ one).real)) for w, one in zip(problem.weights, p, strict=True))
 
 
 class _Programme:
@@ -103,10 +105,10 @@ class _Programme:
         self.problem, self.worst = problem, worst
         paths, n = problem.paths, problem.paths.rows.shape[-1]
         steps, senders = paths.kappa.shape
-        self.scale = self._scale()
-        at = np.diag(1 / self.scale)
+        self.root = self._root()
+        back = np.linalg.inv(self.root)
         start = paths.plants.start
-        self.unit = float(np.sum(problem.weights * np.diag(self.scale**2)))
+        self.unit = float(np.sum(problem.weights * (self.root @ self.root.T)))
         self.x = cp.Variable((steps, senders), nonneg=True)  # powers, of `size`
         self.constraints: list[Constraint] = []
         self.tops: dict[int, Constraint] = {}  # by step: its largest eigenvalue is below what is made small
@@ -114,10 +116,10 @@ class _Programme:
         informed = self._information()
         pieces: list[Any] = []
         for k in range(steps):
-            a = at @ paths.plants.transition[k] / at.diagonal()
-            noise = [at @ _factor(paths.plants.process[k])]
+            a = back @ paths.plants.transition[k] @ self.root
+            noise = [_factor(back @ paths.plants.process[k] @ back.T)]
             if k == 0 and start is not None:
-                noise.append(a @ at @ _factor(start))
+                noise.append(a @ _factor(back @ start @ back.T))
             b = np.concatenate(noise, axis=1)
             self._predict(told[k], told[k - 1] if k or start is None else None, a, b, informed[k], k)
             if np.any(problem.weights[k]):
@@ -125,16 +127,17 @@ class _Programme:
         self.error = sum(pieces)
         self.mean_power = cp.sum(cp.multiply(self.size, self.x)) / steps / float(np.max(self.size))
 
-    def _scale(self) -> Float[np.ndarray, "n"]:
-        """Deviations of the states at powers as large as what the hops' noise costs."""
+    def _root(self) -> Float[np.ndarray, "n n"]:
+        """A factor of the error covariance at powers of the size of the budget: x = root xs, and xs is of order one."""
         paths = self.problem.paths
         free = np.minimum(self.problem.allowed.peak, self.problem.allowed.each)
         total = self.problem.allowed.total / free.shape[1]
-        self.size = np.minimum(free, total if np.isfinite(total) else np.maximum(paths.alpha, np.finfo(float).tiny))
-        self.size = np.where(self.size > 0, self.size, 1.0)
-        p = covariances(paths.plants, informations(paths, heard(paths, self.size).information))
-        deviation = np.sqrt(np.diagonal(p, axis1=1, axis2=2).max(axis=0))
-        return np.where(deviation > 0, deviation, 1.0)
+        self.size = np.minimum(free, total if np.isfinite(total) else np.maximum(paths.alpha, TINY))
+        self.size = np.where(self.size > 0, np.minimum(self.size, LOUD * np.maximum(paths.alpha, TINY)), 1.0)
+        p = covariances(paths.plants, informations(paths, heard(paths, self.size).information)).mean(axis=0)
+        unit = np.sqrt(np.diagonal(p))
+        unit = np.where(unit > 0, unit, 1.0)
+        return np.asarray(unit[:, None] * np.linalg.cholesky(p / np.outer(unit, unit) + FLAT * np.eye(len(p))))
 
     def _information(self) -> list[Any]:
         """sum_i j_i c_i' c_i of each step, with j (a p + b) <= p: in u = a j and q = p a / b, 1 / (1 + q) <= 1 - u.
@@ -142,12 +145,12 @@ class _Programme:
         A path that unlimited power frees of noise has a = 0 and j = p / b, one whose hop is free b = 0 and j = 1 / a.
         """
         cp = solvers()
-        paths, n = self.problem.paths, len(self.scale)
+        paths, n = self.problem.paths, len(self.root)
         full = paths.second * paths.kappa
         a, b = full - paths.signal, full * paths.alpha
         result = []
         for k in range(len(full)):
-            c = paths.rows[k] * self.scale
+            c = paths.rows[k] @ self.root
             outer = np.einsum("in,im->inm", c, c).reshape(len(c), -1)
             straight, free = a[k] <= LINEAR * full[k], b[k] == 0
             bent = np.flatnonzero(~straight & ~free)
@@ -179,7 +182,7 @@ class _Programme:
     def _piece(self, told: Any, k: int) -> Any:
         """What step k adds to the error, in units of `unit`."""
         cp = solvers()
-        f = (_factor(self.problem.weights[k]) * self.scale[:, None]).T / np.sqrt(self.unit)
+        f = self._seen(k)
         x = cp.Variable((len(f), len(f)), symmetric=True)
         self.constraints.append(cp.bmat([[x, f], [f.T, told]]) >> 0)
         if not self.worst:
@@ -188,6 +191,10 @@ class _Programme:
         self.tops[k] = top * np.eye(len(f)) - x >> 0
         self.constraints.append(self.tops[k])
         return top
+
+    def _seen(self, k: int) -> Float[np.ndarray, "r n"]:
+        """W^1/2 of step k in these coordinates."""
+        return _factor(self.root.T @ self.problem.weights[k] @ self.root / self.unit).T
 
     def within(self, allowed: Allowed) -> list[Any]:
         """The budget, which is linear."""
@@ -215,12 +222,12 @@ class _Programme:
         self.powers = np.asarray(self.x.value) * self.size
         self.weights = self.problem.weights
         if self.worst:
-            self.weights = np.zeros_like(self.problem.weights)
+            self.weights, back = np.zeros_like(self.problem.weights), np.linalg.inv(self.root)
             for k, constraint in self.tops.items():
-                f, dual = _factor(self.problem.weights[k]), np.asarray(constraint.dual_value)
+                f, dual = self._seen(k) @ back, np.asarray(constraint.dual_value)
                 values, vectors = np.linalg.eigh((dual + dual.T) / 2)
                 share = (vectors * np.maximum(values, 0.0)) @ vectors.T
-                self.weights[k] = f @ (share / np.trace(share)) @ f.T
+                self.weights[k] = self.unit * f.T @ (share / np.trace(share)) @ f
 
 
 def _factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n r"]:
@@ -228,12 +235,3 @@ def _factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n r"]:
     values, vectors = np.linalg.eigh(matrix)
     kept = values > KEPT * max(values[-1], 0.0)
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
-
-
-def _inside(p: Powers, allowed: Allowed) -> Powers:
-    """The solver's powers, which may leave the budget by its accuracy, made smaller where they do."""
-    p = np.clip(p, 0.0, allowed.peak)
-    mean = p.mean(axis=0)
-    p = p * np.minimum(1.0, np.divide(allowed.each, mean, out=np.ones_like(mean), where=mean > 0))
-    total = float(p.mean(axis=0).sum())
-    return np.asarray(p * min(1.0, allowed.total / total) if total > 0 else p)
