@@ -48,7 +48,7 @@ from .front import (
 from .independent import (
     independent_paths as independent_paths,
 )
-from .network_design import (
+from .outcome import (
     NetworkDesign as NetworkDesign,
 )
 from .paths import (

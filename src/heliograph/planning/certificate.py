@@ -40,6 +40,8 @@ class Certificate(NamedTuple):
         if self.convex:
             return f"optimal within {self.gap:.1e}: the problem is convex, and no {self.unit} is below {self.bound:.6g}"
         found = "the one start" if self.starts == 1 else f"{self.starts} starts"
+        if not np.isfinite(self.bound):
+            return f"best of {found}, stationary within {self.stationarity:.1e}; no bound is known"
         better = "better" if self.unit == "error" else "less"
         return (
             f"best of {found}, stationary within {self.stationarity:.1e}; nothing can be {better} than {self.bound:.6g}"

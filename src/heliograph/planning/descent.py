@@ -12,6 +12,7 @@ from heliograph.planning.objective import Objective
 Powers = Float[np.ndarray, "time free"]
 
 ITERATIONS = 400
+FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and one of many of which one will go on
 SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
 OFF = 1e-7  # of the largest power: what counts as none
 ROUNDS = 4  # of Newton's method
@@ -25,7 +26,7 @@ class Found(NamedTuple):
     error: float
 
 
-def descend(objective: Objective, limits: Allowed, start: Powers) -> Found:
+def descend(objective: Objective, limits: Allowed, start: Powers, tolerance: float = FINE) -> Found:
     """A local minimum from `start`, by sequential quadratic programmes in powers relative to the budget."""
     shape, unit = start.shape, _unit(limits, start)
     first = objective.value(start)
@@ -38,13 +39,13 @@ def descend(objective: Objective, limits: Allowed, start: Powers) -> Found:
     constraints = [LinearConstraint(rows, -np.inf, most / unit)] if len(rows) else []
     bounds = Bounds(np.zeros(start.size), limits.peak.ravel() / unit)
     result = minimize(function, start.ravel() / unit, jac=True, bounds=bounds, constraints=constraints,
-                      method="SLSQP", options={"ftol": 1e-14, "maxiter": ITERATIONS})  # fmt: skip
+                      method="SLSQP", options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
     found = _inside(limits, np.clip(result.x.reshape(shape) * unit, 0.0, limits.peak))
     value = objective.value(found)
     return Found(found, value) if value < first else Found(start, first)
 
 
-def lower_total(objective: Objective, limits: Allowed, wanted: float, start: Powers) -> Powers:
+def lower_total(objective: Objective, limits: Allowed, wanted: float, start: Powers, tolerance: float = FINE) -> Powers:
     """Powers of a locally least total whose error is no larger than wanted, from some that reach it."""
     shape, unit = start.shape, max(float(start.mean(axis=0).sum()), np.finfo(float).tiny)
 
@@ -65,7 +66,7 @@ def lower_total(objective: Objective, limits: Allowed, wanted: float, start: Pow
 
     result = minimize(total, start.ravel() / unit, jac=True, method="SLSQP",
                       bounds=Bounds(np.zeros(start.size), limits.peak.ravel() / unit), constraints=constraints,
-                      options={"ftol": 1e-14, "maxiter": ITERATIONS})  # fmt: skip
+                      options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
     found = _inside(limits._replace(total=np.inf), np.clip(result.x.reshape(shape) * unit, 0.0, limits.peak))
     better = found.mean(axis=0).sum() < start.mean(axis=0).sum() and room(found.ravel() / unit)[0] > -MISSED
     return found if better else start

@@ -1,19 +1,19 @@
 """The powers of a network chosen for a small error, or the least power for a wanted one, with what certifies them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar
-from heliograph.numerics.readable import readable
+from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, shown
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.planning.budget import MET, Allowed, Budget, allowed, as_budget
 from heliograph.planning.certificate import Certificate, least_total, lower_bound
 from heliograph.planning.criterion import Error
-from heliograph.planning.designed import designed_network
+from heliograph.planning.free_numbers import Build
+from heliograph.planning.numbers_design import design_numbers
 from heliograph.planning.objective import Objective, of_hops
+from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.paths import Paths
 from heliograph.planning.reading import paths_of
 from heliograph.planning.relaxation import relaxed
@@ -23,37 +23,6 @@ from heliograph.simulation.network import Network
 
 UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
 REACHED = 1e-9  # relative: an error so near to what unlimited power leaves is not reached
-
-
-@readable
-class NetworkDesign(eqx.Module):
-    """Powers that were found, what they give, and how good they are.
-
-    powers: of every transmitter, {name: (steps,)}, steps of the error's period or horizon (one if steady). error: what
-    they give; present: what the network gives as it is; covariance: P after each step. sensitivity: the error's
-    derivative by the mean power of each transmitter; price: the error that one more watt of the budget takes away.
-    given, asked: the network and the error that the design is of.
-    """
-
-    powers: dict[str, Float[np.ndarray, "steps"]]
-    error: float
-    present: float
-    covariance: Float[np.ndarray, "steps n n"]
-    sensitivity: dict[str, float]
-    price: float
-    certificate: Certificate
-    given: Network
-    asked: Error
-
-    @property
-    def network(self) -> Network:
-        """The design as a network that runs: every node with the filter "best", and "best" of all that they receive."""
-        return designed_network(self.given, self.powers, self.asked)
-
-    @property
-    def total(self) -> float:
-        """Mean power of all transmitters together."""
-        return float(sum(np.mean(power) for power in self.powers.values()))
 
 
 class _Task(NamedTuple):
@@ -68,8 +37,8 @@ class _Task(NamedTuple):
 
 
 def design(
-    network: Network,
-    free: Sequence[str] | None = None,
+    network: Network | Build,
+    free: Sequence[str] | Mapping[str, object] | None = None,
     error: Error | None = None,
     budget: Budget | ArrayLike | None = None,
     wanted: ArrayLike | None = None,
@@ -84,6 +53,11 @@ def design(
     or a `Budget`. With an error `wanted`, the least total mean power is sought that reaches it (within the budget, if
     one is given too).
 
+    Numbers of any kind are free where `network` is a function of them that returns a network, and `free` says
+    {name: (start, low, high)}: amplifications, weights, places. Channels may then share gains, tell of their modes or
+    losses, or have uncertain probabilities: the error is an upper bound then, with "young" among the numbers found, the
+    scalar in it. The error is steady.
+
     With one free hop a path the problem is convex, and the certificate is a gap. With more it is not: descents begin
     from every choice of the paths that send, if there are no more than `starts`, else from drawn ones (`seed`), and the
     certificate is the global bound of the convex envelopes.
@@ -93,10 +67,15 @@ def design(
             free, neither a budget nor a wanted error, a budget that cannot be met, an error that no power reaches.
     Source: for one hop, Lagrange's conditions are water-filling; the gap is that of Frank and Wolfe (1956).
     """
-    instance("network", network, Network, "a Network")
     error = Error() if error is None else instance("error", error, Error, "an Error")
+    if not isinstance(network, Network) and callable(network):
+        count, draws = check_count("starts", starts), check_seed("seed", seed)
+        return design_numbers(network, free, error, budget, wanted, count, draws)
+    instance("network", network, Network, "a Network, or a function of free numbers that returns one")
     if budget is None and wanted is None:
         raise fail("design", "a budget of power or a wanted error", "neither")
+    if isinstance(free, Mapping):
+        raise fail("free", "names of transmitters (numbers are free of a function that returns a network)", shown(free))
     paths, present = paths_of(network, error)
     task = _task(network, paths, present, error, free, budget, check_count("starts", starts), check_seed("seed", seed))
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
@@ -116,6 +95,7 @@ def design(
         certificate=certificate,
         given=network,
         asked=error,
+        numbers={},
     )
 
 

@@ -45,26 +45,33 @@ class Heard(NamedTuple):
 
 def fading(paths: Paths) -> Float[np.ndarray, "time path"]:
     """K, the product of kappa along each path."""
-    result = np.ones(paths.second.shape)
-    for h, i in enumerate(paths.path):
-        result[:, i] *= paths.kappa[:, h]
-    return result
+    return np.asarray(_along(paths, paths.kappa)[0].prod(axis=-1))
+
+
+def _along(
+    paths: Paths, each: Float[np.ndarray, "time hop"]
+) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
+    """Numbers of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
+    order = np.argsort(paths.path, kind="stable")
+    counts = np.bincount(paths.path, minlength=paths.second.shape[1])
+    place = np.empty_like(paths.path)
+    place[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    result = np.ones((len(each), len(counts), max(1, int(counts.max(initial=1)))))
+    result[:, paths.path, place] = each
+    return result, place
 
 
 def heard(paths: Paths, powers: Powers) -> Heard:
     """j of each path at each step, and dj/dp of each hop."""
     total = powers + paths.alpha
     passed = np.divide(powers, total, out=np.ones_like(powers), where=total > 0)  # a hop without noise: any power does
-    whole, others = np.ones(paths.second.shape), np.ones(powers.shape)
-    for h, i in enumerate(paths.path):
-        for other in np.flatnonzero(paths.path == i):
-            if other != h:
-                others[:, h] *= passed[:, other]
-        whole[:, i] *= passed[:, h]
-    full = paths.second * fading(paths)
+    along, place = _along(paths, passed)
+    others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
+    whole, full = along.prod(axis=-1), paths.second * fading(paths)
     left = full - paths.signal * whole
     own = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
-    return Heard(whole / left, (full / left**2)[:, paths.path] * others * own)
+    slope = (full / left**2)[:, paths.path] * others[:, paths.path, place] * own
+    return Heard(whole / left, slope)
 
 
 def informations(paths: Paths, each: Float[np.ndarray, "time path"]) -> Float[np.ndarray, "time n n"]:

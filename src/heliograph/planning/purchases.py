@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.model.channel import amplify_and_forward
 from heliograph.numerics.readable import readable
-from heliograph.planning.network_design import NetworkDesign
+from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.task import Task
 from heliograph.planning.transmitters import Hop, names_of, walked
 from heliograph.random_affine.atoms import GainAndNoise

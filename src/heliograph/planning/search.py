@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import Allowed
-from heliograph.planning.descent import Found, descend, lower_total, polish
+from heliograph.planning.descent import COARSE, Found, descend, lower_total, polish
 from heliograph.planning.objective import SHARPEST, Objective
 
 Mask = Bool[np.ndarray, "time free"]
@@ -44,13 +44,14 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
 def search(objective: Objective, limits: Allowed, starts: list[Powers]) -> Found:
     """The best of the descents from these powers."""
     if objective.sharpness is None:
-        found = [descend(objective, limits, start) for start in starts]
+        found = [descend(objective, limits, start, COARSE) for start in starts]
     else:  # the largest eigenvalue is smoothed less and less
         found = [Found(start, np.inf) for start in starts]
         for sharpness in SHARPER:
             objective = objective._replace(sharpness=sharpness)
-            found = [descend(objective, limits, one.powers) for one in found]
-    return polish(objective, limits, min(found, key=lambda one: one.error))
+            found = [descend(objective, limits, one.powers, COARSE) for one in found]
+    best = min(found, key=lambda one: one.error)
+    return polish(objective, limits, descend(objective, limits, best.powers))
 
 
 def least_power(objective: Objective, limits: Allowed, wanted: float, starts: list[Powers]) -> Found | None:
@@ -63,10 +64,10 @@ def least_power(objective: Objective, limits: Allowed, wanted: float, starts: li
     for start in starts:
         raised = _raised(objective, limits, wanted, start)
         if raised is not None:
-            found.append(lower_total(objective, limits, wanted, raised))
+            found.append(lower_total(objective, limits, wanted, raised, COARSE))
     if not found:
         return None
-    powers = min(found, key=lambda p: float(p.mean(axis=0).sum()))
+    powers = lower_total(objective, limits, wanted, min(found, key=lambda p: float(p.mean(axis=0).sum())))
     for _ in range(ROUNDS):
         total = float(powers.mean(axis=0).sum())
         powers = polish(objective, limits._replace(total=total), Found(powers, objective.value(powers))).powers

@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
-from heliograph.planning.network_design import NetworkDesign
+from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.task import Task
 from heliograph.simulation.network import Network
 

@@ -3,6 +3,7 @@
 Pi = E (x, 1)(x, 1)' of the state itself, mean included, not of an estimate's error: Pi+ = A Pi A' + Q.
 """
 
+import jax
 import numpy as np
 from scipy.linalg import solve_discrete_lyapunov
 
@@ -63,8 +64,10 @@ def seconds_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None)
     for k in range(horizon):
         now = at(plant, k)
         a = np.asarray(now.matrix)
-        mean = a @ mean + np.asarray(now.input_matrix) @ u[k] + np.asarray(now.noise_mean())
-        spread = a @ spread @ a.T + np.asarray(now.noise_covariance(u[k]))
+        with jax.enable_x64(True):  # the noise may be a function of the inputs in operations of JAX
+            noise_mean, noise = np.asarray(now.noise_mean()), np.asarray(now.noise_covariance(u[k]))
+        mean = a @ mean + np.asarray(now.input_matrix) @ u[k] + noise_mean
+        spread = a @ spread @ a.T + noise
         found.append(_joined(mean, spread))
     return np.array(found)
 

@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 from heliograph.numerics.readable import readable
 from heliograph.planning.budget import Budget
 from heliograph.planning.criterion import Error
-from heliograph.planning.network_design import NetworkDesign, design
+from heliograph.planning.network_design import design
+from heliograph.planning.outcome import NetworkDesign
 from heliograph.simulation.network import Network
 
 

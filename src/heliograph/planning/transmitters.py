@@ -7,23 +7,25 @@ in which it is silent it knows nothing. Behind a loss that is told (an erasure) 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from math import prod
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import Float
+from heliograph.numerics.traced import is_traced, is_zero, library, plain
+from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, Modes, joint_modes
+from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed, joint_modes
 from heliograph.random_affine.second_moments import second_moment_tensor
 
-Second = Float[np.ndarray, "p p"]  # E (y, 1)(y, 1)'
+Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
 Hop = GainAndNoise | Faded
 Act = Callable[[str, Hop], AbstractRandomAffine]
 
@@ -32,15 +34,16 @@ def transmits(atom: Hop) -> bool:
     """Whether anything is sent over the air."""
     if isinstance(atom, Faded):
         return True
-    one = isinstance(atom.law, Constant) and float(atom.law.value) == 1.0
-    return not (one and not np.any(np.asarray(atom.noise.covariance)))
+    return not (_is_one(atom) and is_zero(atom.noise.covariance))
+
+
+def _is_one(atom: GainAndNoise) -> bool:
+    return isinstance(atom.law, Constant) and not is_traced(atom.law.value) and float(atom.law.value) == 1.0
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
     """Whether nothing comes through but noise: what a loss, or a mode in which nothing is heard, is made of."""
-    if not isinstance(channel, GainAndNoise) or np.any(np.asarray(channel.matrix)):
-        return False
-    return isinstance(channel.law, Constant) and float(channel.law.value) == 1.0
+    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _is_one(channel)
 
 
 class _Place(NamedTuple):
@@ -75,8 +78,10 @@ def walked(channel: AbstractRandomAffine, act: Act, place: _Place = BEGINNING) -
             parts = [walked(part, act, own)[0] for part, own in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
             parts, place = _chosen(channel, act, place)
-        case Erasure() | Delayed() | OfLine():
-            name = {Erasure: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
+        case Revealed():
+            return channel, place
+        case Erasure() | OneStepLate() | Delayed() | OfLine():
+            name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
             inner, place = walked(getattr(channel, name), act, place)
             return eqx.tree_at(lambda c: getattr(c, name), channel, inner), place
         case _:
@@ -115,7 +120,7 @@ def scaled(channel: AbstractRandomAffine, factors: Mapping[str, float]) -> Abstr
     return walked(channel, act)[0]
 
 
-def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, float]:
+def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
     """Mean square of what each transmitter sends at a step, from E (y, 1)(y, 1)' of what is given to the channel.
 
     Exact: of modes in the law that they have at the step.
@@ -123,21 +128,21 @@ def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) ->
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
-    total: dict[str, float] = dict.fromkeys(names_of(channel), 0.0)
+    total: dict[str, Any] = dict.fromkeys(names_of(channel), 0.0)
     seen = dict(total)
     joint = joint_modes(channel, order=2)
-    law = np.asarray(joint.initial) @ np.linalg.matrix_power(np.asarray(joint.transition), step)
+    law = joint.initial @ library(joint.transition).linalg.matrix_power(joint.transition, step)
     for weight, one in zip(law, joint.maps, strict=True):
-        powers: dict[str, float] = {}
-        _send(one, np.asarray(second), BEGINNING, 1.0, powers)
+        powers: dict[str, Any] = {}
+        _send(one, second, BEGINNING, 1.0, powers)
         for name, power in powers.items():
             total[name] += weight * power
             seen[name] += weight
-    return {name: total[name] / seen[name] if seen[name] else 0.0 for name in total}
+    return {name: 0.0 if is_zero(seen[name]) else plain(total[name] / seen[name]) for name in total}
 
 
 def _send(
-    channel: AbstractRandomAffine, second: Second, place: _Place, arrives: float, powers: dict[str, float]
+    channel: AbstractRandomAffine, second: Second, place: _Place, arrives: Scalar, powers: dict[str, Any]
 ) -> _Place:
     """Note the powers in a map that forgets, and return the place behind it."""
     match channel:
@@ -147,8 +152,8 @@ def _send(
             place = place._replace(hops=place.hops + 1)
             if is_silent(channel):  # a transmitter that is not heard sends as in other modes
                 return place
-            matrix = np.asarray(channel.matrix)
-            powers[f"{place.prefix}hop{place.hops}"] = arrives * float(np.sum(matrix @ second[:-1, :-1] * matrix))
+            matrix = channel.matrix
+            powers[f"{place.prefix}hop{place.hops}"] = arrives * (matrix @ second[:-1, :-1] * matrix).sum()
         case Series():
             for i, part in enumerate(channel.maps):
                 place = _send(part, second, place, arrives, powers)
@@ -170,7 +175,7 @@ def _send(
     return place
 
 
-def _send_mixture(channel: Mixture, second: Second, place: _Place, arrives: float, powers: dict[str, float]) -> _Place:
+def _send_mixture(channel: Mixture, second: Second, place: _Place, arrives: Scalar, powers: dict[str, Any]) -> _Place:
     own = [not is_silent(part) for part in channel.maps]
     if sum(own) > 1:
         for i, part in enumerate(channel.maps, 1):
@@ -181,15 +186,15 @@ def _send_mixture(channel: Mixture, second: Second, place: _Place, arrives: floa
     return place
 
 
-def _arrival(channel: AbstractRandomAffine) -> float:
+def _arrival(channel: AbstractRandomAffine) -> Scalar:
     """The probability that what comes through is there."""
     if not channel.erases:
         return 1.0
     match channel:
         case Erasure():
-            return float(channel.arrival) * _arrival(channel.base)
+            return plain(channel.arrival) * _arrival(channel.base)
         case Series():
-            return float(np.prod([_arrival(part) for part in channel.maps]))
+            return prod(_arrival(part) for part in channel.maps)
         case Delayed():
             return _arrival(channel.link)
     raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
@@ -207,16 +212,20 @@ def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
         case Delayed():
             return _behind(channel.link, second)
     moments = channel.moments(2)
-    tensor = np.asarray(second_moment_tensor(moments.matrix, moments.outputs, moments.inputs))
-    mean = np.asarray(moments.mean[:-1]) @ second[:, -1]
-    return np.block([[np.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]])
+    tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
+    result: Second = xp.block(
+        [[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]]
+    )
+    return result
 
 
 def _line(second: Second, times: int) -> Second:
     """Of the line (y_k, y_{k-1}, ...): each as the present one; a delay chooses one of them, so no two meet."""
-    y, mean = second[:-1, :-1], np.tile(second[:-1, -1], times)
-    whole = np.kron(np.eye(times), y)
-    return np.block([[whole, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    xp = library(second)
+    mean, whole = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
+    result: Second = xp.block([[whole, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    return result
 
 
 def allocated(

@@ -4,9 +4,11 @@ from collections.abc import Callable
 from functools import reduce
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.traced import is_traced, plain
 from heliograph.numerics.types import Bool, Float
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
@@ -20,7 +22,7 @@ OUTCOME_LIMIT = 1024  # sets of losses that are listed
 class Outcome(NamedTuple):
     """One thing that a receiver may be told: with `probability` the outputs in `arrived` come through `map`."""
 
-    probability: float
+    probability: float | jax.Array
     map: AbstractRandomAffine
     arrived: Bool[np.ndarray, " outputs"]
 
@@ -37,7 +39,7 @@ def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
         return [Outcome(1.0, channel, np.ones(channel.outputs, dtype=bool))]
     match channel:
         case Erasure():
-            arrival, lost = float(channel.arrival), np.zeros(channel.outputs, dtype=bool)
+            arrival, lost = plain(channel.arrival), np.zeros(channel.outputs, dtype=bool)
             found = [o._replace(probability=arrival * o.probability) for o in outcomes(channel.base)]
             found.append(Outcome(1 - arrival, known(np.zeros((channel.outputs, channel.inputs))), lost))
         case Series():
@@ -48,7 +50,7 @@ def outcomes(channel: AbstractRandomAffine) -> list[Outcome]:
                            outcomes(channel.maps[0]))  # fmt: skip
         case _:
             raise fail("channel with erasures", "erasures in series and stacks", type(channel).__name__)
-    return [o for o in found if o.probability > 0]
+    return [o for o in found if is_traced(o.probability) or o.probability > 0]
 
 
 def _joint(

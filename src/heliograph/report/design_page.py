@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from heliograph.files.quoting import in_figure, visible
 from heliograph.planning.front import Front
-from heliograph.planning.network_design import NetworkDesign
+from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.purchases import Purchase
 from heliograph.planning.site_map import SiteMap
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH

@@ -1,0 +1,197 @@
+"""Numbers of any kind: gradients against differences, errors against filters, sites against the closed form."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.planning import Budget
+from heliograph.planning.criterion import Error
+from heliograph.planning.free_numbers import Problem, as_numbers
+
+PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
+BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
+SUM = hg.LinearSensor([[1.0, 1.0]], 0.2)
+FADING = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3])
+
+
+def shared(amplifications):
+    """One relay gain for both numbers: their noises are correlated."""
+    pairs = zip((1.0, FADING), (0.3, 0.2), amplifications, strict=True)
+    hops = [hg.hop(g, noise * np.eye(2), amplification=a) for g, noise, a in pairs]
+    return hg.Network(PLANT, {"node": hg.Node(BOTH, hg.amplify_and_forward(hops), {})})
+
+
+def told_losses(amplification, arrival):
+    lossy = hg.erasure(hg.hop(FADING, 0.3, amplification=amplification), arrival)
+    nodes = {
+        "a": hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.2), lossy, {}),
+        "b": hg.Node(hg.LinearSensor([[0.0, 1.0]], 0.4), hg.hop(1.0, 0.1), {}),
+    }
+    return hg.Network(PLANT, nodes)
+
+
+def told_modes(amplification, stays):
+    chain = hg.random_affine.MarkovChain(jnp.stack([jnp.stack([0.9, 0.1]), jnp.stack([1 - stays, stays])]))
+    modes = hg.random_affine.Modes(chain, [hg.hop(g, 0.3, amplification=amplification) for g in (1.0, 0.3)])
+    return hg.Network(PLANT, {"node": hg.Node(SUM, hg.model.with_flag(modes), {})})
+
+
+def one_hop(amplification):
+    return hg.Network(PLANT, {"node": hg.Node(SUM, hg.hop(FADING, 0.3, amplification=amplification), {})})
+
+
+def uncertain(amplification):
+    """The mean gain is anything from .76 to 1.16."""
+    law = hg.Discrete([0.6, 1.0, 1.4], [0.3, 0.4, 0.3], radius=[0.1, 0.0, 0.1])
+    return hg.Network(PLANT, {"node": hg.Node(SUM, hg.hop(law, 0.3, amplification=amplification), {})})
+
+
+CASES = {
+    "shared gain": (shared, {"amplifications": ([0.7, 1.3], 0.1, 5.0)}),
+    "told losses": (told_losses, {"amplification": (1.2, 0.1, 5.0), "arrival": (0.6, 0.1, 0.9)}),
+    "uncertain": (uncertain, {"amplification": (1.2, 0.1, 5.0)}),
+    "told modes": (told_modes, {"amplification": (1.2, 0.1, 5.0), "stays": (0.6, 0.1, 0.9)}),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def problem(request):
+    build, free = CASES[request.param]
+    return request.param, Problem(build, as_numbers(free), Error({"x0": 1.0, "x1": 0.5}).matrix)
+
+
+def test_gradients_are_those_of_differences(problem):
+    _, one = problem
+    x, relative = one.numbers.start, 2e-3
+    slopes = one.at(x)[2]
+    for i in range(len(x)):
+        h = relative * x[i]
+        ends = [one.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
+        errors = [np.sum(one.weight * end[1].parts.sum(axis=0)) for end in ends]
+        for each, slope in ((errors, slopes.error[i]), ([end[0].powers for end in ends], slopes.powers[:, i])):
+            low, near, far, high = each
+            differences = (8 * (far - near) - (high - low)) / (12 * h)
+            np.testing.assert_allclose(slope, differences, rtol=1e-8, atol=1e-9)  # fourth order: h^4 and rounding / h
+
+
+def test_the_error_is_that_of_the_recursion(problem):
+    name, one = problem
+    found = one.covariance(one.numbers.start)
+    network = one.network(one.numbers.start)
+    if name == "shared gain":
+        node = network.nodes["node"]
+        best = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((200, 0)))
+        np.testing.assert_allclose(found, best.covariances[-1], rtol=1e-10)
+        powers = one.powers(one.numbers.start)
+        np.testing.assert_allclose(powers, list(hg.power(network).mean.values()), rtol=1e-12)
+        return
+    m = one.at(one.numbers.start)[0]
+    parts = m.law[:, None, None] * np.eye(2)
+    for _ in range(400):  # the recursion of X_j, as it is written
+        after = np.zeros_like(parts)
+        for j in range(len(parts)):
+            y = m.transition @ np.einsum("i,iab->ab", m.chain[:, j], parts) @ m.transition.T + m.law[j] * m.process
+            k = y @ m.output[j].T @ np.linalg.inv(m.output[j] @ y @ m.output[j].T + m.law[j] * m.noise[j])
+            after[j] = y - k @ m.output[j] @ y
+        parts = after
+    np.testing.assert_allclose(found, parts.sum(axis=0), rtol=1e-11)
+
+
+def test_told_losses_are_bounded_by_what_drawn_losses_leave():
+    found = Problem(told_losses, as_numbers(CASES["told losses"][1]), Error().matrix)
+    bound = np.trace(found.covariance(found.numbers.start))
+    m = found.at(found.numbers.start)[0]
+    draws, p, total = np.random.default_rng(0), np.eye(2), []
+    for _ in range(20_000):  # the filter that knows which losses there were
+        j = draws.choice(2, p=m.law)
+        y = m.transition @ p @ m.transition.T + m.process
+        k = y @ m.output[j].T @ np.linalg.inv(m.output[j] @ y @ m.output[j].T + m.noise[j])
+        p = y - k @ m.output[j] @ y
+        total.append(np.trace(p))
+    mean = np.mean(total[100:])
+    assert mean <= bound <= 1.05 * mean
+
+
+def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
+    """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
+    found = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
+    node = found.network.nodes["node"]
+    one = Problem(uncertain, as_numbers({"amplification": (1.2, 1.2, 1.2)}), Error().matrix)
+    k = one.at(np.append(1.2, found.numbers["young"]))[1].gains[0]
+    a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
+    for p in (0.2, 0.3, 0.4):
+        values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])
+        z = np.zeros((4, 4))
+        for _ in range(400):  # E (x, e)(x, e)', e+ = (I - K c) e - K (g - 1) c x - K (g v + n)
+            moved = np.block([[a, np.zeros((2, 2))], [np.zeros((2, 2)), a]]) @ z
+            moved = moved @ np.block([[a, np.zeros((2, 2))], [np.zeros((2, 2)), a]]).T + np.kron(np.ones((2, 2)), q)
+            z = np.zeros((4, 4))
+            for g, share in zip(values, law, strict=True):
+                f = np.block([[np.eye(2), np.zeros((2, 2))], [-(g - 1) * k @ c, np.eye(2) - k @ c]])
+                noise = np.zeros((4, 4))
+                noise[2:, 2:] = k @ k.T * (0.2 * (1.2 * g) ** 2 + 0.3)
+                z += share * (f @ moved @ f.T + noise)
+        assert np.linalg.eigvalsh(found.covariance[0] - z[2:, 2:])[0] > 0
+    filters = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((300, 0)))
+    assert found.error <= np.trace(filters.covariances[-1]) * 1.05
+
+
+def test_a_relay_is_placed_where_the_closed_form_puts_it():
+    """One state, two hops, loss d^-3: above rho = 4 the best site leaves the middle, x (1 - x) = 1 / rho."""
+    rho = 8.0
+    plant = hg.LinearPlant([[0.95]], [[0.1]], [0.0], [[1.0]])
+    sensor = hg.LinearSensor([[1.0]], 0.5)
+    received = 0.1 / (1 - 0.95**2) + 0.5
+
+    def at(site, first, second):
+        hops = [
+            hg.hop(site**-1.5, 1.0, amplification=jnp.sqrt(first / received)),
+            hg.hop((1 - site) ** -1.5, 1.0, amplification=jnp.sqrt(second / (first * site**-3 + 1.0))),
+        ]
+        return hg.Network(plant, {"node": hg.Node(sensor, hg.amplify_and_forward(hops), {})})
+
+    power = 1 / rho  # rho = sigma^2 d^e / (nu P)
+    free = {"site": (0.4, 0.02, 0.98), "first": (0.05, 1e-4, 1.0), "second": (0.05, 1e-4, 1.0)}
+    found = hg.design(at, free=free, budget=power, starts=3)
+    site = float(found.numbers["site"])
+    assert site * (1 - site) == pytest.approx(1 / rho, abs=1e-4)
+    noise = received * rho - (received - 0.5)
+    p = 0.1
+    for _ in range(500):
+        p = 1 / (1 / (0.95**2 * p + 0.1) + 1 / noise)
+    assert found.error == pytest.approx(p, rel=1e-7)
+    assert found.total == pytest.approx(power, rel=1e-7) and found.certificate.stationarity < 1e-4
+    assert found.certificate.words.endswith("no bound is known")
+    assert hg.power(found.network).total == pytest.approx(power, rel=1e-7)
+
+
+def test_powers_and_amplifications_agree():
+    """The same network by amplifications, as a function, and by powers, by name."""
+
+    def chain(a, b):
+        hops = [hg.hop(FADING, 0.3, amplification=a), hg.hop(FADING, 0.2, amplification=b)]
+        return hg.Network(PLANT, {"node": hg.Node(SUM, hg.amplify_and_forward(hops), {})})
+
+    free = {"a": (0.5, 0.01, 9.0), "b": (0.5, 0.01, 9.0)}
+    by_number = hg.design(chain, free=free, budget=3, starts=2)
+    by_power = hg.design(chain(1.0, 1.0), budget=3)
+    assert by_number.error == pytest.approx(by_power.error, rel=1e-9)
+    least = hg.design(chain, free=free, wanted=by_power.error, starts=2)
+    assert least.total == pytest.approx(3, rel=1e-6)
+    capped = hg.design(chain, free=free, budget=Budget(3, each={"node.hop1": 0.5}), starts=1)
+    assert capped.powers["node.hop1"][0] == pytest.approx(0.5, rel=1e-6) and capped.error > by_power.error
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        ({}, "free: expected at least one number"),
+        (None, "free: expected at least one number"),
+        ({"amplification": (3.0, 0.0, 1.0)}, "free number 'amplification': expected a start between its ends"),
+        ({"amplification": 3.0}, r"free number 'amplification': expected a list of \(start, low, high\)"),
+    ],
+)
+def test_bad_numbers_are_named(free, message):
+    with pytest.raises(ValueError, match=message):
+        hg.design(one_hop, free=free, budget=1)

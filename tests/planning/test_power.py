@@ -1,0 +1,123 @@
+"""What transmitters send: by hand, along the algebra, against drawn channels."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.random_affine.base import apply
+from tests.planning.published import one_hop, two_hops
+
+PLANT = hg.LinearPlant([[0.9]], [[0.19]], [2.0], [[1.0]])
+SENSOR = hg.LinearSensor([[1.0]], 0.5)
+FADING = hg.Discrete([0.5, 1.5], [0.5, 0.5])
+
+
+def network(channel, plant=PLANT, sensor=SENSOR):
+    return hg.Network(plant, {"node": hg.Node(sensor, channel, {})})
+
+
+def test_a_chain_by_hand():
+    """E y^2 = 1 + .5 in the steady state; the relay hears it by E g^2 = 1.25, with noise."""
+    chain = hg.amplify_and_forward([hg.hop(FADING, 0.3, power=4.0), hg.hop(1.0, 0.1, amplification=2.0)])
+    found = hg.power(network(chain))
+    assert found.mean == pytest.approx({"node.hop1": 4 * 1.5, "node.hop2": 4 * (4 * 1.5 * 1.25 + 0.3)}, rel=1e-12)
+    assert found.growth == pytest.approx(0.81) and found.words == "what is sent stays bounded"
+    assert found.total == pytest.approx(sum(found.mean.values()))
+
+
+def test_over_time_the_mean_counts():
+    """x_0 has mean 2 and variance 1, which stays: E y^2 = 4 .81^k + 1.5."""
+    found = hg.power(network(hg.hop(1.0, 0.3)), horizon=4)
+    np.testing.assert_allclose(found.over_time["node.hop1"], 4 * 0.81 ** np.arange(1, 5) + 1.5, rtol=1e-12)
+    assert found.peak["node.hop1"] == found.over_time["node.hop1"][0]
+    np.testing.assert_array_equal(found.standard_error["node.hop1"], 0.0)
+
+
+def test_an_unstable_plant_grows_and_says_so():
+    plant = hg.LinearPlant([[1.1]], [[1.0]], [0.0], [[1.0]])
+    wild = network(hg.hop(1.0, 0.2), plant)
+    with pytest.raises(ValueError, match=r"steady power: expected a stable plant, or a horizon.*spectral radius 1\.1"):
+        hg.power(wild)
+    found = hg.power(wild, horizon=60)
+    assert found.over_time["node.hop1"][[0, 59]] == pytest.approx([2.71, 5.3e5], rel=0.01)
+    assert found.words == "the plant is unstable: what is sent grows by 1.21 a step, without limit"
+
+
+def chain_of(kind):
+    """Channels of every kind, two hops each, and how to see what their second transmitter hears."""
+    first, second = hg.hop(FADING, 0.3), hg.hop(1.0, 0.1, amplification=1.5)
+    chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.4, 0.6]], initial=[1.0, 0.0])
+    return {
+        "dropout": [hg.dropout(first, 0.7), second],
+        "modes": [hg.random_affine.Modes(chain, [first, hg.hop(0.2, 0.5)]), second],
+        "drift": [hg.autoregressive_fading(0.9, 1.0, 0.4, 0.3), second],
+        "delay": [hg.hop(FADING, 0.3, delay=2), second],
+        "erasure": [hg.erasure(first, 0.7), second],
+    }[kind]
+
+
+@pytest.mark.parametrize("kind", ["dropout", "modes", "drift", "delay", "erasure"])
+def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
+    hops = chain_of(kind)
+    found = hg.power(network(hg.amplify_and_forward(hops)), horizon=3).over_time
+    y2 = 4 * 0.81**3 + 1.5
+    assert found["node.hop1"][2] == pytest.approx(y2, rel=1e-12)
+    with jax.enable_x64(True):
+
+        def heard(key):
+            begin, *keys = jax.random.split(key, 5)
+            state = hops[0].init(begin)
+            y = jnp.sqrt(y2)  # its sign and law do not matter: noise has mean zero
+            for k in keys[:3]:
+                state, h = hops[0].draw(state, k)
+            z = h[0, :1] * y + h[0, -1] if kind != "delay" else apply(h, jnp.tile(y, 3))
+            return jnp.where(jnp.isnan(z[0]), 0.0, (1.5 * z[0]) ** 2)
+
+        drawn = np.asarray(jax.jit(jax.vmap(heard))(jax.random.split(jax.random.key(1), 40_000)))
+    assert abs(drawn.mean() - found["node.hop2"][2]) < 4 * drawn.std() / 200
+
+
+def test_stacks_wires_and_names():
+    plant = hg.LinearPlant(0.5 * np.eye(2), np.eye(2), np.zeros(2), np.eye(2))
+    sensor = hg.LinearSensor(np.eye(2), 0.1)
+    relayed = hg.amplify_and_forward([hg.hop(FADING, 0.3), hg.hop(1.0, 0.1)])
+    found = hg.power(hg.Network(plant, {"cart": hg.Node(sensor, hg.parallel([relayed, hg.perfect()]), {})}))
+    assert list(found.mean) == ["cart.part1.hop1", "cart.part1.hop2"]  # a wire sends nothing
+
+
+def test_a_nonlinear_plant_is_drawn():
+    """The same linear plant written as a function: drawn powers agree with exact ones."""
+    plant = hg.Plant(lambda x, u: 0.9 * x, 0.19, [2.0], [[1.0]], states=["x"])
+    drawn = hg.power(network(hg.hop(FADING, 0.3), plant), horizon=4, runs=4000)
+    exact = hg.power(network(hg.hop(FADING, 0.3)), horizon=4).over_time["node.hop1"]
+    z = (drawn.over_time["node.hop1"] - exact) / drawn.standard_error["node.hop1"]
+    assert np.max(np.abs(z)) < 3.5 and np.isnan(drawn.growth)
+    with pytest.raises(ValueError, match="power: expected a horizon"):
+        hg.power(network(hg.hop(FADING, 0.3), plant))
+
+
+def test_relays_that_filter_send_what_their_design_says():
+    hop = hg.hop(FADING, 0.3)
+    slots = [
+        {"north": {"sensor": hop}, "receiver": {"south": hop}},
+        {"south": {"sensor": hop}, "receiver": {"north": hop}},
+    ]
+    relays = hg.model.RelayNetwork(PLANT, SENSOR, ["north", "south"], slots)
+    design = hg.relays.own_error_design(relays, 10)
+    schedules = hg.relays.relay_schedules(relays, design)
+    receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
+    found = hg.power(hg.Network.of_relays(relays, schedules, {"best": receiver}))
+    for name in ("north", "south"):
+        np.testing.assert_allclose(found.over_time[name], design.power[name], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.over_time["sensor"], 4 * 0.81 ** np.arange(1, 11) + 1.5, rtol=1e-12)
+
+
+def test_powers_given_are_powers_sent():
+    """What a designed network sends over any chain is what was asked of it."""
+    asked = hg.design(two_hops(), budget=7, starts=1)
+    np.testing.assert_allclose(
+        list(hg.power(asked.network).mean.values()), [p[0] for p in asked.powers.values()], atol=1e-12
+    )
+    assert hg.power(one_hop()).total > 0
