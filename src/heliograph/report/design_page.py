@@ -8,6 +8,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from heliograph.files.quoting import in_figure, visible
 from heliograph.planning.front import Front
@@ -89,13 +90,17 @@ def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figu
     """Error over total power: what was found, the bound below which nothing is, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
-    axes.fill_between(front.totals, front.bounds, 0, color=PALE, alpha=0.6, linewidth=0, label="impossible")
+    # a bound at some power holds for all less: hence steps
+    axes.fill_between(front.totals, front.bounds, 0, step="pre", color=PALE, alpha=0.6, linewidth=0, label="impossible")
     axes.plot(front.totals, front.errors, "o-", color=BLUE, linewidth=1.6, markersize=4, label="found")
     for (name, (power, error)), colour in zip(marks.items(), (VERMILION, AMBER, GREEN), strict=False):
         axes.plot([power], [error], "D", color=colour, markeredgecolor=INK, markersize=8, label=in_figure(name))
     spread = np.ptp(front.errors)
     every = [*front.errors, *(error for _, error in marks.values())]
     axes.set(xscale="log", xlabel="total mean power", ylabel="error", xlim=(front.totals[0], front.totals[-1]))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:g}")
     axes.set_ylim(max(front.bounds.min() - 0.15 * spread, 0.0), max(every) + 0.1 * spread)
     axes.legend(frameon=False, fontsize=9)
     return figure

@@ -13,6 +13,7 @@ from heliograph.report.design_page import front_figure
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, STYLE, VERMILION, WIDTH
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
+COLOURS = (BLUE, AMBER, GREEN)  # of total powers
 EVEN = 60  # values of the noise in the picture of sites
 
 
@@ -32,9 +33,9 @@ def _powers(outcome: Outcome) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     grid = figure.subplots(1, 2, sharey=True)
     cases = [("one hop", outcome.one_hop), ("two hops", outcome.two_hops)]
-    for axes, (name, each), colours in zip(grid, cases, ((BLUE, GREEN, AMBER), (BLUE, AMBER)), strict=True):
+    for axes, (name, each) in zip(grid, cases, strict=True):
         width = 0.8 / len(each)
-        for i, ((total, one), colour) in enumerate(zip(each.items(), colours, strict=True)):
+        for i, ((total, one), colour) in enumerate(zip(each.items(), COLOURS, strict=False)):
             shares = np.array(list(path_powers(one.best).values())) / total
             places = np.arange(len(shares)) + (i - (len(each) - 1) / 2) * width
             axes.bar(places, 100 * shares, width, color=colour, label=f"{total:g} in all")
