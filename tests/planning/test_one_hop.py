@@ -4,12 +4,14 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
+import heliograph as hg
 from heliograph.numerics.check import InputError
 from heliograph.planning import (
     Budget,
     Error,
     independent_paths,
     least_power,
+    paths_of,
     semidefinite_least_power,
     semidefinite_powers,
     water_filling,
@@ -197,3 +199,19 @@ def test_states_in_very_different_units_are_the_same_design(seed):
         assert again.bound <= again.error <= again.bound * (1 + 1e-5)
     found = water_filling(plain, 2.0)
     np.testing.assert_allclose(water_filling(other, 2.0, Error(np.diag(units**-2.0))).powers, found.powers, atol=1e-7)
+
+
+def test_the_paths_of_a_network_have_the_powers_of_its_design():
+    """Fixed point and descent are different programs over one description."""
+    plant = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [0.0, 1.0], np.eye(2))
+    far = hg.hop(hg.Rician(1.0, 0.3), 0.7, power=3.0)
+    near = hg.dropout(hg.hop(hg.Nakagami(2.0, 1.3), 0.4, power=2.0), 0.8)
+    nodes = {
+        "far": hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.5), far, {}),
+        "near": hg.Node(hg.LinearSensor([[1.0, -1.0]], 0.3), near, {}),
+    }
+    network, error = hg.Network(plant, nodes), Error(horizon=3)
+    paths, _ = paths_of(network, error)
+    found, design = water_filling(paths, 2.0, error), hg.design(network, error=error, budget=2.0)
+    assert found.error == pytest.approx(design.error, rel=1e-10) and found.bound <= design.error
+    np.testing.assert_allclose(found.powers, np.transpose(list(design.powers.values())), rtol=1e-5)

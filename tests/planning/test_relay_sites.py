@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 from heliograph.numerics.check import InputError
-from heliograph.planning import Radio, RelayScene, relay_line, relay_map, split_power
+from heliograph.planning import Radio, RelayScene, choose_relays, relay_line, relay_map, split_power
 from heliograph.planning.paths import heard
 from heliograph.report.figures import png
 from heliograph.report.sites import site_map
@@ -48,6 +48,16 @@ def test_relays_only_help_and_never_more_than_the_bound_allows():
     assert min(SCENE.error(sites, POWER) for sites in draws) > one.bound
     assert SCENE.error(np.zeros((0, 2)), POWER) == pytest.approx(one.direct, rel=1e-14)
     assert "no sites can be better" in one.words
+
+
+def test_relays_are_chosen_among_sites():
+    sites = np.random.default_rng(1).uniform([1, 0], [4, 3], (6, 2))
+    found, searched = choose_relays(SCENE, POWER, sites, 2), choose_relays(SCENE, POWER, sites, 2, compared=0)
+    errors = [SCENE.error(sites[[i, k]], POWER) for i in range(6) for k in range(i)]
+    assert found.error == min(errors) and found.exact and not searched.exact
+    assert found.bound == SCENE.error(sites, POWER) < found.error <= searched.error
+    with pytest.raises(InputError, match="relays to choose: expected at most the 6 sites there are, got 7"):
+        choose_relays(SCENE, POWER, sites, 7)
 
 
 def test_the_map_is_drawn():

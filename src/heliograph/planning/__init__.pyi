@@ -66,11 +66,14 @@ from .relay_line import (
     best_relays as best_relays,
     relay_line as relay_line,
 )
-from .relay_sites import (
+from .relay_scene import (
     Radio as Radio,
-    RelayMap as RelayMap,
     RelayScene as RelayScene,
+)
+from .relay_sites import (
+    RelayMap as RelayMap,
     relay_map as relay_map,
+    choose_relays as choose_relays,
 )
 from .schedules import (
     SendingSchedule as SendingSchedule,

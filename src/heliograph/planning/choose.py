@@ -27,7 +27,7 @@ ROUNDING = 1e-12  # relative, by which a bound stays below what is computed
 
 @readable
 class Choice(NamedTuple):
-    """Sensors that are listened to, by number.
+    """Those that are chosen, by number.
 
     bound: proven, no choice of as many has a smaller error. exact: every choice was compared.
     """
@@ -41,8 +41,8 @@ class Choice(NamedTuple):
     def words(self) -> str:
         """How good the choice is, in a line."""
         if self.exact:
-            return f"the best of all choices; weights between 0 and 1 would reach {self.bound:.6g}"
-        return f"the best of two starts and their swaps; nothing can be better than {self.bound:.6g}"
+            return f"the best of all choices: every one was compared; a bound without that would be {self.bound:.6g}"
+        return f"the best of a few starts and their swaps; nothing can be better than {self.bound:.6g}"
 
 
 class Listening(NamedTuple):
@@ -130,19 +130,20 @@ def choose_sensors(
         best = min(combinations(range(number), count), key=of)
     else:
         rounded = tuple(int(i) for i in np.argsort(-shares, kind="stable")[:count])
-        best = min((_swapped(of, number, start) for start in (_greedy(of, number, count), rounded)), key=of)
+        best = min((swapped(of, number, start) for start in (greedy(of, number, count), rounded)), key=of)
     found = of(best)
     return Choice(best, found, min(bound, found), exact)
 
 
-def _greedy(of: Callable[[tuple[int, ...]], float], number: int, count: int) -> tuple[int, ...]:
+def greedy(of: Callable[[tuple[int, ...]], float], number: int, count: int) -> tuple[int, ...]:
+    """One after another, each the best beside those before it."""
     chosen: tuple[int, ...] = ()
     while len(chosen) < count:
         chosen = min(((*chosen, i) for i in range(number) if i not in chosen), key=of)
     return chosen
 
 
-def _swapped(of: Callable[[tuple[int, ...]], float], number: int, chosen: tuple[int, ...]) -> tuple[int, ...]:
+def swapped(of: Callable[[tuple[int, ...]], float], number: int, chosen: tuple[int, ...]) -> tuple[int, ...]:
     """The best swap again and again, until none helps."""
     value = of(chosen)
     while True:

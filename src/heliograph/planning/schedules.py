@@ -77,18 +77,18 @@ def best_schedule(
 
     greedy = _greedy(case, choices)
     best: dict[int, Steps] = {}
-    exact = []
+    exact = tuple(period for period in wanted if len(choices) ** period <= compared * period)
     for period in wanted:
-        if len(choices) ** period <= compared * period:
-            exact.append(period)
-            best[period] = min((tuple(choices[i] for i in word) for word in necklaces(len(choices), period)), key=of)
+        if period in exact:
+            words = necklaces(len(choices), period)
+            best[period] = min((tuple(choices[i] for i in word) for word in words), key=of)
         else:
             starts = [_stretched(steps, period) for steps in (*best.values(), greedy)]
             best[period] = min((_bettered(of, choices, start) for start in starts), key=of)
     errors = {period: of(steps) for period, steps in best.items()}
-    chosen = best[min(errors, key=lambda period: errors[period])]
-    found = min(errors.values())
-    return SendingSchedule(chosen, found, min(shared(case, at_once)[1], found), errors, tuple(exact), of(greedy))
+    found = min(errors, key=lambda period: errors[period])
+    bound = min(shared(case, at_once)[1], errors[found])
+    return SendingSchedule(best[found], errors[found], bound, errors, exact, of(greedy))
 
 
 def necklaces(letters: int, length: int) -> Iterator[tuple[int, ...]]:

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 LINEAR = 1e-12  # a, of s kappa, below which j = p / b
 KEPT = 1e-14  # eigenvalue of W or Q, of the largest, that counts
 LOUD = 1e3  # of a hop's noise: powers are measured in no larger units
-TINY = float(np.finfo(np.float64).tiny)
 FLAT = 1e-9  # of a variance: directions in which the error is smaller are not scaled up to it
 
 
@@ -132,8 +131,9 @@ class _Programme:
         paths = self.problem.paths
         free = np.minimum(self.problem.allowed.peak, self.problem.allowed.each)
         total = self.problem.allowed.total / free.shape[1]
-        self.size = np.minimum(free, total if np.isfinite(total) else np.maximum(paths.alpha, TINY))
-        self.size = np.where(self.size > 0, np.minimum(self.size, LOUD * np.maximum(paths.alpha, TINY)), 1.0)
+        hop = np.where(paths.alpha > 0, paths.alpha, 1.0)
+        self.size = np.minimum(np.minimum(free, total if np.isfinite(total) else hop), LOUD * hop)
+        self.size = np.where(self.size > 0, self.size, hop)
         p = covariances(paths.plants, informations(paths, heard(paths, self.size).information)).mean(axis=0)
         unit = np.sqrt(np.diagonal(p))
         unit = np.where(unit > 0, unit, 1.0)
