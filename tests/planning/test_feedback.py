@@ -99,3 +99,16 @@ def test_bad_input_is_one_clear_line() -> None:
         noise_of_hops([HOP], 0.0)
     with pytest.raises(ValueError, match="single hops of one number"):
         noise_of_hops([hg.parallel([HOP, HOP])], 1.0)
+
+
+def test_every_transmitter_sends_its_power() -> None:
+    channel = fed_back_channel(PLANT, SENSOR, [HOP, HOP], [1.0, 3.0], 12)
+    fed = hg.Node(SENSOR, channel, {"fed": fed_back_filter(PLANT, SENSOR, channel)})
+    network = hg.Network(PLANT, {"node": fed})
+    sent = hg.power(network, 12).over_time
+    np.testing.assert_allclose(sent["node.hop1"], 1.0, rtol=1e-9)
+    np.testing.assert_allclose(sent["node.hop2"], 3.0, rtol=1e-9)
+    with pytest.raises(ValueError, match="hears back: expected a horizon"):
+        hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": fed}))
+    with pytest.raises(ValueError, match="got a sensor that hears back"):
+        hg.design(network, error=hg.planning.Error(horizon=12), budget=3.0)

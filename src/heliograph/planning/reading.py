@@ -161,6 +161,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
     found = _Step([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
+        if node.told_by is not None:
+            raise _unfit("a sensor that hears back, whose power depends on the error")
         sensor, channel = at(node.sensor, k), at(node.channel, k)
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
