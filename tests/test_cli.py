@@ -407,7 +407,17 @@ def test_help_does_not_load_jax():
 def test_lists_do_not_load_jax():
     lines = without_jax(["example"]).splitlines()
     assert [line.split()[0] for line in lines] == [
-        *("delays", "demo", "fusion", "late-data", "links-with-memory", "motor-drive", "range-bearing", "smoothing")
+        *(
+            "delays",
+            "demo",
+            "fusion",
+            "late-data",
+            "links-with-memory",
+            "motor-drive",
+            "network-design",
+            "range-bearing",
+            "smoothing",
+        )
     ]
     assert all(len(line.split()) > 5 for line in lines)
     assert "cubature-fusion" in without_jax(["reproduce"]).splitlines()

@@ -10,6 +10,7 @@ from heliograph.examples.demo import compute as compute_module
 from heliograph.examples.demo import robot, run
 from heliograph.examples.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
 from heliograph.examples.demo.recording import PlazaRecording, read_recording
+from heliograph.examples.demo.twin import Design, channel_less
 from heliograph.files.recording import read_recording as read_measurements
 from heliograph.model.estimate import Estimate
 
@@ -27,19 +28,24 @@ def outcome(recording: PlazaRecording) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def folder(outcome: Outcome, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(outcome: Outcome, designs: dict[str, Design], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("run") / "new" / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "compute", lambda *_: outcome)  # computed once for all tests
+        patch.setattr(run, "designs", lambda *_: designs)
         run.example(out)
     assert [p.name for p in out.iterdir()] == ["demo"]  # nothing temporary is left beside it
     return out / "demo"
 
 
 def cubature_oracle(
-    recording: PlazaRecording, received: np.ndarray, gain_variance: float, noise: float
+    recording: PlazaRecording,
+    received: np.ndarray,
+    gain_variance: float,
+    noise: float,
+    taken_off: np.ndarray | float = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The textbook cubature filter in NumPy, Var(z) = Pyy + gain_variance (Pyy + y^2) + noise for each component."""
+    """The textbook cubature filter in NumPy, Var(z) = Pyy + gain_variance (Pyy + (y - r)^2) + noise by component."""
 
     def points(x: np.ndarray, p: np.ndarray) -> np.ndarray:
         spread = np.sqrt(3) * np.linalg.cholesky(p).T
@@ -56,9 +62,10 @@ def cubature_oracle(
         p = (c - x).T @ (c - x) / 6 + np.diag(walk)
         c = points(x, p)
         b = PLAZA2.beacons[~np.isnan(z)]
+        r = np.broadcast_to(taken_off, (4,))[~np.isnan(z)]
         y = robot.RANGE_SCALE * np.linalg.norm(c[:, None, :2] - b, axis=-1)
         mean, pyy = y.mean(0), (y - y.mean(0)).T @ (y - y.mean(0)) / 6 + robot.RANGE_VARIANCE * np.eye(len(b))
-        s = pyy + np.diag(gain_variance * (np.diag(pyy) + mean**2) + noise)
+        s = pyy + np.diag(gain_variance * (np.diag(pyy) + (mean - r) ** 2) + noise)
         k = (c - x).T @ (y - mean) / 6 @ np.linalg.inv(s)
         x, p = x + k @ (z[~np.isnan(z)] - mean), p - k @ s @ k.T
         means.append(x)
@@ -87,6 +94,34 @@ def test_filters_are_the_textbook_ones(
     # Rounding only; errors of 1e-16 grow over 1816 steps of a stable filter by little.
     np.testing.assert_allclose(trial.estimates[name].mean, mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(trial.estimates[name].covariance, covariance, rtol=0, atol=1e-9)
+
+
+@pytest.fixture(scope="module")
+def designs(outcome: Outcome) -> dict[str, Design]:
+    return run.designs(outcome)
+
+
+@pytest.mark.parametrize(("name", "power"), [("centred", 1.0), ("centred_thousandth", 1e-3)])
+def test_designed_relays_are_the_same_relays_less_the_start(
+    recording: PlazaRecording, designs: dict[str, Design], name: str, power: float
+) -> None:
+    """By hand, of what arrives over the root of the power: gain noise of y - r, and the relay's noise the larger."""
+    r = robot.RANGE_SCALE * np.hypot(*(PLAZA2.start[:2] - PLAZA2.beacons).T)
+    received = relay(channel_less(r, power), recording.ranges, 0) / np.sqrt(power)
+    mean, covariance = cubature_oracle(recording, received, SECOND**2 - 1, RELAY_NOISE / power, r)
+    expected = score(Estimate(mean, covariance, "nominal"), recording.truth)
+    got = designs[name].scores[0]
+    assert got.position_rmse_m == pytest.approx(expected.position_rmse_m, abs=1e-9)
+    assert got.claimed_rmse_m == pytest.approx(expected.claimed_rmse_m, abs=1e-9)
+    sent = np.nanmean(power * (recording.ranges - r) ** 2)
+    assert designs[name].power == pytest.approx(sent + SECOND * sent + robot.HOP_VARIANCE, rel=1e-12)
+
+
+def test_less_is_sent_for_as_much(designs: dict[str, Design]) -> None:
+    plain, less, least = (designs[name] for name in ("as_it_is", "centred", "centred_thousandth"))
+    assert less.rmse < 0.6 * plain.rmse and less.power < 0.26 * plain.power
+    assert least.rmse < 1.1 * plain.rmse and least.power < plain.power / 3900
+    assert plain.power == pytest.approx(2528 + 2579, abs=1)
 
 
 def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:
@@ -154,10 +189,11 @@ def test_score_of_known_errors() -> None:
     assert far.inside_95 == 0.5
 
 
-def test_summary_holds_the_scores(folder: Path, outcome: Outcome) -> None:
+def test_summary_holds_the_scores(folder: Path, outcome: Outcome, designs: dict[str, Design]) -> None:
     found = json.loads((folder / "summary.json").read_text())
     assert found["seed"] == 0
     assert found["seeds"]["seed"] == list(range(SEEDS))
+    assert found["designs"] == {name: run.numbers(one) for name, one in designs.items()}
     for name in NAMES:
         shown = outcome.trials[0].scores[name]
         assert found["position_rmse_m"][name] == shown.position_rmse_m == found["seeds"]["position_rmse_m"][name][0]
@@ -202,11 +238,14 @@ def test_table_is_printed_whole_in_80_columns(
         assert re.search(r"\s+".join(map(re.escape, row)), printed)
 
 
-def test_failure_leaves_nothing(outcome: Outcome, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failure_leaves_nothing(
+    outcome: Outcome, designs: dict[str, Design], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def broken(*_: object) -> None:
         raise OSError("disk full")
 
     monkeypatch.setattr(run, "compute", lambda *_: outcome)
+    monkeypatch.setattr(run, "designs", lambda *_: designs)
     monkeypatch.setattr(run, "write_data", broken)
     with pytest.raises(OSError, match="disk full"):
         run.example(tmp_path / "a" / "b")

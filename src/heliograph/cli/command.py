@@ -8,6 +8,7 @@ from cyclopts import CycloptsError
 
 from heliograph.cli.app import app
 from heliograph.cli.completion import completion
+from heliograph.cli.design import design
 from heliograph.cli.example import demo, example
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
@@ -21,7 +22,8 @@ from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
-for one in (new, run, serve, replay, demo, example, reproduce, sweep, completion):  # in the order of the help
+COMMANDS = new, run, serve, replay, demo, example, reproduce, sweep, design, completion  # in the order of the help
+for one in COMMANDS:
     app.command(one)
 
 

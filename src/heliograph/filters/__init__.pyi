@@ -16,6 +16,10 @@ from .delay import (
     late_filter as late_filter,
     part_filter as part_filter,
 )
+from .fed_back import (
+    FedBackFilter as FedBackFilter,
+    fed_back_filter as fed_back_filter,
+)
 from .gaussian import (
     gaussian_filter as gaussian_filter,
 )

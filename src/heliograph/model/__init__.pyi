@@ -1,5 +1,9 @@
 """Public names of the room; the package loads them when first used."""
 
+from .centred import (
+    centred as centred,
+    expected_signal as expected_signal,
+)
 from .channel import (
     delayed as delayed,
     mean_gain as mean_gain,

@@ -29,9 +29,21 @@ from .coherent import (
 from .criterion import (
     Error as Error,
 )
+from .designed import (
+    designed_network as designed_network,
+)
+from .feedback import (
+    FeedbackLimit as FeedbackLimit,
+    fed_back_channel as fed_back_channel,
+    feedback_limit as feedback_limit,
+)
 from .fixed_point import (
     least_power as least_power,
     water_filling as water_filling,
+)
+from .front import (
+    Front as Front,
+    error_over_power as error_over_power,
 )
 from .independent import (
     independent_paths as independent_paths,
@@ -41,6 +53,10 @@ from .outcome import (
 )
 from .paths import (
     Paths as Paths,
+)
+from .purchases import (
+    Purchase as Purchase,
+    purchases_of as purchases_of,
 )
 from .reading import (
     paths_of as paths_of,
@@ -56,8 +72,8 @@ from .relay_scene import (
 )
 from .relay_sites import (
     RelayMap as RelayMap,
-    choose_relays as choose_relays,
     relay_map as relay_map,
+    choose_relays as choose_relays,
 )
 from .schedules import (
     SendingSchedule as SendingSchedule,
@@ -70,8 +86,15 @@ from .semidefinite import (
 from .sent import (
     SentPower as SentPower,
 )
+from .site_map import (
+    SiteMap as SiteMap,
+    error_over_sites as error_over_sites,
+)
 from .splits import (
     path_noise as path_noise,
     power_for_noise as power_for_noise,
     split_power as split_power,
+)
+from .task import (
+    Task as Task,
 )

@@ -24,14 +24,14 @@ ALIKE = 1e-12  # relative: a covariance of noises that counts as none
 
 
 class Route(NamedTuple):
-    """A chain of hops for one number: the outputs' combination it carries, and kappa and alpha of each hop by name."""
+    """A chain of hops for one number: what it carries of (outputs, 1), and kappa and alpha of each hop by name."""
 
-    chosen: Float[np.ndarray, "m"]
+    chosen: Float[np.ndarray, "m1"]
     hops: dict[str, tuple[float, float]]
 
 
-def routes(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], prefix: str = "") -> list[Route]:
-    """The routes of a channel that is given chosen @ y.
+def routes(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Route]:
+    """The routes of a channel that is given chosen @ (y, 1).
 
     Raises:
         ValueError: a channel that is not made of independent chains, each for one number.
@@ -47,7 +47,9 @@ def routes(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], pref
             head, *rest = channel.maps
             if isinstance(head, GainAndNoise) and not transmits(head) and rest:
                 onward = rest[0] if len(rest) == 1 else Series(rest)
-                return routes(onward, np.asarray(head.matrix) @ chosen, prefix)
+                given = np.asarray(head.matrix) @ chosen
+                given[:, -1] += np.asarray(head.noise.mean)
+                return routes(onward, given, prefix)
             if isinstance(head, Series):
                 return routes(Series([*head.maps, *rest]), chosen, prefix)
             if isinstance(head, Stack):
@@ -55,11 +57,11 @@ def routes(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], pref
     return [_chain(channel, chosen, prefix)]
 
 
-def _chain(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], prefix: str) -> Route:
+def _chain(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m1"], prefix: str) -> Route:
     if channel.outputs != 1:
         raise _unfit(f"one gain for {channel.outputs} numbers")
     parts = list(channel.maps) if isinstance(channel, Series) else [channel]
-    row, fading = chosen[0], 1.0
+    row, fading, moved = chosen[0], 1.0, False
     hops: dict[str, tuple[float, float]] = {}
     while parts:
         part = parts.pop(0)
@@ -75,9 +77,13 @@ def _chain(channel: AbstractRandomAffine, chosen: Float[np.ndarray, "k m"], pref
         if not hops:
             row = np.asarray(part.matrix)[0] @ chosen if part.inputs > 1 else chosen[0]  # of one number, in its units
         if transmits(part):
+            if moved:
+                raise _unfit("a relay that takes a reference off")
             hops[f"{prefix}hop{len(hops) + 1}"] = _hop(part)
         elif part.inputs != 1 or part.outputs != 1:
             raise _unfit("a wire of several numbers behind a hop")
+        elif hops:
+            moved = moved or bool(np.any(np.asarray(part.noise.mean)))
     if hops:
         last = list(hops)[-1]
         hops[last] = (hops[last][0] * fading, hops[last][1])
@@ -160,17 +166,20 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
 def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
     found = _Step([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
+        if node.told_by is not None:
+            raise _unfit("a sensor that hears back, whose power depends on the error")
         sensor, channel = at(node.sensor, k), at(node.channel, k)
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
         y, noise = of_sensor(sensor, state), np.asarray(sensor.noise.covariance)
-        each, sends = routes(channel, np.eye(len(sensor.outputs))), sent_powers(channel, y, k)
-        _check_apart(name, np.array([route.chosen for route in each]), noise)
+        each, sends = routes(channel, np.eye(len(sensor.outputs), len(y))), sent_powers(channel, y, k)
+        _check_apart(name, np.array([route.chosen[:-1] for route in each]), noise)
         for route in each:
-            found.rows.append(route.chosen @ np.asarray(sensor.matrix))
-            found.second.append(float(route.chosen @ y[:-1, :-1] @ route.chosen))
-            found.signal.append(found.second[-1] - float(route.chosen @ noise @ route.chosen))
+            chosen = route.chosen[:-1]
+            found.rows.append(chosen @ np.asarray(sensor.matrix))
+            found.second.append(float(route.chosen @ y @ route.chosen))
+            found.signal.append(found.second[-1] - float(chosen @ noise @ chosen))
             if not route.hops and not found.second[-1] > found.signal[-1]:
                 raise fail(f"sensor of {name!r}", "noise, since a wire adds none", "none")
             for hop, (kappa, alpha) in route.hops.items():

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.fed_back import FedBackFilter
 from heliograph.filters.scheduled import ScheduledFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
@@ -75,8 +76,11 @@ def power(
     "node.hop1", "node.hop2" along the node's channel, "node.part1.hop1" in a stack. Relays that filter are called by
     their names, the sensor that they hear "sensor", and slots are the steps.
 
+    A sensor that hears its filter back sends what this does not expect, over a horizon.
+
     Raises:
-        ValueError: no horizon for a plant that is not stable or not linear, inputs of another shape.
+        ValueError: no horizon for a plant that is not stable or not linear, or where a sensor hears back; inputs of
+            another shape.
     """
     instance("network", network, Network, "a Network")
     start = first(network.plant)
@@ -95,6 +99,8 @@ def power(
         raise fail("power", "a horizon, since plant or sensor is not linear", "none")
     else:
         y = _drawn(network.plant, worlds, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
+    for name, item in _tellers(network).items():
+        y[name], rate = _left(item, u, horizon), float("nan")
     sent, error = {}, {}
     for name, (_, channel) in worlds.items():
         each = [[sent_powers(at(channel, k), now, k) for k, now in enumerate(batch)] for batch in y[name]]
@@ -110,6 +116,29 @@ def _worlds(network: Network) -> Worlds:
     if network.common is not None:
         return {"common": (network.common.sensor, network.common.channel)}
     return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}
+
+
+def _tellers(network: Network) -> dict[str, FedBackFilter]:
+    """The filters that sensors hear back, by node."""
+    each = {name: list(node.filters.values()) for name, node in network.nodes.items() if isinstance(node, Node)}
+    return {name: item for name, items in each.items() for item in items if isinstance(item, FedBackFilter)}
+
+
+def _left(item: FedBackFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> np.ndarray:
+    """C P C' + R of the filter's own prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
+    if horizon is None or item.claim != "exact":
+        expected = "a horizon and a linear model, whose filter knows its error before any data"
+        raise fail("power of a sensor that hears back", expected, "no horizon" if horizon is None else item.claim)
+    state, found = item.init(), []
+    for k, u in enumerate(inputs):
+        state = item.predict(state, u, k)
+        sensor = at(item.base.sensor, k)
+        c = np.asarray(sensor.matrix)
+        one = np.eye(len(c) + 1)
+        one[:-1, :-1] = c @ np.asarray(state.covariance) @ c.T + np.asarray(sensor.noise.covariance)
+        found.append(one)
+        state, _ = item.correct(state, np.zeros(item.received), k)
+    return np.array([found])
 
 
 def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:

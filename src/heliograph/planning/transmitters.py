@@ -34,8 +34,7 @@ def transmits(atom: Hop) -> bool:
     """Whether anything is sent over the air."""
     if isinstance(atom, Faded):
         return True
-    quiet = is_zero(atom.noise.covariance) and is_zero(atom.noise.mean)
-    return not (_is_one(atom) and quiet)
+    return not (_is_one(atom) and is_zero(atom.noise.covariance))
 
 
 def _is_one(atom: GainAndNoise) -> bool:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
+from heliograph.filters.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
@@ -32,8 +33,8 @@ class AbstractAir(eqx.Module):
         """Before the first step; `key` is the run's."""
         raise NotImplementedError
 
-    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
-        """What reaches the nodes of each group at step k, when the plant's state is x; NaN where nothing does."""
+    def hear(self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+        """What reaches the nodes of each group at step k, x the state to which u led; NaN where nothing does."""
         raise NotImplementedError
 
     def told(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
@@ -44,6 +45,8 @@ class AbstractAir(eqx.Module):
 class Antenna(eqx.Module):
     """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws.
 
+    `teller`: the filters that sensors hear back, whose estimates stand at `place` (kind, filter) among all.
+
     Shapes: checksums (node,), memories (node, memories of a channel): checksums of what the channels remember.
     """
 
@@ -51,6 +54,15 @@ class Antenna(eqx.Module):
     channel: Channel
     checksums: jax.Array | np.ndarray
     memories: jax.Array | np.ndarray
+    teller: FedBackFilter | None
+    place: tuple[int, int] | None = eqx.field(static=True)
+
+
+class Reach(NamedTuple):
+    """A channel's state, and the estimate that its sensor heard back last, (n,); None where it hears none."""
+
+    memory: PyTree
+    told: jax.Array | None
 
 
 class OwnChannels(AbstractAir):
@@ -59,24 +71,35 @@ class OwnChannels(AbstractAir):
     antennas: tuple[Antenna, ...]
 
     def init(self, key: jax.Array) -> PyTree:
-        """States of the channels, by group, with a leading node axis."""
+        """States of the channels and what was heard back, by group, with a leading node axis."""
 
-        def one(antenna: Antenna) -> PyTree:
-            return start(antenna.channel, key, antenna.checksums, antenna.memories)
+        def one(antenna: Antenna) -> Reach:
+            told = None if antenna.teller is None else jnp.asarray(antenna.teller.init().mean)
+            return Reach(start(antenna.channel, key, antenna.checksums, antenna.memories), told)
 
         return tuple(eqx.filter_vmap(one, in_axes=(eqx.if_array(0),))(antenna) for antenna in self.antennas)
 
-    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
-        """The sensor measures x, the channel delivers."""
+    def hear(self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+        """The sensor measures x and takes off what is expected of it, the channel delivers."""
 
-        def one(antenna: Antenna, memory: PyTree) -> tuple[PyTree, jax.Array]:
+        def one(antenna: Antenna, reach: Reach) -> tuple[Reach, jax.Array]:
             sensor = at(antenna.sensor, k)
             y = sensed(sensor, x, draw_key(key, k, antenna.checksums, SENSOR))
-            return deliver(antenna.channel, memory, y, key, k, antenna.checksums, antenna.memories)
+            if antenna.teller is not None and reach.told is not None:
+                y = y - antenna.teller.reference(reach.told, u, k)
+            memory, z = deliver(antenna.channel, reach.memory, y, key, k, antenna.checksums, antenna.memories)
+            return Reach(memory, reach.told), z
 
         both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0))
-        results = [both(antenna, memory) for antenna, memory in zip(self.antennas, state, strict=True)]
+        results = [both(antenna, reach) for antenna, reach in zip(self.antennas, state, strict=True)]
         return tuple(after for after, _ in results), tuple(z for _, z in results)
+
+    def told(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
+        """Every sensor hears what its filter estimates now."""
+        return tuple(
+            reach if antenna.place is None else Reach(reach.memory, estimates[antenna.place[0]].mean[antenna.place[1]])
+            for antenna, reach in zip(self.antennas, state, strict=True)
+        )
 
 
 def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
@@ -95,7 +118,7 @@ class CommonChannel(AbstractAir):
         """What a late channel holds of the past; the channel forgets all else."""
         return start(self.channel, key, checksum(SENDER), ())
 
-    def hear(self, state: PyTree, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
+    def hear(self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array) -> tuple[PyTree, Heard]:
         """The sensor measures x, the channel delivers."""
         sensor, place = at(self.sensor, k), checksum(SENDER)
         y = sensed(sensor, x, draw_key(key, k, place, SENSOR))
@@ -130,7 +153,7 @@ class Slots(AbstractAir):
         }
         return Relayed(jnp.tile(mean, (len(self.own), 1)), hops)
 
-    def hear(self, state: Relayed, x: jax.Array, key: jax.Array, k: jax.Array) -> tuple[Relayed, Heard]:
+    def hear(self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array) -> tuple[Relayed, Heard]:
         """The sum of the hops of this step's slot, at each listener."""
         sensor = at(self.relays.sensor, k)
         y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
@@ -217,11 +240,15 @@ def air_of(network: Network) -> AbstractAir:
         rows = network.rows()
         heard = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
         return CommonChannel(network.common.sensor, network.common.channel, heard)
-    antennas = []
+    antennas, places = [], network.places()
     own = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in own.items()})
     for names in network.groups:
         parts = stack([(own[name].sensor, anonymous(own[name].channel)) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
-        antennas.append(Antenna(*parts, checksums, np.stack([memories[name] for name in names])))
+        held = np.stack([memories[name] for name in names])
+        told_by = own[names[0]].told_by
+        teller: Any = None if told_by is None else stack([own[name].filters[told_by] for name in names])
+        place = None if told_by is None else places[names[0], told_by][:2]
+        antennas.append(Antenna(*parts, checksums, held, teller, place))
     return OwnChannels(tuple(antennas))

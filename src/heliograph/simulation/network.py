@@ -275,7 +275,9 @@ def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], input
 
 def _world(node: Node | Listener) -> object:
     """What decides how a node hears."""
-    return (node.sensor, anonymous(node.channel)) if isinstance(node, Node) else (node.received, node.complete)
+    if isinstance(node, Node):
+        return node.sensor, anonymous(node.channel), node.told_by
+    return node.received, node.complete
 
 
 def lowered(claims: Claims) -> Claims:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
@@ -17,8 +18,10 @@ from heliograph.random_affine.base import AbstractRandomAffine
 class Node(eqx.Module):
     """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
 
+    With a `fed_back_filter` among them the sensor sends what that filter does not expect.
+
     Raises:
-        ValueError: a sensor and a channel that do not fit.
+        ValueError: a sensor and a channel that do not fit, a filter that hears beside one that is fed back.
     """
 
     sensor: AnySensor
@@ -30,11 +33,19 @@ class Node(eqx.Module):
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_filters(self.filters, self.received)
+        hearing = [name for name, item in self.filters.items() if item.received]
+        if self.told_by is not None and hearing != [self.told_by]:
+            raise fail("node whose sensor hears back", f"no filter that hears beside {self.told_by!r}", hearing)
 
     @property
     def received(self) -> int:
         """Length of the measurement that reaches the filters."""
         return int(first(self.channel).outputs)
+
+    @property
+    def told_by(self) -> str | None:
+        """Name of the filter whose estimates the sensor hears back; None where it hears none."""
+        return next((name for name, item in self.filters.items() if isinstance(item, FedBackFilter)), None)
 
     @property
     def outputs(self) -> tuple[str, ...]:

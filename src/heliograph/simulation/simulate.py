@@ -220,7 +220,7 @@ class World(eqx.Module):
         (x, air, states), (k, u) = carry, row
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
-        air, z = self.air.hear(air, x, key, k)
+        air, z = self.air.hear(air, x, u, key, k)
         drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
         states, found = self.filters.step(states, z, u, k, drawn)
         after = x, self.air.told(air, found["estimates"]), states

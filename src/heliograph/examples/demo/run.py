@@ -1,9 +1,11 @@
 """The demonstration as a folder of results, and its table on the terminal."""
 
+from collections.abc import Callable
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from textwrap import fill
+from typing import NamedTuple
 
 import rich.box
 import rich.console
@@ -12,6 +14,7 @@ import rich.table
 from heliograph.examples.demo import robot
 from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
 from heliograph.examples.demo.recording import find_recording, read_recording
+from heliograph.examples.demo.twin import Design, as_it_is, twins
 from heliograph.files.recording import write_estimates
 from heliograph.files.table import write_table
 from heliograph.numerics.check import check_seed
@@ -20,7 +23,14 @@ from heliograph.report.results import Json, Results, write_results
 from heliograph.simulation.record import Record
 
 NAME = "demo"
-STAGES = SEEDS + 1  # of reading and computing
+STAGES = 2 * SEEDS + 1  # of reading and computing
+
+
+class Found(NamedTuple):
+    """The filters behind the relays as they are, and behind relays that were designed."""
+
+    outcome: Outcome
+    designs: dict[str, Design]
 
 
 def example(out: Path, seed: int = 0, recording: str = "plaza2") -> None:
@@ -35,19 +45,35 @@ def example(out: Path, seed: int = 0, recording: str = "plaza2") -> None:
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     find_recording(recording)  # a missing extra is told before the work starts
 
-    def work(advance: Advance) -> Outcome:
+    def work(advance: Advance) -> Found:
         advance("reading the recording")
-        return compute(read_recording(recording), seed, advance)
+        drive = read_recording(recording)
+        outcome = compute(drive, seed, advance)
+        return Found(outcome, designs(outcome, advance))
 
     target = Path(out) / NAME
-    print_table(write_results(target, STAGES, work, results, ("pyarrow",)), target)
+    print_table(write_results(target, STAGES, work, results, ("pyarrow",)).outcome, target)
 
 
-def results(outcome: Outcome) -> Results:
+def designs(outcome: Outcome, advance: Callable[[str], None] = lambda what: None) -> dict[str, Design]:
+    """The relays as they are and the designed ones, over the same seeds."""
+    trials = outcome.trials
+    plain = as_it_is(outcome.recording, [trial.scores["relay_aware"] for trial in trials])
+    return {"as_it_is": plain, **twins(outcome.recording, range(trials[0].seed, trials[-1].seed + 1), advance)}
+
+
+def results(found: Found) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.demo.page import demo_figures, demo_page
 
-    return Results(demo_figures(outcome), partial(demo_page, outcome), summary(outcome), partial(write_data, outcome))
+    outcome = found.outcome
+    told = {**summary(outcome), "designs": {name: numbers(one) for name, one in found.designs.items()}}
+    return Results(demo_figures(outcome), partial(demo_page, *found), told, partial(write_data, outcome))
+
+
+def numbers(design: Design) -> dict[str, Json]:
+    """RMSE and what is claimed (m), as means over the seeds, and the power of sensor and relay together (m^2)."""
+    return {"rmse": design.rmse, "claimed": design.claimed, "power": design.power}
 
 
 def write_data(outcome: Outcome, folder: Path) -> None:

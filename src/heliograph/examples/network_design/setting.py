@@ -1,0 +1,70 @@
+"""The networks: six sensors over one hop or two, a seldom seen state, packets, and a published circuit."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+import heliograph as hg
+
+TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
+PROCESS = np.diag([0.1, 0.05, 0.2])
+ROWS = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0], [0, 1, -1], [1, 0, 1]])
+NOISES = np.array([0.5, 0.4, 0.3, 0.6, 0.5, 0.8])
+NEAR, FAR = np.array([1.2, 0.7, 1.9, 1.0, 1.5, 0.5]), np.array([0.8, 1.6, 0.6, 1.3, 0.9, 1.8])  # lengths of hops
+KAPPA = np.array([1.02, 1.05, 1.02, 1.1, 1.02, 1.05])  # E g^2 / (E g)^2 of a single hop
+RELAYED_KAPPA = 1.02
+NAMES = tuple("abcdef")
+
+VARIANCE = 4e-6  # of the circuit's noises
+SPREAD = 0.01  # of its gains
+QUIET = {"relay_1": (1, (0.39, -0.21, 0.033)), "relay_2": (0, (0.84, -0.42, 0.13))}  # the slot and gains to begin from
+
+
+def gain(kappa: float, length: float) -> hg.Discrete:
+    """Two gains of mean length^-3/2 and of this kappa."""
+    mean = length**-1.5
+    away = mean * np.sqrt(kappa - 1)
+    return hg.Discrete([mean - away, mean + away], [0.5, 0.5])
+
+
+def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
+    """Three states, and these of the six sensors, heard directly or each through a relay of its own."""
+    nodes = {}
+    for i, name in enumerate(NAMES):
+        hops = [hg.hop(gain(RELAYED_KAPPA if relayed else KAPPA[i], NEAR[i]), 1.0)]
+        if relayed:
+            hops.append(hg.hop(gain(RELAYED_KAPPA, FAR[i]), 1.0))
+        sensor = hg.LinearSensor(ROWS[i : i + 1], NOISES[i])
+        nodes[name] = hg.Node(sensor, hg.amplify_and_forward(hops), {})
+    plant = hg.LinearPlant(TRANSITION, PROCESS, np.zeros(3), np.eye(3))
+    return hg.Network(plant, {name: nodes[name] for name in names})
+
+
+def six_paths() -> hg.planning.Paths:
+    """The same sensors, heard directly, as plain numbers."""
+    return hg.planning.independent_paths(TRANSITION, PROCESS, ROWS, NOISES, KAPPA, NEAR**3 / KAPPA)
+
+
+def slow_state() -> hg.planning.Paths:
+    """A state that hardly moves, heard over two hops without fading."""
+    return hg.planning.independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
+
+
+def circuit() -> hg.model.RelayNetwork:
+    """Two relays in turn that filter and forward what they hear of a circuit, as published."""
+    drive = np.array([[0.6], [0.5], [0.3]])
+    plant = hg.LinearPlant(
+        [[0.6858, 0.3364, 0.0935], [0.1790, 0.7960, -0.4229], [0.0120, 0.1069, 0.9732]],
+        VARIANCE * drive @ drive.T,
+        [0.3, 0.2, -0.2],
+        np.diag([0.05, 0.02, 0.03]),
+    )
+    sensor = hg.LinearSensor([[2.0, 1.8, 2.5]], 0.36 * VARIANCE)
+
+    def link(mean: float, noise: float = VARIANCE) -> hg.random_affine.GainAndNoise:
+        squared = np.log(1 + SPREAD / mean**2)
+        return hg.hop(hg.LogNormal(np.log(mean) - squared / 2, np.sqrt(squared)), noise)
+
+    odd = {"relay_2": {"sensor": link(0.92), "relay_1": link(0.9, 0.0)}, "receiver": {"relay_1": link(0.9)}}
+    even = {"relay_1": {"sensor": link(0.9), "relay_2": link(0.9, 0.0)}, "receiver": {"relay_2": link(0.92)}}
+    return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), (odd, even))

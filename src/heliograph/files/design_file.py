@@ -1,0 +1,155 @@
+"""A design in a TOML file: which network, what is free, the budget or the wanted error, and what is shown beside."""
+
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.network_file import load_function, load_network
+from heliograph.numerics.check import array, check_count, check_seed, fail, scalar
+from heliograph.planning.budget import Budget
+from heliograph.planning.criterion import Error
+from heliograph.planning.task import Task
+from heliograph.simulation.network import Network
+
+KEYS = ("network", "free", "budget", "wanted", "error", "starts", "seed", "front", "path_loss_exponent", "map")
+TABLES = {
+    "budget": ("total", "each", "peak"),
+    "error": ("weight", "worst", "horizon", "at_end", "period"),
+    "map": ("network", "x", "y", "points"),
+}
+
+
+@dataclass(frozen=True)
+class MapAsked:
+    """A function of a Python file that returns the network for a place (x, y), and the places, in its units."""
+
+    build: Callable[[float, float], Network]
+    x: np.ndarray
+    y: np.ndarray
+
+
+@dataclass(frozen=True)
+class DesignFile:
+    """What the file asks; `reference` and `source` are the network's name in it and its Python source."""
+
+    reference: str
+    source: str
+    network: Network
+    task: Task
+    front: tuple[float, ...] | None
+    exponent: float | None
+    map: MapAsked | None
+
+
+def read_design(path: Path) -> DesignFile:
+    """Read the file; names of Python files in it are relative to its folder.
+
+    Raises:
+        ValueError: no TOML, keys or values that are none, a network that cannot be loaded; one line with the key.
+    """
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise fail(f"design {path.name}", "TOML", str(error)) from None
+    _check_keys(path.name, table, KEYS)
+    for key, known in TABLES.items():
+        if isinstance(table.get(key), dict):
+            _check_keys(f"{path.name}, {key}", table[key], known)
+    file, name = _place(path, table.get("network"), "network")
+    free = table.get("free")
+    if free is not None and (not isinstance(free, list) or not all(isinstance(one, str) for one in free)):
+        raise fail(f"{path.name}, free", "a list of names", repr(free))
+    task = Task(
+        free=None if free is None else tuple(free),
+        error=Error(**_table(path, table, "error")) if "error" in table else None,
+        budget=_budget(path, table),
+        wanted=float(scalar(f"{path.name}, wanted", table["wanted"], 0.0)) if "wanted" in table else None,
+        starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
+        seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
+    )
+    front = table.get("front")
+    exponent = table.get("path_loss_exponent")
+    return DesignFile(
+        reference=f"{file.name}:{name}" if name else file.name,
+        source=file.read_text(encoding="utf-8"),
+        network=load_network(f"{file}:{name}" if name else str(file)),
+        task=task,
+        front=None if front is None else tuple(array(f"{path.name}, front", front, (None,)).tolist()),
+        exponent=None if exponent is None else float(scalar(f"{path.name}, path_loss_exponent", exponent, 0.0)),
+        map=_map(path, table) if "map" in table else None,
+    )
+
+
+def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
+    value = table.get("budget")
+    if value is None:
+        return None
+    return Budget(**value) if isinstance(value, dict) else Budget(scalar(f"{path.name}, budget", value, 0.0))
+
+
+def _map(path: Path, table: Mapping[str, Any]) -> MapAsked:
+    asked = _table(path, table, "map")
+    file, name = _place(path, asked.get("network"), "map.network")
+    if not name:
+        raise fail(f"{path.name}, map.network", 'a file and a function of x and y, as "my_network.py:at"', file.name)
+    points = check_count(f"{path.name}, map.points", asked.get("points", 11), 2)
+    ends = [array(f"{path.name}, map.{key}", asked.get(key, "none"), (2,)) for key in ("x", "y")]
+    build = load_function(file, file.read_text(encoding="utf-8"), name)
+    x, y = (np.linspace(low, high, points) for low, high in ends)
+    return MapAsked(build, x, y)
+
+
+def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
+    """The Python file and the name in it."""
+    if not isinstance(value, str):
+        raise fail(f"{path.name}, {key}", 'a Python file, as "my_network.py" or "my_network.py:name"', repr(value))
+    place, colon, name = value.rpartition(":")
+    place, name = (place, name) if colon and name.isidentifier() else (value, "")
+    file = path.parent / place
+    if not file.is_file():
+        raise fail(f"{path.name}, {key}", "a Python file beside it", repr(value))
+    return file, name
+
+
+def _table(path: Path, table: Mapping[str, Any], key: str) -> dict[str, Any]:
+    value = table[key]
+    if not isinstance(value, dict):
+        raise fail(f"{path.name}, {key}", f"a table of {', '.join(TABLES[key])}", repr(value))
+    return value
+
+
+def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...]) -> None:
+    for key in table:
+        if key not in known:
+            close = get_close_matches(key, known, 1)
+            hint = f" (closest: {close[0]!r})" if close else ""
+            raise fail(f"{where}, key {key!r}", f"one of {', '.join(known)}", f"an unknown key{hint}")
+
+
+def designed_source(asked: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
+    """Python source of the network with these powers, which reads that as it was from the file `source` beside it."""
+    error = Error() if asked.task.error is None else asked.task.error
+    _, colon, name = asked.reference.rpartition(":")
+    place = f'str(Path(__file__).with_name("{source}"))' + (f' + ":{name}"' if colon else "")
+    return "\n".join([
+        '"""A network with designed powers, and the best linear filters for them."""',
+        "",
+        "from pathlib import Path",
+        "",
+        "import heliograph as hg",
+        "",
+        "POWERS = {  # by transmitter, of each step of a period or horizon",
+        *(f"    {one!r}: {np.asarray(power).tolist()}," for one, power in powers.items()),
+        "}",
+        "network = hg.planning.designed_network(",
+        f"    hg.files.load_network({place}),",
+        "    POWERS,",
+        f"    hg.planning.Error(horizon={error.horizon}, period={error.period}),",
+        ")",
+        "",
+    ])  # fmt: skip

@@ -1,0 +1,89 @@
+"""Signals that cost less: what sender and receiver both expect is taken off before sending and added back after."""
+
+from typing import overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.channel import Channel, amplify_and_forward
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor, check_sensor
+from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.traced import library
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.atoms import known
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+
+
+@overload
+def centred(channel: AbstractRandomAffine, reference: ArrayLike) -> AbstractRandomAffine: ...
+@overload
+def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel: ...
+
+
+def centred(channel: Channel, reference: ArrayLike | OverTime) -> Channel:
+    """The channel that sends y - r: z = G (y - r) + n + E[G] r, where the receiver knows r and adds E[G] r back.
+
+    E[z | y] is that of the channel itself; power and the gain's noise see E (y - r)^2 in place of E y^2. `reference` r
+    is a constant (m,), a number where one is sent, or an `OverTime` of one for each step: a trajectory, or
+    `expected_signal`, the best of all that is known before. Any sensor, linear or not, and any filter take the result,
+    and so does a relay between two hops.
+
+    Raises:
+        ValueError: a reference of another length than what is sent; a channel that is late or erases: put
+            `centred` inside, as in `delayed(centred(link, r), d)` and `erasure(centred(link, r), p)`.
+    """
+    steps = steps_covered((channel, reference))
+    if steps is None:
+        return _centred(first(channel), reference)
+    return over_time([_centred(at(channel, k), at(reference, k)) for k in range(steps)])
+
+
+def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> AbstractRandomAffine:
+    (channel,) = as_maps("channel less a reference", [channel])
+    if channel.past or channel.erases:
+        what = "late" if channel.past else "one that erases"
+        raise fail("channel less a reference", "neither late nor lossy by itself (put `centred` inside)", what)
+    r = array("reference", library(reference).atleast_1d(reference), (channel.inputs,))
+    forgets = without_memory(channel)
+    assert isinstance(forgets, AbstractRandomAffine)
+    gain = forgets.moments(1).mean[:-1, :-1]
+    return amplify_and_forward([known(np.eye(len(r)), -r), channel, known(np.eye(channel.outputs), gain @ r)])
+
+
+def expected_signal(
+    plant: AnyPlant, sensor: AnySensor, horizon: int, inputs: ArrayLike | None = None
+) -> Float[np.ndarray, "horizon outputs"]:
+    """E[y_k] at each step of a linear plant and sensor; h along the path without noise of a nonlinear one.
+
+    Of all references that do not depend on data, E[y_k] leaves the least to send: E (y - r)^2 = Var y + (E y - r)^2.
+    `inputs` (horizon, inputs) as they are planned.
+
+    Raises:
+        ValueError: a horizon beyond what varies over time, a sensor that does not fit, inputs of another shape.
+    """
+    check_horizon(horizon, steps_covered((plant, sensor)))
+    start = check_plant(plant)
+    check_sensor(first(sensor), len(start.states))
+    if inputs is None and start.inputs:
+        raise fail("inputs", f"an array ({horizon}, {len(start.inputs)}) of {list(start.inputs)}", "none")
+    shape = (horizon, len(start.inputs))
+    u = np.zeros(shape) if inputs is None else array("inputs", inputs, shape)
+    return np.asarray(_along(plant, sensor, u))
+
+
+@compiled
+def _along(plant: AnyPlant, sensor: AnySensor, inputs: Float[Array, "horizon inputs"]) -> jax.Array:
+    def step(x: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        k, u = row
+        moves, senses = at(plant, k), at(sensor, k)
+        x = moves.transition(x, u) + moves.noise_mean()
+        return x, senses.measure(x) + senses.noise.mean
+
+    start = jnp.asarray(at(plant, 0).initial_mean)
+    result: jax.Array = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+    return result

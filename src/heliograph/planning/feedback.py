@@ -1,0 +1,179 @@
+"""Sending what the receiver does not expect: how much noise on the way an unstable plant bears, and with what error.
+
+A sensor sends c x + v - c xhat with xhat the receiver's prediction; of E (y - c xhat)^2 = s = c P c' + r every
+transmitter makes its power p_h. Received over the path's mean gain, this has the second moment s D,
+  D = prod_h kappa_h (1 + alpha_h / p_h), kappa = E g^2 / (E g)^2, alpha = Var m / E g^2,
+so that the predicted error is P+ = A (P - P c' c P / (s D)) A' + Q: that of a filter whose packets arrive with
+probability 1 / D and which is not told. It is bounded if and only if 1 / D > 1 - 1 / Lambda.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.linear.arrival import plant_matrices, sensor_matrices
+from heliograph.linear.told_losses import spectral_radius
+from heliograph.model.channel import Channel, amplify_and_forward, hop
+from heliograph.model.over_time import over_time
+from heliograph.model.plant import LinearPlant
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import check_count, fail, items, per_step, shown
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.random_affine.atoms import GainAndNoise
+
+SETTLED = 1e-12  # relative change of a round at which the error is taken for steady: rounding of the linear equation
+STEPS, ROUNDS = 20, 2000  # of the filter in a round; rounds
+
+
+@readable
+class FeedbackLimit(NamedTuple):
+    """The certificate of a plant whose sensor hears back: the error is bounded if and only if noise < limit.
+
+    noise D = prod kappa_h (1 + alpha_h / p_h) of the path; limit = Lambda / (Lambda - 1), Lambda the product of the
+    squared unstable eigenvalues (inf for a stable plant). predicted, filtered (n, n): the steady error covariances,
+    None where they grow.
+    """
+
+    noise: float
+    limit: float
+    predicted: Float[np.ndarray, "n n"] | None
+    filtered: Float[np.ndarray, "n n"] | None
+
+    @property
+    def bounded(self) -> bool:
+        """Whether the error stays bounded."""
+        return self.noise < self.limit
+
+
+class _Link(NamedTuple):
+    """Mean, second moment and noise variance of a hop whose transmitter sends at power 1 what it is given."""
+
+    mean: float
+    second: float
+    noise: float
+
+
+def feedback_limit(
+    plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike
+) -> FeedbackLimit:
+    """How much noise the path may add, how much it does, and the steady error, for one sensor that hears back.
+
+    `hops` from the sensor through its relays, as `hop(law, variance)`: of each counts what the air does; how much it
+    amplifies follows from its power in `powers` (hop,). That the error is bounded means that of `fed_back_filter`.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear or varies, more than one output, an unstable mode that the
+            sensor does not show, hops that are no single hops, powers that are not positive.
+    Source: Elia, Remote stabilization over fading channels (2005), for one input.
+    """
+    a, q = plant_matrices(plant)
+    c, r = sensor_matrices(sensor, len(a))
+    _check_seen(a, c)
+    noise = noise_of_hops(hops, powers)
+    unstable = np.abs(np.linalg.eigvals(a))
+    lam = float(np.prod(unstable[unstable > 1] ** 2))
+    limit = lam / (lam - 1) if lam > 1 else np.inf
+    if noise >= limit:
+        return FeedbackLimit(noise, limit, None, None)
+    predicted = _steady(a, q, c, r, noise)
+    return FeedbackLimit(noise, limit, predicted, _heard(predicted, c, r, noise))
+
+
+def fed_back_channel(
+    plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike, horizon: int
+) -> Channel:
+    """The channel over so many steps of a sensor that hears back, in which every transmitter keeps its power.
+
+    a_1^2 = p_1 / (c P_k c' + r) falls and rises with what the receiver does not know, which is known before any data;
+    relays amplify by a_{h+1}^2 = p_{h+1} / (E g_h^2 p_h + Var m_h). For `fed_back_filter`.
+
+    Raises:
+        ValueError: as `feedback_limit`; a horizon below one.
+    """
+    a, q = plant_matrices(plant)
+    c, r = sensor_matrices(sensor, len(a))
+    links, p = _links(hops), _powers(powers, len(hops))
+    noise, steps = noise_of_hops(hops, powers), check_count("horizon", horizon)
+    relays = [np.sqrt(then / (one.second * sent + one.noise)) for one, sent, then in zip(links, p, p[1:], strict=False)]
+    filtered, channels = np.asarray(plant.initial_covariance), []
+    for _ in range(steps):
+        predicted = a @ filtered @ a.T + q
+        first = np.sqrt(p[0] / (c @ predicted @ c.T + r)[0, 0])
+        factors = [first, *relays]
+        channels.append(
+            amplify_and_forward([
+                hop(one.law, one.noise, amplification=factor) for one, factor in zip(hops, factors, strict=True)
+            ])
+        )  # fmt: skip
+        filtered = _heard(predicted, c, r, noise)
+    return over_time(channels)
+
+
+def noise_of_hops(hops: Sequence[GainAndNoise], powers: ArrayLike) -> float:
+    """D = prod_h kappa_h (1 + alpha_h / p_h): the second moment of what arrives, over that of what was sent.
+
+    Raises:
+        ValueError: hops that are no single hops, powers that are not positive.
+    """
+    links = _links(hops)
+    each = zip(links, _powers(powers, len(links)), strict=True)
+    return float(np.prod([one.second / one.mean**2 * (1 + one.noise / (one.second * p)) for one, p in each]))
+
+
+def _heard(p: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndarray:
+    """P - P c' c P / (s D)."""
+    cross = p @ c.T
+    return np.asarray(p - cross @ cross.T / (noise * (c @ cross + r)[0, 0]))
+
+
+def _steady(a: np.ndarray, q: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndarray:
+    """P = A (P - P c' c P / (s D)) A' + Q: steps of the filter, and the steady error of their gain once it is bounded.
+
+    With a gain K kept, P+ = A ((I - K c) P (I - K c)' + K r K' + (D - 1) K (c P c' + r) K') A' + Q.
+    """
+    n = len(a)
+    p = q
+    for _ in range(ROUNDS):
+        for _ in range(STEPS):
+            p = a @ _heard(p, c, r, noise) @ a.T + q
+        gain = p @ c.T / (noise * (c @ p @ c.T + r)[0, 0])
+        kept, fed = a @ (np.eye(n) - gain @ c), a @ gain
+        through = np.kron(kept, kept) + (noise - 1) * np.kron(fed @ c, fed @ c)
+        if spectral_radius(through) >= 1:
+            continue
+        found = np.linalg.solve(np.eye(n * n) - through, (noise * r[0, 0] * fed @ fed.T + q).ravel()).reshape(n, n)
+        found = (found + found.T) / 2
+        if np.abs(found - p).max() <= SETTLED * np.abs(found).max():
+            return found
+        p = found
+    return p
+
+
+def _links(hops: Sequence[GainAndNoise]) -> list[_Link]:
+    found = []
+    for one in items("hops", hops, "hops"):
+        if not isinstance(one, GainAndNoise) or one.inputs != 1 or one.outputs != 1:
+            raise fail("hops of a sensor that hears back", "single hops of one number", shown(one))
+        variance = float(np.asarray(one.noise.covariance)[0, 0])
+        found.append(_Link(float(one.law.moment(1)), float(one.law.moment(2)), variance))
+    if not found or any(one.mean == 0 for one in found):
+        raise fail("hops of a sensor that hears back", "at least one, each with a mean gain", shown(hops))
+    return found
+
+
+def _powers(powers: ArrayLike, count: int) -> np.ndarray:
+    result = per_step("powers", powers, count)
+    if np.any(result <= 0):
+        raise fail("powers", "positive numbers", result.tolist())
+    return result
+
+
+def _check_seen(a: np.ndarray, c: np.ndarray) -> None:
+    """One output, which shows every unstable mode (Hautus)."""
+    if len(c) != 1:
+        raise fail("sensor that hears back", "one output", len(c))
+    for value in np.linalg.eigvals(a):
+        if abs(value) >= 1 and np.linalg.matrix_rank(np.vstack([a - value * np.eye(len(a)), c])) < len(a):
+            raise fail("sensor that hears back", "one that shows every unstable mode", f"none of {value:.4g}")

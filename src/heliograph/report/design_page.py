@@ -1,0 +1,213 @@
+"""A design as figures and a page: the front, who sends how much, a map, what is certified, and what more would buy."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from heliograph.files.quoting import in_figure, visible
+from heliograph.planning.front import Front
+from heliograph.planning.outcome import NetworkDesign
+from heliograph.planning.purchases import Purchase
+from heliograph.planning.site_map import SiteMap
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
+from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
+from heliograph.report.results import Json, Results
+
+MOST = 40  # transmitters that are drawn; the table and the summary hold all
+ROUNDING = 1e-12  # of the total power
+SOURCE, DESIGNED = "network.py", "designed.py"
+
+
+@dataclass(frozen=True)
+class DesignResults:
+    """Everything a design's page tells. `before`: what each transmitter sends as the network is, in the mean."""
+
+    reference: str
+    source: str
+    design: NetworkDesign
+    before: Mapping[str, float]
+    front: Front
+    purchases: Sequence[Purchase]
+    map: SiteMap | None
+    written: str  # the designed network as Python source
+
+
+def design_results(found: DesignResults) -> Results:
+    """Everything that the folder holds."""
+    return Results(figures(found), partial(page, found), summary(found), partial(write_networks, found))
+
+
+def write_networks(found: DesignResults, folder: Path) -> None:
+    """The network as it was, and beside it the designed one, which reads it."""
+    (folder / SOURCE).write_text(found.source, encoding="utf-8")
+    (folder / DESIGNED).write_text(found.written, encoding="utf-8")
+
+
+def mean_powers(design: NetworkDesign) -> dict[str, float]:
+    """Mean power of each transmitter, zero where it is but rounding of the total."""
+    each = {name: float(np.mean(power)) for name, power in design.powers.items()}
+    return {name: power if power > ROUNDING * design.total else 0.0 for name, power in each.items()}
+
+
+def summary(found: DesignResults) -> dict[str, Json]:
+    """All numbers of the page."""
+    design, certificate = found.design, found.design.certificate
+    place = None if found.map is None else dict(zip(("x", "y", "error"), found.map.best, strict=True))
+    return {
+        "error": design.error,
+        "present": design.present,
+        "total": design.total,
+        "powers": {name: np.asarray(power).tolist() for name, power in design.powers.items()},
+        "certificate": {
+            "words": certificate.words, "convex": certificate.convex, "value": certificate.value,
+            "bound": certificate.bound, "gap": certificate.gap, "starts": certificate.starts,
+        },
+        "sensitivity": dict(design.sensitivity),
+        "price": design.price,
+        "front": {key: np.asarray(value).tolist() for key, value in found.front._asdict().items()},
+        "purchases": {one.name: {"value": one.value, "saved": one.saved} for one in found.purchases},
+        "map": place,
+    }  # fmt: skip
+
+
+def figures(found: DesignResults) -> dict[str, Figure]:
+    """Front, powers, and the map where one is asked for, by file name."""
+    drawn = {"front": front_figure(found.front, {"this design": (found.design.total, found.design.error)})}
+    drawn["powers"] = powers_figure(found.before, mean_powers(found.design))
+    if found.map is not None:
+        drawn["map"] = map_figure(found.map)
+    return drawn
+
+
+@matplotlib.rc_context(STYLE)
+def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
+    """Error over total power: what was found, the bound below which nothing is, and named points (power, error)."""
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    axes = figure.subplots()
+    # a bound at some power holds for all less: hence steps
+    axes.fill_between(front.totals, front.bounds, 0, step="pre", color=PALE, alpha=0.6, linewidth=0, label="impossible")
+    axes.plot(front.totals, front.errors, "o-", color=BLUE, linewidth=1.6, markersize=4, label="found")
+    for (name, (power, error)), colour in zip(marks.items(), (VERMILION, AMBER, GREEN), strict=False):
+        axes.plot([power], [error], "D", color=colour, markeredgecolor=INK, markersize=8, label=in_figure(name))
+    spread = np.ptp(front.errors)
+    every = [*front.errors, *(error for _, error in marks.values())]
+    axes.set(xscale="log", xlabel="total mean power", ylabel="error", xlim=(front.totals[0], front.totals[-1]))
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.set_ylim(max(front.bounds.min() - 0.15 * spread, 0.0), max(every) + 0.1 * spread)
+    axes.legend(frameon=False, fontsize=9)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Figure:
+    """Mean power of each transmitter, as it is and designed, a bar each."""
+    names = sorted(after, key=lambda name: -after[name])[:MOST]
+    names = [name for name in after if name in names]
+    figure = Figure(figsize=(WIDTH, 0.9 + 0.28 * len(names)), layout="constrained")
+    axes = figure.subplots()
+    places = np.arange(len(names))[::-1]
+    axes.barh(places, [after[name] for name in names], height=0.55, color=BLUE, label="designed")
+    axes.plot([before.get(name, np.nan) for name in names], places, "|", color=VERMILION, markersize=13,
+              markeredgewidth=2.2, label="as it is")  # fmt: skip
+    axes.set_yticks(places, [in_figure(name) for name in names])
+    largest = max(np.nanmax([values.get(name, np.nan) for name in names]) for values in (before, after))
+    axes.set(xlabel="mean power", xlim=(0, 1.05 * (largest or 1.0)))
+    axes.grid(visible=False, axis="y")
+    figure.legend(loc="outside upper right", ncols=2, frameon=False, fontsize=9)
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def map_figure(found: SiteMap) -> Figure:
+    """The error over places, darker where it is smaller, with the best place."""
+    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    axes = figure.subplots()
+    picture = axes.contourf(found.x, found.y, found.errors, levels=14, cmap="cividis")
+    east, north, least = found.best
+    axes.plot([east], [north], "*", color="white", markeredgecolor=INK, markersize=16)
+    axes.set(xlabel="x", ylabel="y", aspect="equal", title=f"best at ({east:.3g}, {north:.3g}): {least:.4g}")
+    axes.grid(visible=False)
+    figure.colorbar(picture, ax=axes, label="error", shrink=0.8, format="%.3g")
+    return figure
+
+
+def page(found: DesignResults, drawings: Mapping[str, bytes]) -> Page:
+    """The report; `drawings` holds each figure as SVG."""
+    design = found.design
+    sections = [_result(found), _front(drawings), _powers(found, drawings)]
+    if found.map is not None:
+        sections.append(_map(found.map, drawings))
+    return Page(
+        kicker="Heliograph design",
+        title="Who should send how much",
+        lead=(
+            f"The network {visible(found.reference)} has the error {design.present:.4g} and sends "
+            f"{sum(found.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
+            f"{design.total:.4g}."
+        ),
+        sections=[*sections, _more(found), _rerun()],
+    )
+
+
+def _result(found: DesignResults) -> Section:
+    design = found.design
+    keys = [
+        KeyFigure("error", f"{design.error:.4g}", f"{design.present:.4g} as the network is", BLUE),
+        KeyFigure("total power", f"{design.total:.4g}", f"{sum(found.before.values()):.4g} as it is", VERMILION),
+        KeyFigure("not below", f"{design.certificate.bound:.4g}", f"{design.certificate.unit}, proven", GREEN),
+    ]
+    words = f"**How good it is:** {design.certificate.words}."
+    return Section("The design", [KeyFigures(keys), Text([words])])
+
+
+def _front(drawings: Mapping[str, bytes]) -> Section:
+    caption = "The least error found at each total power. Nothing lies in the grey region, whatever is tried."
+    return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
+
+
+def _powers(found: DesignResults, drawings: Mapping[str, bytes]) -> Section:
+    after, slope = mean_powers(found.design), found.design.sensitivity
+    rows = [
+        [visible(name), f"{found.before.get(name, float('nan')):.4g}", f"{power:.4g}",
+         f"{np.max(found.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]
+        for name, power in after.items()
+    ]  # fmt: skip
+    caption = (
+        "**One more watt here**: by how much the error falls for one unit of mean power more at this transmitter; "
+        f"where a total binds, it is the same ({found.design.price:.3g}) for all that send, and less for the others."
+    )
+    headers = ("transmitter", "as it is", "designed", "peak", "one more watt here")
+    picture = Picture(drawings["powers"], "Bars of power by transmitter, with marks for what is sent now.")
+    return Section("Who sends how much", [picture, Table(headers, rows, caption)])
+
+
+def _map(found: SiteMap, drawings: Mapping[str, bytes]) -> Section:
+    caption = "The least error at the design's total power, with the network standing as the map's function says."
+    return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
+
+
+def _more(found: DesignResults) -> Section:
+    unit = found.design.certificate.unit
+    rows = [[visible(one.name), f"{one.value:.4g}", f"{one.saved:+.3g}"] for one in found.purchases]
+    caption = (
+        f"The {unit} of the design made again after each change, and how much of it that saves. A relay halfway is put "
+        "in where the exponent of the path loss is given."
+    )
+    return Section("What one more would buy", [Table(("change", unit, "saved"), rows, caption)])
+
+
+def _rerun() -> Section:
+    commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
+    text = (
+        f"`{DESIGNED}` is the network with these powers and the best linear filters for them; it reads `{SOURCE}`, "
+        "the network as it was, beside it. `summary.json` holds every number of this page."
+    )
+    return Section("Run it", [Code(commands), Text([text])])
