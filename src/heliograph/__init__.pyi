@@ -91,6 +91,9 @@ from .simulation.record import (
 from .simulation.sums import (
     Statistics as Statistics,
 )
+from .learning.tell_apart import (
+    samples_to_tell as samples_to_tell,
+)
 from .live.stream import (
     Stream as Stream,
 )
