@@ -93,6 +93,14 @@ from .simulation.sums import (
 )
 from .learning.tell_apart import (
     samples_to_tell as samples_to_tell,
+from .learning.parameters import (
+    free as free,
+)
+from .learning.fitting import (
+    fit as fit,
+)
+from .learning.identification import (
+    identifiable as identifiable,
 )
 from .live.stream import (
     Stream as Stream,

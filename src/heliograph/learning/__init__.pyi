@@ -36,4 +36,17 @@ from .stretches import (
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,
     fates_of_sequence as fates_of_sequence,
+from .fitting import (
+    Fit as Fit,
+)
+from .identification import (
+    Identifiability as Identifiability,
+)
+from .parameters import (
+    Description as Description,
+    Parameters as Parameters,
+    describe as describe,
+)
+from .solution import (
+    Row as Row,
 )

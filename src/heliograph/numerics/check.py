@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from heliograph.numerics.domain import PROBABILITY, REAL, SIMPLEX, Domain, tell, tell_covariance
 from heliograph.numerics.traced import is_traced
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
@@ -44,6 +45,7 @@ def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: b
     Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
     shape alone is checked.
     """
+    tell(name, value, REAL)
     result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
         want is None or want == have for want, have in zip(shape, result.shape, strict=True)
@@ -77,6 +79,7 @@ def _numbers(name: str, value: ArrayLike) -> Any:
 
 def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.inf) -> Any:
     """Return `value` as a finite scalar between `low` and `high`."""
+    tell(name, value, Domain(low=low, high=high))
     result = array(name, value, ())
     if not is_traced(result) and not low <= result <= high:
         raise fail(name, f"a number from {low:g} to {high:g}", f"{float(result):g}")
@@ -190,6 +193,7 @@ def covariance(name: str, value: ArrayLike, dimension: int | None = None) -> Any
     Raises:
         ValueError: wrong shape, not finite, not symmetric, or with a negative eigenvalue.
     """
+    tell_covariance(name, value)
     result = _numbers(name, value)
     if dimension is not None and result.ndim == 0:
         result = array(name, result, ()) * np.eye(dimension)
@@ -221,6 +225,7 @@ def own_units(matrix: np.ndarray) -> np.ndarray:
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:
     """Return non-negative numbers that sum to one."""
+    tell(name, value, SIMPLEX, PROBABILITY)
     result = array(name, value, (count,))
     if is_traced(result):
         return result

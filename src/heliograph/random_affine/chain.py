@@ -15,6 +15,7 @@ from numpy.polynomial.hermite_e import hermegauss, hermevander
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
+from heliograph.numerics.domain import PROBABILITY, SIMPLEX, tell
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
 
@@ -103,6 +104,7 @@ class MarkovChain(AbstractMemory):
         name: str | None = None,
         radius: ArrayLike = 0.0,
     ):
+        tell("transition matrix", transition, SIMPLEX, PROBABILITY)
         self.transition = rows = array("transition matrix", transition, (None, None))
         if rows.shape[0] != rows.shape[1] or not rows.size:
             raise fail("transition matrix", "a square matrix", f"shape {rows.shape}")

@@ -1,0 +1,291 @@
+"""`fit`: estimates of what is free in a network, with intervals, and sentences on what the data cannot tell."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from heliograph.learning.identification import Identifiability, identified_by
+from heliograph.learning.intervals import METHODS, Method
+from heliograph.learning.maximise import Maximum
+from heliograph.learning.objective import Form, objectives
+from heliograph.learning.parameters import Build, Description, describe
+from heliograph.learning.recordings import gathered
+from heliograph.learning.solution import Row, Solution
+from heliograph.learning.surface import StoppedError, Surface
+from heliograph.numerics.check import check_count, check_seed, fail, shown
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.simulation.network import Network
+
+SPREAD = 1.5  # of the starts, in each coordinate that is a logarithm or a logit
+ELSEWHERE = 0.01  # of the log-likelihood: a start that ends so far below the best ended elsewhere
+INVISIBLE = 0.01  # information of a logarithm below which its number may as well be the limit
+APART = 3.0  # standard errors between the two forms that suggest an error of the model
+
+Progress = Callable[[str], None]
+
+
+@readable
+@dataclass(frozen=True)
+class Fit:
+    """What a fit found: a network that runs, a table, a covariance, and sentences.
+
+    `solutions` are the maxima by form, the one that counts last. `stopped`: somebody interrupted, this is the best so
+    far. `ends`: log-likelihood at which each start ended, best first.
+    """
+
+    description: Description
+    solutions: tuple[Solution, ...]
+    identified: Identifiability
+    ends: Float[np.ndarray, " starts"]
+    stopped: bool
+
+    @property
+    def best(self) -> Solution:
+        """The maximum that counts: of the conditional form where there is one."""
+        return self.solutions[-1]
+
+    @property
+    def network(self) -> Network:
+        """The network with the estimates in their places."""
+        return self.description.at_point(self.best.x)
+
+    @property
+    def values(self) -> dict[str, float | np.ndarray]:
+        """The estimates by name."""
+        return self.description.parameters.known(self.best.x)
+
+    @property
+    def converged(self) -> bool:
+        """Whether every form came to its maximum."""
+        return all(one.converged for one in self.solutions)
+
+    @property
+    def log_likelihood(self) -> dict[str, float]:
+        """At the maximum, by form, in nats."""
+        return {one.form: one.total for one in self.solutions}
+
+    @property
+    def table(self) -> tuple[Row, ...]:
+        """A row for each number and form, the form that counts first; intervals by `rows("cosines")`."""
+        return tuple(row for one in reversed(self.solutions) for row in one.rows())
+
+    def rows(self, method: Method = "cosines", form: Form | None = None) -> tuple[Row, ...]:
+        """The table of one form with intervals by another method.
+
+        "cosines" (the default) and "bartlett" allow for scores that are correlated over time, as they are behind random
+        gains; "white" does not; "hessian" believes the model besides; "profile" cuts the likelihood (numbers that have
+        a coordinate of their own; the others as "hessian"); "bootstrap" draws blocks of scores.
+
+        Raises:
+            ValueError: an unknown method, or a form that was not fitted.
+        """
+        if method not in METHODS:
+            raise fail("method of intervals", f"one of {', '.join(METHODS)}", shown(method))
+        known = {one.form: one for one in self.solutions}
+        if form is not None and form not in known:
+            raise fail("form", f"one of {', '.join(known)}", shown(form))
+        return known[self.best.form if form is None else form].rows(method)
+
+    @property
+    def covariance(self) -> Float[np.ndarray, "entries entries"]:
+        """Of the estimates in the order of `rows()`, by cosines; NaN for what is not told, or is at a boundary."""
+        best = self.best
+        inner, _ = best.covariance()
+        turned = self.description.parameters.jacobian(best.x)[:, best.active]
+        found = turned @ inner @ turned.T
+        lost = np.array([row.boundary or not row.identified for row in best.rows()])
+        found[lost] = found[:, lost] = np.nan
+        return np.asarray(found)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What there is to say: of starts, boundaries, forms that disagree, and what the data cannot tell."""
+        return (*_of_climb(self), *_of_boundaries(self.best), *_of_forms(self.solutions), *self.identified.sentences)
+
+    def __str__(self) -> str:
+        """The table and the sentences."""
+        width = max(len(row.name) for row in self.table)
+        lines = [f"{row.name:{width}}  {_number(row)}  ({row.form})" for row in self.table]
+        return "\n".join([*lines, *self.sentences])
+
+
+def fit(
+    network: Build,
+    recording: Any,
+    inputs: ArrayLike | Sequence[ArrayLike] | None = None,
+    starts: int = 6,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Fit:
+    """Learn what is free in a network from one recording or several.
+
+    `network` is a function that returns a Network in which numbers are marked by `hg.free`. `recording`: what
+    `hg.run` takes, measurements (steps, received) by node, NaN where one did not arrive, or of the one node alone; a
+    `Recording`; a `Record` with all its runs; or a list of these. The likelihood is that of all nodes together. For
+    linear plants the linear form comes first, which is right whatever the laws; from there the conditional one, which
+    is sharper. `starts`: the given one, and others drawn around it with the seed. `progress` is told each step in a
+    line. Ctrl-C keeps the best so far.
+
+    Shapes: inputs (steps, inputs), for each recording if they differ.
+
+    Raises:
+        ValueError: a network in which nothing is free or whose likelihood no filter knows; recordings that do not fit
+            it, are too short or constant; a free number on which nothing depends; a start that is impossible.
+    Source: Schweppe (1965) for the likelihood; Huber (1967) for intervals where it is not the true one.
+    """
+    check_count("starts", starts)
+    description = describe(network)
+    data = gathered(description.start, recording, inputs, description.parameters.size)
+    surfaces = [Surface(objective, data) for objective in objectives(description)]
+    say: Progress = progress or (lambda line: None)
+    points = _starts(surfaces[0], starts, check_seed("seed", seed))
+    stopped, ends, solutions = False, np.zeros(0), []
+    identified = identified_by(surfaces[-1], points[0], seed)
+    for surface in surfaces:
+        found, stopped = _climbed(surface, points, say)
+        order = np.argsort(-np.nan_to_num(found.total, nan=-np.inf))
+        ends = found.total[order] if not len(ends) else ends
+        solutions.append(_settled(surface, found, int(order[0]), identified.ridges, say))
+        if stopped:
+            break
+        points = found.x[order[:1]]
+    return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped)
+
+
+def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "starts p"]:
+    """The given start, and others around it at which the likelihood is finite.
+
+    Raises:
+        ValueError: a start that is impossible, or a number on which nothing depends.
+    """
+    parameters = surface.objective.description.parameters
+    start, rng = parameters.start, np.random.default_rng(seed)
+    first = surface.found(start[None])
+    if not np.isfinite(first.total[0]):
+        step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
+        raise fail("start of the fit", "numbers under which the recording is possible",
+                   f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
+    own = np.diag(first.information[0])
+    spread = np.full(len(start), SPREAD)
+    for entry in parameters.entries:
+        if entry.place is not None and np.isinf([entry.domain.low, entry.domain.high]).all():
+            at = abs(start[entry.place])
+            spread[entry.place] = at / 2 if at else 3 / np.sqrt(max(own[entry.place], 1e-300))
+    points: np.ndarray = start + np.concatenate(
+        [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
+    )
+    for _ in range(6):
+        wrong = ~np.isfinite(surface.found(points).total)
+        if not wrong.any():
+            break
+        points[wrong] = (points[wrong] + start) / 2
+    _check_dependence(surface, points, own)
+    return points
+
+
+def _check_dependence(surface: Surface, points: np.ndarray, own: np.ndarray) -> None:
+    """Every free number matters somewhere."""
+    if np.all(own > 0):
+        return
+    seen = np.nanmax(np.diagonal(surface.found(points).information, axis1=1, axis2=2), axis=0)
+    names = surface.objective.description.parameters.coordinates
+    lost = [name for name, size in zip(names, seen, strict=True) if not size > 0]
+    if lost:
+        raise fail(f"free number {lost[0]!r}", "one on which the measurements depend", "one on which nothing does")
+
+
+def _climbed(surface: Surface, points: np.ndarray, say: Progress) -> tuple[Maximum, bool]:
+    """To the top, or as far as somebody let it climb."""
+    form = surface.objective.form
+
+    def watch(now: Maximum) -> None:
+        best = np.nanmax(now.total)
+        say(f"{form}: step {now.steps}, {int(now.converged.sum())} of {len(now.x)} starts done, {best:.6g}")
+
+    try:
+        return surface.climb(points, np.ones(points.shape, dtype=bool), watch), False
+    except StoppedError as stopped:
+        return stopped.best, True
+
+
+def _settled(surface: Surface, found: Maximum, lane: int, ridges: int, say: Progress) -> Solution:
+    """The best of the ends, with numbers at a limit put there and the others climbed again."""
+    x, total, active = found.x[lane].copy(), float(found.total[lane]), np.ones(found.x.shape[1], dtype=bool)
+    converged, steps = bool(found.converged[lane]), found.steps
+    for place in _invisible(surface, x):
+        moved = x.copy()
+        moved[place] = np.inf if x[place] > 0 and _two_sided(surface, place) else -np.inf
+        at_limit = surface.found(moved[None])
+        if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
+            x, active[place] = moved, False
+    if not active.all():
+        say(f"{surface.objective.form}: again without {int((~active).sum())} at a limit")
+        again = surface.climb(x[None], active[None], lambda now: None)
+        x, total, converged = again.x[0], float(again.total[0]), bool(again.converged[0])
+    return Solution(surface, x, total, active, converged, steps, ridges)
+
+
+def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
+    """Coordinates of numbers with a limit that the data hardly see where they are."""
+    own = np.diag(surface.found(x[None]).information[0])
+    entries = surface.objective.description.parameters.entries
+    return [
+        entry.place
+        for entry in entries
+        if entry.place is not None
+        and np.isfinite([entry.domain.low, entry.domain.high]).any()
+        and own[entry.place] < INVISIBLE
+    ]
+
+
+def _two_sided(surface: Surface, place: int) -> bool:
+    entry = next(e for e in surface.objective.description.parameters.entries if e.place == place)
+    return bool(np.isfinite([entry.domain.low, entry.domain.high]).all())
+
+
+def _of_climb(found: Fit) -> list[str]:
+    sentences = []
+    if found.stopped:
+        sentences.append("Stopped before the end: this is the best so far.")
+    elif not found.converged:
+        sentences.append("The climb did not converge: the estimates are the best points found.")
+    below = found.ends[0] - found.ends[1:]
+    elsewhere = np.count_nonzero(~(below < ELSEWHERE))
+    if elsewhere and not found.stopped:
+        lost = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
+        sentences.append(f"{elsewhere} of {len(found.ends)} starts ended elsewhere, {lost:.3g} or more below the best.")
+    return sentences
+
+
+def _of_boundaries(best: Solution) -> list[str]:
+    return [
+        f"{row.name}: {row.estimate:.4g}, {'below' if row.high > row.estimate else 'above'} "
+        f"{row.high if row.high > row.estimate else row.low:.3g} (95 %)."
+        for row in best.rows()
+        if row.boundary
+    ]
+
+
+def _of_forms(solutions: tuple[Solution, ...]) -> list[str]:
+    if len(solutions) < 2:
+        return []
+    sentences = []
+    for a, b in zip(*(one.rows() for one in solutions), strict=True):
+        size = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
+        if np.isfinite(size) and size > APART:
+            sentences.append(
+                f"{a.name}: the two forms of the likelihood disagree by {size:.1f} standard errors "
+                f"({a.estimate:.4g} and {b.estimate:.4g}), so that the model is in doubt."
+            )
+    return sentences
+
+
+def _number(row: Row) -> str:
+    if not row.identified:
+        return f"{row.estimate:10.4g}  (not identified)"
+    if row.boundary:
+        return f"{row.estimate:10.4g}  (limit; {row.low:.4g} .. {row.high:.4g})"
+    return f"{row.estimate:10.4g}  ({row.low:.4g} .. {row.high:.4g})"

@@ -1,0 +1,189 @@
+"""What a recording of a network can tell of its free numbers, before there is one and after, in words."""
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.learning.intervals import quantile
+from heliograph.learning.objective import Data, Objective, objectives
+from heliograph.learning.parameters import Build, Parameters, describe
+from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
+from heliograph.learning.surface import Surface
+from heliograph.numerics.check import check_count, check_seed, fail
+from heliograph.numerics.compiler import large_program
+from heliograph.numerics.readable import readable
+from heliograph.numerics.small_matrix import factor
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+
+if TYPE_CHECKING:
+    from heliograph.learning.solution import Solution
+
+POINTS = 3
+AROUND = 0.5  # how far from the start, in each coordinate
+
+
+@readable
+@dataclass(frozen=True)
+class Identifiability:
+    """What the data tell: the names that they tell each by itself, groups that they do not tell apart, and sentences.
+
+    ridges: number of directions in which the likelihood does not change. weakest: least eigenvalue of the information,
+    in units of each number's own, above nothing: small where two numbers are hard to tell apart.
+    """
+
+    parameters: Parameters
+    groups: tuple[Confounded, ...]
+    ridges: int
+    weakest: float
+    sentences: tuple[str, ...]
+
+    @property
+    def identified(self) -> tuple[str, ...]:
+        """Coordinates that are told each by itself."""
+        lost = {place for group in self.groups for place in group.places}
+        return tuple(name for i, name in enumerate(self.parameters.coordinates) if i not in lost)
+
+    def at(self, solution: "Solution") -> "Identifiability":
+        """The same with estimates and intervals of what is told."""
+        return replace(self, sentences=sentences(self, solution))
+
+    def __str__(self) -> str:
+        """The sentences."""
+        return "\n".join(self.sentences) or "All free numbers are identified."
+
+
+def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int = 400, seed: int = 0) -> Identifiability:
+    """What a recording of this network could tell of its free numbers, before there is one.
+
+    Data are drawn as the filter expects them, at three points around the start, and the information that their second
+    half holds is examined: that of the first is helped by what is known of the initial state, and does not grow.
+
+    Shapes: inputs (horizon, inputs), which a plant with inputs needs.
+
+    Raises:
+        ValueError: as `fit`.
+    """
+    description = describe(network)
+    objective = objectives(description)[-1]
+    count = len(description.start.inputs)
+    if inputs is None and count:
+        raise fail("inputs", f"an array (steps, {count}) of {list(description.start.inputs)}", "none")
+    u = np.zeros((check_count("horizon", horizon), 0)) if inputs is None else np.asarray(inputs, dtype=float)
+    points = _points(description.parameters.start, seed)
+    ranks = []
+    for i, x in enumerate(points):
+        z = _drawn(objective, x, u, check_seed("seed", seed) + i)
+        data = Data(z[None], u[None], (len(z),))
+        ranks.append(rank_of(Surface(objective, data).found(x[None]).late[0]))
+    return _identified(description.parameters, points, ranks)
+
+
+def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
+    """What a recording tells, at three points around a start."""
+    points = _points(start, seed)
+    late = surface.found(np.stack(points)).late
+    sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
+    if not sound:
+        points, late, sound = [start], surface.found(start[None]).late, [0]
+    ranks = [rank_of(late[i]) for i in sound]
+    return _identified(surface.objective.description.parameters, [points[i] for i in sound], ranks)
+
+
+def _points(start: np.ndarray, seed: int) -> list[np.ndarray]:
+    rng = np.random.default_rng([seed, 1])
+    return [
+        start + rng.uniform(-AROUND, AROUND, len(start)) * np.minimum(1.0, 0.2 + np.abs(start)) for _ in range(POINTS)
+    ]
+
+
+def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Rank]) -> Identifiability:
+    groups = tuple(confounded(parameters, points, ranks))
+    ridges = min(rank.flat.shape[1] for rank in ranks)
+    weakest = max(rank.weakest for rank in ranks)
+    found = Identifiability(parameters, groups, ridges, weakest, ())
+    return replace(found, sentences=sentences(found, None))
+
+
+def sentences(found: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
+    """What is not told, and what is instead."""
+    names = found.parameters.coordinates
+    lines = [_of_group(found.parameters, group, solution) for group in found.groups]
+    if found.weakest < WEAK:
+        lines.append(
+            f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {found.weakest:.1g}): "
+            "expect wide intervals."
+        )
+    return tuple(lines)
+
+
+def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
+    names = [parameters.coordinates[i] for i in group.places]
+    fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
+    if group.fix == len(names):
+        return f"Nothing in the data tells {_listed(names)}."
+    if len(group.exponents):
+        told = [
+            product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents
+        ]
+        kind = "product" if all(np.all(row >= 0) for row in group.exponents) else "combination"
+        plural = "s" if len(told) > 1 else ""
+        verb = "are" if plural else "is"
+        return f"Only the {kind}{plural} {_listed(told)} of {_listed(names)} {verb} identified; {fix}."
+    if len(group.weights):
+        told = [sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights]
+        plural = "s" if len(told) > 1 else ""
+        return f"Only the sum{plural} {_listed(told)} {'are' if plural else 'is'} identified; {fix}."
+    left = len(names) - group.fix
+    combinations = "combination" if left == 1 else "combinations"
+    return f"The data tell only {left} {combinations} of {_listed(names)}; {fix}."
+
+
+def _interval(
+    parameters: Parameters, group: Confounded, row: np.ndarray, solution: "Solution | None", log: bool
+) -> str:
+    """(0.48, 95 % 0.44..0.53) of a product or a sum at a maximum."""
+    if solution is None or not all(solution.active[i] for i in group.places):
+        return ""
+    jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
+    slopes, value = np.zeros(len(solution.x)), 0.0
+    for entry, own, number in zip(parameters.entries, jacobian, values, strict=True):
+        if entry.place in group.places:
+            weight = row[group.places.index(entry.place)]
+            slopes += weight * (own / number if log else own)
+            value += weight * (np.log(abs(number)) if log else number)
+    covariance, freedom = solution.covariance()
+    along = slopes[solution.active]
+    reach = quantile(freedom) * float(np.sqrt(max(along @ covariance @ along, 0.0)))
+    middle, low, high = ((np.exp(v) if log else v) for v in (value, value - reach, value + reach))
+    return f" ({middle:.3g}, 95 % {low:.3g}..{high:.3g})"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Float[np.ndarray, "steps m"]:
+    """Data with the mean and covariance that the filter expects of them, Gaussian given those before."""
+    with jax.enable_x64(True):
+        return np.asarray(_expected(objective, x, u, jax.random.key(seed)))
+
+
+@large_program
+def _expected(objective: Objective, x: Array, u: Array, key: Any) -> jax.Array:
+    item = objective.filter(jnp.asarray(x))
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+        k, u_k, noise = row
+        prior = item.predict(state, u_k, k)
+        heard = item.correct(prior, jnp.zeros(item.received), k)[1]
+        columns, _ = factor(jnp.asarray(heard.covariance))
+        z = jnp.stack(columns, axis=1) @ noise - heard.value
+        return item.correct(prior, z, k)[0], z
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    noise = jax.random.normal(key, (len(u), item.received), dtype=float)
+    found: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    return found

@@ -1,0 +1,98 @@
+"""How well a maximum is known: covariances from scores that are correlated over time, and quantiles for them."""
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy import stats
+
+from heliograph.numerics.types import Float
+
+Method = Literal["cosines", "bartlett", "white", "hessian", "bootstrap", "profile"]
+METHODS = get_args(Method)
+LEVEL = 0.95
+DRAWS = 999  # of the bootstrap
+
+Scores = list[Float[np.ndarray, "steps p"]]
+
+
+class LongRun(NamedTuple):
+    """The covariance of the sum of scores, and the degrees of freedom with which it is known."""
+
+    covariance: Float[np.ndarray, "p p"]
+    freedom: float
+
+
+def cosines(scores: Scores) -> LongRun:
+    """(T/nu) sum_j G_j G_j', G_j = sqrt(2/T) sum_t s_t cos(pi j (t + 1/2)/T), j = 1..nu, nu = floor(0.4 T^(2/3)).
+
+    Source: Müller, HAC corrections for strongly autocorrelated time series (2014); Lazarus, Lewis, Stock and Watson,
+    HAR inference (2018).
+    """
+    parts, weights = [], []
+    for s in scores:
+        steps = len(s)
+        count = max(int(0.4 * steps ** (2 / 3)), 1)
+        angles = np.pi * np.outer(np.arange(1, count + 1), np.arange(steps) + 0.5) / steps
+        g = np.sqrt(2 / steps) * np.cos(angles) @ s
+        parts.append(steps / count * g.T @ g)
+        weights.append((steps, count))
+    total = sum(steps for steps, _ in weights)
+    return LongRun(np.sum(parts, axis=0), total**2 / sum(steps**2 / count for steps, count in weights))
+
+
+def bartlett(scores: Scores) -> LongRun:
+    """sum_|l| <= L (1 - |l|/(L + 1)) sum_t s_t s_(t-l)', L = ceil(4 (T/100)^(2/9)).
+
+    Source: Newey and West (1987).
+    """
+    found = []
+    for s in scores:
+        lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
+        products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
+        found.append(products[0] + sum(each + each.T for each in products[1:]))
+    return LongRun(np.sum(found, axis=0), np.inf)
+
+
+def white(scores: Scores) -> LongRun:
+    """sum_t s_t s_t'."""
+    return LongRun(np.sum([s.T @ s for s in scores], axis=0), np.inf)
+
+
+def block_sums(scores: Scores, draws: int, seed: int) -> Float[np.ndarray, "draws p"]:
+    """Sums of scores over blocks drawn anew, of T^(1/3) times two steps each, about their mean.
+
+    Source: Künsch (1989) for blocks; Hu and Kalbfleisch (2000) for drawing scores in place of data.
+    """
+    rng = np.random.default_rng(seed)
+    result = np.zeros((draws, scores[0].shape[1]))
+    for s in scores:
+        length = min(max(int(np.ceil(2 * len(s) ** (1 / 3))), 1), len(s))
+        running = np.concatenate([np.zeros((1, s.shape[1])), np.cumsum(s, axis=0)])
+        sums = running[length:] - running[:-length]  # of each block
+        count = len(s) / length
+        drawn = sums[rng.integers(0, len(sums), (draws, max(int(count), 1)))].sum(axis=1)
+        result += (drawn - max(int(count), 1) * sums.mean(axis=0)) * np.sqrt(count / max(int(count), 1))
+    return result
+
+
+def long_run(method: Method, scores: Scores, hessian: Float[np.ndarray, "p p"]) -> LongRun:
+    """By one of the methods that have a covariance."""
+    match method:
+        case "cosines":
+            return cosines(scores)
+        case "bartlett":
+            return bartlett(scores)
+        case "white":
+            return white(scores)
+    return LongRun(hessian, np.inf)
+
+
+def quantile(freedom: float) -> float:
+    """How many standard errors an interval reaches to each side."""
+    return float(stats.t.ppf((1 + LEVEL) / 2, freedom))
+
+
+def sandwich(hessian: Float[np.ndarray, "p p"], scores: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """H^-1 J H^-1."""
+    half = np.linalg.solve(hessian, scores)
+    return np.asarray(np.linalg.solve(hessian, half.T))

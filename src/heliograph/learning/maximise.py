@@ -1,0 +1,115 @@
+"""Levenberg-Marquardt on the Gauss-Newton information, from several starts side by side."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.types import Bool, Float
+
+MOST_STEPS = 100
+LONGEST = 1.5  # of a step, in each coordinate
+FLAT = 1e-10  # eigenvalue of the scaled information below which nothing is to be gained in a direction
+CLOSE = 1e-12  # twice the likelihood that a full step would gain: 1e-6 standard deviations away
+NOISE = 1e-13  # of a log-likelihood's own size: its rounding
+HARDEST = 1e8  # damping at which a start is given up
+
+Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Float[np.ndarray, "lanes p p"]]
+Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
+
+
+class Maximum(NamedTuple):
+    """Where each lane came to: the point, its likelihood, whether it converged, and the steps taken.
+
+    Shapes: x (lanes, p), total (lanes,), converged (lanes,).
+    """
+
+    x: Float[np.ndarray, "lanes p"]
+    total: Float[np.ndarray, " lanes"]
+    converged: Bool[np.ndarray, " lanes"]
+    steps: int
+
+
+class _State(NamedTuple):
+    x: np.ndarray
+    total: np.ndarray
+    gradient: np.ndarray
+    information: np.ndarray
+    damping: np.ndarray
+    done: np.ndarray
+    converged: np.ndarray
+
+
+def maximise(
+    evaluate: Evaluate,
+    start: Float[np.ndarray, "lanes p"],
+    active: Bool[np.ndarray, "lanes p"] | None = None,
+    watch: Callable[[Maximum], None] | None = None,
+) -> Maximum:
+    """Climb from each start by (I + damping diag I)^-1 s; `active` coordinates move, the others stay.
+
+    A lane has converged when a full step would gain less than rounding sees. `watch` sees the best so far.
+    """
+    moving = np.ones(start.shape, dtype=bool) if active is None else active
+    with np.errstate(all="ignore"):
+        state = _begin(evaluate, start, moving)
+        for count in range(MOST_STEPS):
+            best = Maximum(state.x, state.total, state.converged, count)
+            if watch is not None:
+                watch(best)
+            if state.done.all():
+                return best
+            state = _step(evaluate, state, moving)
+    return Maximum(state.x, state.total, state.converged, MOST_STEPS)
+
+
+def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray) -> _State:
+    total, gradient, information = evaluate(start)
+    none = ~np.isfinite(total)
+    damping = np.full(len(start), 1e-2)
+    state = _State(start.copy(), total, gradient, information, damping, none, np.zeros(len(start), dtype=bool))
+    return _judged(state, moving)
+
+
+def _judged(state: _State, moving: np.ndarray) -> _State:
+    """Which lanes have arrived: the gain that an undamped step promises is nothing."""
+    whole = steps_of(state.gradient, state.information, np.zeros(len(state.x)), moving)
+    promised = np.sum(np.clip(whole, -LONGEST, LONGEST) * np.nan_to_num(state.gradient), axis=1)
+    arrived = ~state.done & (promised < CLOSE + NOISE * np.abs(state.total))
+    return state._replace(done=state.done | arrived, converged=state.converged | arrived)
+
+
+def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
+    step = np.clip(steps_of(state.gradient, state.information, state.damping, moving), -LONGEST, LONGEST)
+    going = ~state.done
+    tried = np.where(going[:, None], state.x + step, state.x)
+    total, gradient, information = evaluate(tried)
+    sound = np.isfinite(total) & np.isfinite(gradient).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
+    better = going & sound & (total >= state.total - NOISE * np.abs(state.total))
+    damping = np.where(
+        better, np.where(state.damping < 1e-7, 0.0, state.damping / 10), np.maximum(state.damping * 8, 1e-3)
+    )
+    pick = better[:, None]
+    after = _State(
+        np.where(pick, tried, state.x),
+        np.where(better, total, state.total),
+        np.where(pick, gradient, state.gradient),
+        np.where(pick[:, None], information, state.information),
+        damping,
+        state.done | (going & (damping > HARDEST)),
+        state.converged,
+    )
+    return _judged(after, moving)
+
+
+def steps_of(
+    gradient: np.ndarray, information: np.ndarray, damping: np.ndarray, moving: np.ndarray
+) -> Float[np.ndarray, "lanes p"]:
+    """(I + damping diag I)^-1 s among the coordinates that move; none in directions that are flat."""
+    there = moving & (np.diagonal(information, axis1=1, axis2=2) > 0)
+    unit = np.where(there, 1 / np.sqrt(np.where(there, np.diagonal(information, axis1=1, axis2=2), 1.0)), 0.0)
+    scaled = np.nan_to_num(information * unit[:, :, None] * unit[:, None, :])
+    values, vectors = np.linalg.eigh((scaled + scaled.swapaxes(1, 2)) / 2)
+    inverse = np.where(values > FLAT, 1 / (np.where(values > FLAT, values, 1.0) + damping[:, None]), 0.0)
+    along = np.einsum("lij,li->lj", vectors, np.nan_to_num(gradient) * unit)
+    return np.asarray(np.einsum("lij,lj->li", vectors, along * inverse) * unit)

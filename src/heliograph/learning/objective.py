@@ -1,0 +1,213 @@
+"""What a fit maximises: a filter's likelihood as a function of the free numbers, with scores and information."""
+
+import hashlib
+from collections.abc import Hashable
+from dataclasses import dataclass
+from functools import partial
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian import cubature_filter
+from heliograph.filters.innovation import log_density
+from heliograph.filters.linear import linear_filter
+from heliograph.learning.joint import joint_world
+from heliograph.learning.parameters import Description
+from heliograph.model.fading import without_memory
+from heliograph.model.over_time import first
+from heliograph.model.sensor import is_linear
+from heliograph.numerics.check import fail
+from heliograph.numerics.compiler import large_program
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.small_matrix import solve
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.random_affine.second_moments import has_random_gain, second_order
+from heliograph.simulation.network import Network
+
+Form = Literal["linear", "conditional"]
+
+
+class Data(NamedTuple):
+    """Recordings of one network, joined over its nodes and filled up with rows in which nothing arrived.
+
+    Shapes: measurements (recordings, steps, received), inputs (recordings, steps, inputs), lengths (recordings,).
+    """
+
+    measurements: Float[np.ndarray, "recordings steps received"]
+    inputs: Float[np.ndarray, "recordings steps inputs"]
+    lengths: tuple[int, ...]
+
+
+class Found(NamedTuple):
+    """At points of the line: log-likelihoods and scores of each step, and the Gauss-Newton information of both halves.
+
+    Shapes: density (points, recordings, steps), score (points, recordings, steps, p), halves (points, 2, p, p).
+    """
+
+    density: Float[Array, "points recordings steps"]
+    score: Float[Array, "points recordings steps p"]
+    halves: Float[Array, "points 2 p p"]
+
+    @property
+    def information(self) -> Float[np.ndarray, "points p p"]:
+        """The Gauss-Newton information of all data."""
+        return np.asarray(self.halves.sum(axis=1))
+
+    @property
+    def late(self) -> Float[np.ndarray, "points p p"]:
+        """The information of the second half, to which the initial state adds nothing."""
+        return np.asarray(self.halves[:, 1])
+
+    @property
+    def total(self) -> Float[np.ndarray, " points"]:
+        """Log-likelihoods of all data."""
+        return np.asarray(self.density.sum(axis=(1, 2)))
+
+    @property
+    def gradient(self) -> Float[np.ndarray, "points p"]:
+        """Scores of all data."""
+        return np.asarray(self.score.sum(axis=(1, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Objective:
+    """The filter of one form, from numbers on the line. Equal ones share a compiled program: see `_identity`."""
+
+    description: Description
+    form: Form
+    identity: Hashable
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Objective) and self.identity == other.identity
+
+    def __hash__(self) -> int:
+        return hash(self.identity)
+
+    def filter(self, x: Array) -> AbstractFilter:
+        """The filter at a point of the line."""
+        return filter_of(self.description.at(self.description.parameters.values(x)), self.form)
+
+    def innovations(self, x: Array, z: Array, u: Array) -> tuple[jax.Array, jax.Array]:
+        """z less what is expected (steps, m), NaN where nothing arrived, and its covariance (steps, m, m)."""
+        item = self.filter(x)
+
+        def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
+            k, z_k, u_k = row
+            after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
+            return after, (jnp.asarray(heard.value), jnp.asarray(heard.covariance))
+
+        start = jax.tree.map(jnp.asarray, item.init())
+        found: tuple[jax.Array, jax.Array] = jax.lax.scan(
+            body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u))
+        )[1]
+        return found
+
+
+def objectives(network: Description) -> list[Objective]:
+    """Those that the network allows, the linear one first.
+
+    Linear: the spread of a random gain by the state's own moments, for linear plants; its score has mean zero whatever
+    the laws. Conditional: by what is known of the state, for channels that neither remember nor are late. Without a
+    random gain both are the same, the first.
+
+    Raises:
+        ValueError: a network whose likelihood no filter here knows.
+    """
+    built = network.start
+    identity = _identity(network, built)
+    return [Objective(network, form, (form, identity)) for form in forms_of(built)]
+
+
+def forms_of(network: Network) -> list[Form]:
+    """The forms that a network allows."""
+    plant, sensor, channel = joint_world(network)
+    one = first(channel)
+    plain = not one.remembers and not one.past
+    if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
+        if one.past:
+            raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
+        return ["conditional"]
+    if not plain or not has_random_gain(one, second_order(one)):
+        return ["linear"]
+    return ["linear", "conditional"]
+
+
+def filter_of(network: Network, form: Form) -> AbstractFilter:
+    """The filter that hears all that the network's nodes hear, whose likelihood is of this form."""
+    plant, sensor, channel = joint_world(network)
+    if form == "linear":
+        return linear_filter(plant, sensor, channel)
+    return cubature_filter(plant, sensor, without_memory(channel))
+
+
+def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Found:
+    """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program."""
+    parts = []
+    with jax.enable_x64(True):
+        for begin in range(0, len(x), lanes):
+            some = x[begin : begin + lanes]
+            full = np.concatenate([some, np.repeat(some[-1:], lanes - len(some), axis=0)])
+            found = to_numpy(_many(objective, full, data.measurements, data.inputs))
+            parts.append(jax.tree.map(lambda leaf: leaf[: len(some)], found))  # noqa: B023
+    return Found(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+
+
+@large_program
+def _many(objective: Objective, x: Array, z: Array, u: Array) -> Found:
+    one: Found = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
+    return one
+
+
+def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Found:
+    """At one point: (recordings, steps), (recordings, steps, p), (2, p, p)."""
+    found = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
+    return Found(found.density, found.score, jnp.sum(found.halves, axis=0))
+
+
+def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Found:
+    """Of one recording: density (steps,), score (steps, p) and information (2, p, p).
+
+    s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
+    components that arrived; derivatives run forward through the scan.
+    """
+    own = partial(objective.innovations, z=z, u=u)
+    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(own, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
+    return Found(*_scored(e, s, de, ds, jnp.asarray(z)))
+
+
+def _scored(
+    e: jax.Array, s: jax.Array, de: jax.Array, ds: jax.Array, z: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    p, steps, m = de.shape
+    e, z, s = e.T, z.T[:m], jnp.moveaxis(s, 0, -1)  # time last, as the kernels of small matrices want it
+    de, ds = jnp.moveaxis(de, (0, 1), (1, 2)), jnp.moveaxis(ds, (0, 1), (2, 3))
+    present = ~jnp.isnan(e)
+    both = present[:, None] & present
+    density = log_density(e, s, jnp.abs(z) + jnp.abs(z - e))
+    e, s = jnp.where(present, e, 0.0), jnp.where(both, s, 0.0)
+    de, ds = jnp.where(present[:, None], de, 0.0), jnp.where(both[:, :, None], ds, 0.0)
+    right = jnp.concatenate([e[:, None], de, jnp.reshape(jnp.swapaxes(ds, 1, 2), (m, p * m, steps))], axis=1)
+    solved = solve(s, right)
+    w, v, q = solved[:, 0], solved[:, 1 : 1 + p], solved[:, 1 + p :].reshape(m, p, m, steps)  # S^-1 (e, de, dS)
+    score = jnp.einsum("iak,ik->ka", -de, w) - jnp.einsum("iaik->ka", q) / 2
+    score = score + jnp.einsum("ik,ijak,jk->ka", w, ds, w) / 2
+    late = jnp.stack([jnp.arange(steps) < steps // 2, jnp.arange(steps) >= steps // 2]).astype(e.dtype)
+    halves = jnp.einsum("hk,iak,ibk->hab", late, de, v) + jnp.einsum("hk,iajk,jbik->hab", late, q, q) / 2
+    return density, score, halves
+
+
+def _identity(network: Description, built: Network) -> Hashable:
+    """What decides how a program is compiled: the function, what is free, and every number of the network at the start.
+
+    A function of the user's own that reads a number which lives outside of it is not looked into, as with `jax.jit`.
+    """
+    leaves = jax.tree.leaves(built)
+    digest = hashlib.sha256(repr(jax.tree.structure(built)).encode())
+    for leaf in leaves:
+        digest.update(np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else b"-")
+    for one in network.parameters.every:
+        digest.update(repr((one.name, one.domain, one.start.tolist())).encode())
+    return network.build, digest.hexdigest()

@@ -1,0 +1,167 @@
+"""Directions in which the data say nothing: found by the information's rank, put in words, never inverted."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.learning.parameters import Parameters
+from heliograph.numerics.types import Float
+
+NOTHING, WEAK = 1e-8, 1e-4  # eigenvalues of the information in units of each coordinate's own
+SAME = 1e-5  # of a direction at several points
+WHOLE = 1e-4  # how far an exponent may be from a whole number
+LARGEST = 4  # exponent that is put in words
+
+
+class Confounded(NamedTuple):
+    """Free numbers of which the data tell fewer combinations than there are: their places, and what is told.
+
+    exponents: rows e of products prod_i v_i^e_i that are told; weights: rows w of sums sum_i w_i v_i; both empty where
+    what is told is neither. `fix`: how many have to be known from elsewhere.
+
+    Shapes: exponents, weights (combinations, places).
+    """
+
+    places: tuple[int, ...]
+    exponents: Float[np.ndarray, "combinations places"]
+    weights: Float[np.ndarray, "combinations places"]
+    fix: int
+
+
+class Rank(NamedTuple):
+    """At one point: directions of which nothing is known (orthonormal in units of each coordinate), and the units.
+
+    weakest: least eigenvalue above nothing. Shapes: flat (p, k), rest (p, p - k), unit (p,).
+    """
+
+    flat: Float[np.ndarray, "p k"]
+    rest: Float[np.ndarray, "p r"]
+    unit: Float[np.ndarray, " p"]
+    weakest: float
+    weakest_direction: Float[np.ndarray, " p"]
+
+
+def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
+    """Of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
+    own = np.diag(information)
+    there = own > 0
+    unit = np.where(there, 1 / np.sqrt(np.where(there, own, 1.0)), 1.0)
+    values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
+    none = values < NOTHING
+    least = int(np.argmax(~none)) if (~none).any() else 0
+    weakest = float(values[least]) if (~none).any() else np.inf
+    return Rank(vectors[:, none], vectors[:, ~none], unit, weakest, vectors[:, least])
+
+
+def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ranks: list[Rank]) -> list[Confounded]:
+    """Groups of coordinates that the data do not tell apart at any of the points, with what they tell."""
+    count = min(rank.flat.shape[1] for rank in ranks)
+    if not count:
+        return []
+    used = [(x, rank) for x, rank in zip(points, ranks, strict=True) if rank.flat.shape[1] == count]
+    scales = [_scales(parameters, x) for x, _ in used]
+    logs = [
+        _basis(log[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (_, log) in zip(used, scales, strict=True)
+    ]
+    plain = [
+        _basis(own[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (own, _) in zip(used, scales, strict=True)
+    ]
+    return [_told(group, logs, plain) for group in _groups(logs)]
+
+
+def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
+    """dv/dx and d log|v|/dx of each coordinate that is a number of its own; 1 of the others."""
+    own, log = np.ones(len(x)), np.ones(len(x))
+    for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
+        if entry.place is not None:
+            own[entry.place] = row[entry.place]
+            log[entry.place] = row[entry.place] / value if value else np.nan
+    return own, np.nan_to_num(log)
+
+
+def _basis(vectors: np.ndarray) -> np.ndarray:
+    """Orthonormal columns."""
+    left, size, _ = np.linalg.svd(vectors, full_matrices=False)
+    return np.asarray(left[:, size > 1e-12 * max(size.max(initial=0.0), 1e-300)])
+
+
+def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
+    """Coordinates connected by flat directions at any point."""
+    joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
+    left, found = [i for i in range(len(joined)) if joined[i, i]], []
+    while left:
+        group, edge = {left[0]}, {left[0]}
+        while edge:
+            edge = {int(j) for i in edge for j in np.flatnonzero(joined[i])} - group
+            group |= edge
+        found.append(tuple(sorted(int(i) for i in group)))
+        left = [i for i in left if i not in group]
+    return found
+
+
+def _told(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+    places = list(group)
+    size = max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs)
+    none = np.zeros((0, len(group)))
+    if size == len(group):
+        return Confounded(group, none, none, int(size))
+    powers = _constant_complement([b[places] for b in logs])
+    if powers is not None:
+        whole = powers / np.min(np.abs(np.where(np.abs(powers) > SAME, powers, np.inf)), axis=1, keepdims=True)
+        rounded = np.round(whole)
+        if np.all(np.abs(whole - rounded) < WHOLE) and np.max(np.abs(rounded)) <= LARGEST:
+            return Confounded(group, rounded, none, int(size))
+    sums = _constant_complement([b[places] for b in plain])
+    return Confounded(group, none, none if sums is None else sums, int(size))
+
+
+def _constant_complement(bases: list[np.ndarray]) -> np.ndarray | None:
+    """Rows orthogonal to the flat directions, reduced, if they are the same at all points."""
+    spaces = [_basis(b) for b in bases]
+    if any(b.shape != spaces[0].shape or np.max(np.abs(b @ b.T - spaces[0] @ spaces[0].T)) > SAME for b in spaces):
+        return None
+    values, vectors = np.linalg.eigh(spaces[0] @ spaces[0].T)
+    return _reduced(vectors[:, values < 0.5].T)
+
+
+def _reduced(rows: np.ndarray) -> np.ndarray:
+    """Row echelon form, leading entries 1."""
+    result, lead = rows.copy(), 0
+    for row in range(len(result)):
+        while lead < result.shape[1]:
+            pivot = row + int(np.argmax(np.abs(result[row:, lead])))
+            if abs(result[pivot, lead]) > SAME:
+                break
+            lead += 1
+        if lead == result.shape[1]:
+            break
+        result[[row, pivot]] = result[[pivot, row]]
+        result[row] /= result[row, lead]
+        for other in range(len(result)):
+            if other != row:
+                result[other] -= result[other, lead] * result[row]
+        lead += 1
+    result[np.abs(result) < SAME] = 0.0
+    return result
+
+
+def product_text(names: list[str], exponents: Float[np.ndarray, " places"]) -> str:
+    """a * b^2 / c."""
+    above = [_power(n, e) for n, e in zip(names, exponents, strict=True) if e > 0]
+    below = [_power(n, -e) for n, e in zip(names, exponents, strict=True) if e < 0]
+    top = " * ".join(above) or "1"
+    return " / ".join([top, *below])
+
+
+def sum_text(names: list[str], weights: Float[np.ndarray, " places"]) -> str:
+    """a + 0.64 b."""
+    text = ""
+    for name, weight in zip(names, weights, strict=True):
+        if weight:
+            sign = (" - " if weight < 0 else " + ") if text else ("-" if weight < 0 else "")
+            text += sign + (name if abs(abs(weight) - 1) < SAME else f"{abs(weight):.4g} {name}")
+    return text
+
+
+def _power(name: str, exponent: float) -> str:
+    return name if exponent == 1 else f"{name}^{exponent:g}"

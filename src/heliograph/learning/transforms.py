@@ -1,0 +1,104 @@
+"""From a number on its domain to numbers on the whole line and back: where steps are taken and intervals are made."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.domain import Domain
+from heliograph.numerics.types import Array, Float
+
+
+def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
+    """The start of a free number as unbounded ones.
+
+    Intervals: v, log(v - low) or logit. Simplexes: log p_i / p_last. Covariances: the entries of Cholesky's factor row
+    by row, those on the diagonal by their logarithms.
+
+    Raises:
+        ValueError: a start that is not inside the domain.
+    """
+    if domain.kind == "simplex":
+        if not np.all(value > 0) or np.any(np.abs(value.sum(axis=-1) - 1) > 1e-9):
+            raise fail(f"start of {name}", "positive probabilities that sum to 1", value.tolist())
+        logs: np.ndarray = np.log(value[..., :-1] / value[..., -1:])
+        return logs.reshape(-1)
+    if domain.kind == "covariance":
+        factor = _factor(name, value)
+        return np.asarray(np.where(np.eye(len(value)), np.log(np.abs(factor) + (factor == 0)), factor)[_lower(value)])
+    if np.any(value <= domain.low) or np.any(value >= domain.high):
+        raise fail(f"start of {name}", f"a start {_between(domain)}", value.tolist())
+    return np.asarray(link(domain, value)).reshape(-1)
+
+
+def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
+    """The number at a point of the line, in operations that JAX traces."""
+    if domain.kind == "simplex":
+        rows = jnp.reshape(x, (*shape[:-1], shape[-1] - 1))
+        weights = jnp.concatenate([rows, jnp.zeros((*shape[:-1], 1))], axis=-1)
+        weights = jnp.exp(weights - jnp.max(weights, axis=-1, keepdims=True))
+        return weights / jnp.sum(weights, axis=-1, keepdims=True)
+    if domain.kind == "covariance":
+        factor = jnp.zeros(shape).at[np.tril_indices(shape[0])].set(x)
+        factor = jnp.where(np.eye(shape[0], dtype=bool), jnp.exp(jnp.diag(jnp.diag(factor))), factor)
+        return factor @ factor.T
+    value = jnp.reshape(x, shape)
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return domain.low + (domain.high - domain.low) * jax.nn.sigmoid(value)
+    if np.isfinite(domain.low):
+        return domain.low + jnp.exp(value)
+    return domain.high - jnp.exp(value) if np.isfinite(domain.high) else value
+
+
+def link(domain: Domain, value: Any) -> Any:
+    """The scale on which an interval of one number is symmetric."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return np.log((value - domain.low) / (domain.high - value))
+    if np.isfinite(domain.low):
+        return np.log(value - domain.low)
+    return np.log(domain.high - value) if np.isfinite(domain.high) else value
+
+
+def unlink(domain: Domain, value: Any) -> Any:
+    """Back from there; infinite values give the limits."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
+    if np.isfinite(domain.low):
+        return domain.low + np.exp(value)
+    return domain.high - np.exp(value) if np.isfinite(domain.high) else value
+
+
+def slope(domain: Domain, value: Any) -> Any:
+    """d link / d value."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))
+    if np.isfinite(domain.low):
+        return 1 / (value - domain.low)
+    return -1 / (domain.high - value) if np.isfinite(domain.high) else np.ones_like(value)
+
+
+def size(domain: Domain, shape: tuple[int, ...]) -> int:
+    """How many numbers on the line."""
+    count = int(np.prod(shape))
+    if domain.kind == "simplex":
+        return count - count // shape[-1]
+    return shape[0] * (shape[0] + 1) // 2 if domain.kind == "covariance" else count
+
+
+def _lower(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.tril_indices(len(value))
+
+
+def _factor(name: str, value: np.ndarray) -> np.ndarray:
+    try:
+        return np.linalg.cholesky(value)
+    except np.linalg.LinAlgError:
+        raise fail(f"start of {name}", "a positive definite matrix", value.tolist()) from None
+
+
+def _between(domain: Domain) -> str:
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return f"between {domain.low:g} and {domain.high:g}"
+    return f"above {domain.low:g}" if np.isfinite(domain.low) else f"below {domain.high:g}"

@@ -1,0 +1,52 @@
+"""Where a number may lie, and a start value that learns it from whatever checks it."""
+
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+
+class Domain(NamedTuple):
+    """Numbers between two limits, positive ones that sum to one along the last axis, or a covariance matrix."""
+
+    kind: Literal["interval", "simplex", "covariance"] = "interval"
+    low: float = -np.inf
+    high: float = np.inf
+
+
+REAL, POSITIVE, PROBABILITY = Domain(), Domain(low=0.0), Domain(low=0.0, high=1.0)
+SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
+
+
+class Marked(np.ndarray):
+    """An array that is told what it is for, once a check sees it; what is computed from it is told nothing."""
+
+    told: Callable[[str, Domain], None] | None = None
+
+
+def marked(value: Any, told: Callable[[str, Domain], None]) -> Marked:
+    """A copy of an array that calls `told(name, domain)` when it is checked."""
+    result = np.array(value, dtype=np.float64).view(Marked)
+    result.told = told
+    return result
+
+
+def tell(name: str, value: Any, whole: Domain, entry: Domain | None = None) -> None:
+    """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
+    if isinstance(value, Marked):
+        if value.told is not None:
+            value.told(name, whole)
+    elif isinstance(value, list | tuple):
+        for item in value:
+            if isinstance(item, Marked | list | tuple):
+                tell(name, item, whole if entry is None else entry, entry)
+
+
+def tell_covariance(name: str, value: Any) -> None:
+    """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
+    if isinstance(value, Marked):
+        tell(name, value, COVARIANCE if value.ndim else POSITIVE)
+    elif isinstance(value, list | tuple):
+        for i, row in enumerate(value):
+            for j, item in enumerate(row if isinstance(row, list | tuple) else []):
+                tell(name, item, POSITIVE if i == j else REAL)
