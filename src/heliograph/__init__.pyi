@@ -91,8 +91,6 @@ from .simulation.record import (
 from .simulation.sums import (
     Statistics as Statistics,
 )
-from .learning.tell_apart import (
-    samples_to_tell as samples_to_tell,
 from .learning.parameters import (
     free as free,
 )
@@ -101,6 +99,9 @@ from .learning.fitting import (
 )
 from .learning.identification import (
     identifiable as identifiable,
+)
+from .learning.tell_apart import (
+    samples_to_tell as samples_to_tell,
 )
 from .live.stream import (
     Stream as Stream,

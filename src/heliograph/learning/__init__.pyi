@@ -36,6 +36,7 @@ from .stretches import (
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,
     fates_of_sequence as fates_of_sequence,
+)
 from .fitting import (
     Fit as Fit,
 )
