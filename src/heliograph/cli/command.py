@@ -9,6 +9,7 @@ from cyclopts import CycloptsError
 from heliograph.cli.app import app
 from heliograph.cli.completion import completion
 from heliograph.cli.example import demo, example
+from heliograph.cli.fit import fit
 from heliograph.cli.new import new
 from heliograph.cli.reproduce import reproduce
 from heliograph.cli.run import run
@@ -19,7 +20,7 @@ from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
-for one in (new, run, demo, example, reproduce, sweep, completion):  # in the order of the help
+for one in (new, run, fit, demo, example, reproduce, sweep, completion):  # in the order of the help
     app.command(one)
 
 

@@ -9,6 +9,7 @@ from heliograph.learning.foretelling import Predictive
 from heliograph.learning.long_run import mean_and_error
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Float
 
 
 @readable
@@ -46,6 +47,11 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
     heard = ~np.all(np.isnan(a.pit), axis=1)
     if heard.sum() < 10:
         raise fail("recording", "at least 10 steps with a measurement", int(heard.sum()))
-    mean, error = mean_and_error((a.log_likelihood - b.log_likelihood)[heard])
+    return compared((a.log_likelihood - b.log_likelihood)[heard])
+
+
+def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
+    """The test of a mean difference."""
+    mean, error = mean_and_error(differences)
     z = mean / error if error > 0 else 0.0
     return Comparison(mean, error, float(z), float(2 * norm.sf(abs(z))))

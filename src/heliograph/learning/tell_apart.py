@@ -10,7 +10,7 @@ from scipy.stats import norm
 from heliograph.filters.gaussian import GaussianFilter, cubature_filter
 from heliograph.filters.linear import open_loop_filter
 from heliograph.learning.foretelling import NODES, Parts, expected_signals, of_signals
-from heliograph.learning.long_run import long_run_variance
+from heliograph.learning.long_run import long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
@@ -74,7 +74,7 @@ def samples_to_tell(
     found = []
     for own, other in (channels, channels[::-1]):
         ratio = _ratios(network, name, node, own, other, inputs, count, seed, nodes)
-        deviation = np.sqrt(np.mean([long_run_variance(r[:, None])[0, 0] for r in ratio]))
+        deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
         found.append((float(ratio.mean()), float(deviation)))
     (gain_a, deviation_a), (gain_b, deviation_b) = found
     gain = gain_a + gain_b
