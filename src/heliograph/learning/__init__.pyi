@@ -43,6 +43,10 @@ from .fitting import (
 from .identification import (
     Identifiability as Identifiability,
 )
+from .many import (
+    FitEach as FitEach,
+    fit_each as fit_each,
+)
 from .parameters import (
     Description as Description,
     Parameters as Parameters,

@@ -11,6 +11,7 @@ from heliograph.learning.intervals import quantile
 from heliograph.learning.objective import Data, Objective, objectives
 from heliograph.learning.parameters import Build, Parameters, describe
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
+from heliograph.learning.routes import route_sentences
 from heliograph.learning.surface import Surface
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.compiler import large_program
@@ -111,6 +112,8 @@ def sentences(found: Identifiability, solution: "Solution | None") -> tuple[str,
     """What is not told, and what is instead."""
     names = found.parameters.coordinates
     lines = [_of_group(found.parameters, group, solution) for group in found.groups]
+    if solution is not None and any(group.fix + len(group.exponents) < len(group.places) for group in found.groups):
+        lines += route_sentences(solution)
     if found.weakest < WEAK:
         lines.append(
             f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {found.weakest:.1g}): "
@@ -122,23 +125,24 @@ def sentences(found: Identifiability, solution: "Solution | None") -> tuple[str,
 def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | None") -> str:
     names = [parameters.coordinates[i] for i in group.places]
     fix = "fix one" if group.fix == 1 else f"fix {group.fix} of them"
+    left = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
         return f"Nothing in the data tells {_listed(names)}."
-    if len(group.exponents):
-        told = [
-            product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents
-        ]
-        kind = "product" if all(np.all(row >= 0) for row in group.exponents) else "combination"
-        plural = "s" if len(told) > 1 else ""
-        verb = "are" if plural else "is"
-        return f"Only the {kind}{plural} {_listed(told)} of {_listed(names)} {verb} identified; {fix}."
-    if len(group.weights):
-        told = [sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights]
-        plural = "s" if len(told) > 1 else ""
-        return f"Only the sum{plural} {_listed(told)} {'are' if plural else 'is'} identified; {fix}."
-    left = len(names) - group.fix
-    combinations = "combination" if left == 1 else "combinations"
-    return f"The data tell only {left} {combinations} of {_listed(names)}; {fix}."
+    told = [
+        *(product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents),
+        *(sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights),
+    ]
+    if not told:
+        return f"The data tell only {_counted(left, 'combination')} of {_listed(names)}; {fix}."
+    kind = "sum" if len(group.weights) else "product" if np.all(group.exponents >= 0) else "combination"
+    beside = f" and {_counted(left, 'other combination')}" if left else ""
+    verb = "is" if len(told) == 1 and not left else "are"
+    several = kind + ("s" if len(told) > 1 else "")
+    return f"Of {_listed(names)} only the {several} {_listed(told)}{beside} {verb} identified; {fix}."
+
+
+def _counted(count: int, what: str) -> str:
+    return f"one {what}" if count == 1 else f"{count} {what}s"
 
 
 def _interval(

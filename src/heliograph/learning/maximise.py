@@ -10,9 +10,10 @@ from heliograph.numerics.types import Bool, Float
 MOST_STEPS = 100
 LONGEST = 1.5  # of a step, in each coordinate
 FLAT = 1e-10  # eigenvalue of the scaled information below which nothing is to be gained in a direction
-CLOSE = 1e-12  # twice the likelihood that a full step would gain: 1e-6 standard deviations away
+CLOSE = 1e-15  # twice the likelihood that a full step would gain: 3e-8 standard errors away
+NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 NOISE = 1e-13  # of a log-likelihood's own size: its rounding
-HARDEST = 1e8  # damping at which a start is given up
+SOFTEST, HARDEST = 1e-7, 1e8  # damping that is none, and at which a start is given up
 
 Evaluated = tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes p"], Float[np.ndarray, "lanes p p"]]
 Evaluate = Callable[[Float[np.ndarray, "lanes p"]], Evaluated]
@@ -36,6 +37,7 @@ class _State(NamedTuple):
     gradient: np.ndarray
     information: np.ndarray
     damping: np.ndarray
+    growth: np.ndarray
     done: np.ndarray
     converged: np.ndarray
 
@@ -66,8 +68,8 @@ def maximise(
 def _begin(evaluate: Evaluate, start: np.ndarray, moving: np.ndarray) -> _State:
     total, gradient, information = evaluate(start)
     none = ~np.isfinite(total)
-    damping = np.full(len(start), 1e-2)
-    state = _State(start.copy(), total, gradient, information, damping, none, np.zeros(len(start), dtype=bool))
+    damping, growth = np.full(len(start), 1e-2), np.full(len(start), 2.0)
+    state = _State(start.copy(), total, gradient, information, damping, growth, none, np.zeros(len(start), dtype=bool))
     return _judged(state, moving)
 
 
@@ -75,28 +77,32 @@ def _judged(state: _State, moving: np.ndarray) -> _State:
     """Which lanes have arrived: the gain that an undamped step promises is nothing."""
     whole = steps_of(state.gradient, state.information, np.zeros(len(state.x)), moving)
     promised = np.sum(np.clip(whole, -LONGEST, LONGEST) * np.nan_to_num(state.gradient), axis=1)
-    arrived = ~state.done & (promised < CLOSE + NOISE * np.abs(state.total))
-    return state._replace(done=state.done | arrived, converged=state.converged | arrived)
+    stuck = state.damping > HARDEST
+    arrived = ~state.done & (promised < np.where(stuck, NEAR, CLOSE))
+    return state._replace(done=state.done | stuck | arrived, converged=state.converged | arrived)
 
 
 def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
     step = np.clip(steps_of(state.gradient, state.information, state.damping, moving), -LONGEST, LONGEST)
     going = ~state.done
-    tried = np.where(going[:, None], state.x + step, state.x)
+    tried = np.where(going[:, None] & (step != 0), state.x + step, state.x)
     total, gradient, information = evaluate(tried)
     sound = np.isfinite(total) & np.isfinite(gradient).all(axis=1) & np.isfinite(information).all(axis=(1, 2))
-    better = going & sound & (total >= state.total - NOISE * np.abs(state.total))
-    damping = np.where(
-        better, np.where(state.damping < 1e-7, 0.0, state.damping / 10), np.maximum(state.damping * 8, 1e-3)
-    )
+    gain = total - state.total
+    better = going & sound & (gain >= -NOISE * np.abs(state.total))
+    promised = np.sum(step * (state.gradient - np.einsum("lij,lj->li", state.information, step) / 2), axis=1)
+    softer = np.clip(1 - (2 * gain / np.maximum(promised, 1e-300) - 1) ** 3, 1 / 5, 4.0)  # Nielsen's rule
+    harder = np.where(going, np.maximum(state.damping, 1e-3) * state.growth, state.damping)
+    damping = np.where(better, state.damping * softer, harder)
     pick = better[:, None]
     after = _State(
         np.where(pick, tried, state.x),
         np.where(better, total, state.total),
         np.where(pick, gradient, state.gradient),
         np.where(pick[:, None], information, state.information),
-        damping,
-        state.done | (going & (damping > HARDEST)),
+        np.where(damping < SOFTEST, 0.0, damping),
+        np.where(better, 2.0, np.where(going, state.growth * 2, state.growth)),
+        state.done,
         state.converged,
     )
     return _judged(after, moving)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.learning.transforms import from_line, size, slope, to_line
-from heliograph.numerics.check import array, fail, function, instance, shown
+from heliograph.numerics.check import array, fail, function, instance, shown, shown_error
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -268,7 +268,12 @@ class Description:
     def at(self, values: Mapping[str, Any]) -> Network:
         """The network with these values."""
         with _reading(_Given(self.parameters, self.named, values)), jax.enable_x64(True):
-            return checked(self.build())
+            try:
+                return checked(self.build())
+            except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+                expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
+                got = f"one that is read: {shown_error(error)}"
+                raise fail("network to be learned", expected, got) from error
 
     @property
     def start(self) -> Network:

@@ -59,11 +59,12 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     runs = _runs([np.asarray(held[name]) for name in network.names])
     found = []
     for each in runs:
-        columns = [
-            rows(f"measurements of {name!r}", z, len(each[0]), network.nodes[name].received, missing=True)
-            for name, z in zip(network.names, each, strict=True)
-        ]
-        steps, count = len(each[0]), len(network.inputs)
+        columns: list[np.ndarray] = []
+        for name, z in zip(network.names, each, strict=True):
+            like = len(columns[0]) if columns else None
+            found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(found_rows))
+        steps, count = len(columns[0]), len(network.inputs)
         if own is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
         u = np.zeros((steps, 0)) if own is None else rows("inputs", own, steps, count, missing=False)

@@ -16,8 +16,8 @@ LARGEST = 4  # exponent that is put in words
 class Confounded(NamedTuple):
     """Free numbers of which the data tell fewer combinations than there are: their places, and what is told.
 
-    exponents: rows e of products prod_i v_i^e_i that are told; weights: rows w of sums sum_i w_i v_i; both empty where
-    what is told is neither. `fix`: how many have to be known from elsewhere.
+    exponents: rows e of products prod_i v_i^e_i that are told; weights: rows w of sums sum_i w_i v_i that are told
+    where no product is; what is told besides is neither. `fix`: how many have to be known from elsewhere.
 
     Shapes: exponents, weights (combinations, places).
     """
@@ -101,32 +101,26 @@ def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
 
 def _told(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
     places = list(group)
-    size = max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs)
+    size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))
-    if size == len(group):
-        return Confounded(group, none, none, int(size))
-    powers = _constant_complement([b[places] for b in logs])
-    if powers is not None:
-        whole = powers / np.min(np.abs(np.where(np.abs(powers) > SAME, powers, np.inf)), axis=1, keepdims=True)
-        rounded = np.round(whole)
-        if np.all(np.abs(whole - rounded) < WHOLE) and np.max(np.abs(rounded)) <= LARGEST:
-            return Confounded(group, rounded, none, int(size))
-    sums = _constant_complement([b[places] for b in plain])
-    return Confounded(group, none, none if sums is None else sums, int(size))
+    powers = _everywhere_told([b[places] for b in logs])
+    if len(powers):
+        powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
+        if np.all(np.abs(powers - np.round(powers)) < WHOLE) and np.max(np.abs(powers)) <= LARGEST + WHOLE:
+            return Confounded(group, np.round(powers), none, size)
+    return Confounded(group, none, _everywhere_told([b[places] for b in plain]), size)
 
 
-def _constant_complement(bases: list[np.ndarray]) -> np.ndarray | None:
-    """Rows orthogonal to the flat directions, reduced, if they are the same at all points."""
-    spaces = [_basis(b) for b in bases]
-    if any(b.shape != spaces[0].shape or np.max(np.abs(b @ b.T - spaces[0] @ spaces[0].T)) > SAME for b in spaces):
-        return None
-    values, vectors = np.linalg.eigh(spaces[0] @ spaces[0].T)
-    return _reduced(vectors[:, values < 0.5].T)
+def _everywhere_told(bases: list[np.ndarray]) -> np.ndarray:
+    """Rows orthogonal to the flat directions of all points, reduced."""
+    _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
+    rank = int(np.count_nonzero(size > SAME))
+    return _reduced(right[rank:])
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
     """Row echelon form, leading entries 1."""
-    result, lead = rows.copy(), 0
+    result, lead, pivot = rows.copy(), 0, 0
     for row in range(len(result)):
         while lead < result.shape[1]:
             pivot = row + int(np.argmax(np.abs(result[row:, lead])))

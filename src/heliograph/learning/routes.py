@@ -1,0 +1,56 @@
+"""What a route does to second moments, which is all that data tell of it: mean gain, gain variance, noise."""
+
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.learning.intervals import quantile
+from heliograph.learning.joint import joint_world
+from heliograph.model.over_time import OverTime, first
+from heliograph.numerics.small_matrix import congruence, contract
+from heliograph.numerics.types import Array
+from heliograph.random_affine.second_moments import second_order
+
+if TYPE_CHECKING:
+    from heliograph.learning.solution import Solution
+
+KINDS = ("mean gain", "gain variance", "noise")
+
+
+def route_sentences(solution: "Solution") -> list[str]:
+    """Of each output: what is told of its mean gain, gain variance and noise, that of the sensor included."""
+    description = solution.surface.objective.description
+    _, sensor, channel = joint_world(description.start)
+    if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
+        return []
+
+    def totals(x: Array) -> jax.Array:
+        world = joint_world(description.at(description.parameters.values(x)))
+        own, link = first(world[1]), first(world[2])
+        found, r = second_order(link), jnp.asarray(own.noise.covariance)
+        mean, p = jnp.asarray(found.mean_gain), found.mean_gain.shape[1]
+        spread = jnp.asarray(found.nominal.center)
+        whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
+        noise = jnp.diagonal(congruence(mean, r) + contract(spread, whole))
+        reached = jnp.argmax(jnp.abs(mean), axis=1)
+        rows = jnp.arange(len(mean))
+        return jnp.stack([mean[rows, reached], spread[rows, rows, reached, reached], noise], axis=1)
+
+    with jax.enable_x64(True):
+        x = jnp.asarray(solution.x)
+        values, slopes = np.asarray(totals(x)), np.asarray(jax.jacfwd(totals)(x))
+    covariance, freedom = solution.covariance()
+    lines = []
+    for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
+        told = [
+            f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})"
+            for kind, value, row in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True)
+            if solution.told(row)
+            for reach in [quantile(freedom) * float(np.sqrt(max(row @ covariance @ row, 0.0)))]
+        ]
+        if told:
+            label = name if isinstance(name, str) else f"z{name}"
+            lines.append(f"Told of what arrives of {label}: {', '.join(told)}, 95 %, the sensor's noise included.")
+    return lines
