@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.examples.learning import compute, page, run
+from heliograph.examples.learning import compute, page, plaza, run
 from heliograph.examples.learning.setting import LAWS, METHODS, ROWS, learned, true_values, world
 
 
@@ -71,3 +71,29 @@ def test_the_page_shows_every_row(coverage):
     html = page.learning_page(coverage, {name: b"<svg/>" for name in figures}).html()
     assert html.count("data:image/svg+xml") == len(figures) == 1
     assert all(page.labelled(key) in html for key in coverage)
+
+
+def drive_numbers():
+    one = {"rmse": 0.3, "calibrated": 0.35, "second_half": 0.31, "second_half_calibrated": 0.34}
+    each = {"seed": [0, 1], "rmse": [0.8, 0.9], "calibrated": [1.2, 1.4]}
+    return {"direct": one, "relayed": each}
+
+
+def test_the_recorded_drive_stands_in_summary_and_page(coverage):
+    pytest.importorskip("jinja2")
+    told = run.results(run.Outcome(coverage, drive_numbers()))
+    assert told.summary["plaza"] == drive_numbers() and "coverage" in told.summary
+    html = told.page({name: b"<svg/>" for name in told.figures}).html()
+    for words in ("On a recorded drive", "relayed, mean", "0.85", "1.30", "0.310"):
+        assert words in html
+
+
+def test_pieces_of_the_drive_are_found_once_and_kept(tmp_path, monkeypatch):
+    pytest.importorskip("gtsam")
+    calls = []
+    monkeypatch.setattr(plaza, "of_direct", lambda recording: calls.append("direct") or {"rmse": 0.3})
+    monkeypatch.setattr(plaza, "of_relayed", lambda recording, seed: calls.append(seed) or {"seed": seed, "rmse": 0.8})
+    first = plaza.plaza(tmp_path, lambda what: None)
+    assert first == {"direct": {"rmse": 0.3}, "relayed": {"seed": [0, 1, 2, 3, 4], "rmse": [0.8] * 5}}
+    assert plaza.plaza(tmp_path, lambda what: None) == first
+    assert calls == ["direct", 0, 1, 2, 3, 4]

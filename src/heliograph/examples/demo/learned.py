@@ -8,8 +8,8 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import Score, networks, one_trial, relay, score
-from heliograph.examples.demo.recording import PlazaRecording, read_recording
+from heliograph.examples.demo.compute import Score, score
+from heliograph.examples.demo.recording import PlazaRecording
 from heliograph.learning import Fit, Row
 from heliograph.report.results import Json
 
@@ -141,45 +141,4 @@ def parameters(found: Fit) -> dict[str, Json]:
     return {
         row.name: {"estimate": row.estimate, "low": finite(row.low), "high": finite(row.high), "boundary": row.boundary}
         for row in found.rows()
-    }
-
-
-def plaza(seeds: int = 5, advance: Callable[[str], None] = lambda what: None) -> dict[str, Json]:
-    """What learning gives on Plaza2: on direct ranges, and on relayed ones for several seeds of the relay.
-
-    rmse and nees: learned from the whole drive and judged on it, without the truth until then; calibrated: by the
-    constants that were measured with the truth. second_half: learned from the first half, judged on the second.
-    """
-    recording = read_recording()
-    drive = robot.DRIVES[recording.name]
-    half = learn(recording, advance)
-    advance("learning from all direct ranges")
-    whole = fitted(partial(direct, drive), recording, recording.ranges, len(recording.time))
-    own, network = judged(whole.network, recording, recording.ranges), networks(drive, 1.0)
-    relays: dict[str, list[Json]] = {name: [] for name in ("seed", "rmse", "calibrated", "nees", "parameters")}
-    for seed in range(seeds):
-        advance(f"learning from relayed ranges, seed {seed}")
-        heard = relay(robot.channel, recording.ranges, seed)
-        found = fitted(partial(relayed, drive), recording, heard, len(heard))
-        after, before = judged(found.network, recording, heard), one_trial(recording, network, seed)
-        rows: dict[str, Json] = {
-            "seed": seed,
-            "rmse": after.position_rmse_m,
-            "calibrated": before.scores["relay_aware"].position_rmse_m,
-            "nees": after.nees_per_dimension,
-            "parameters": parameters(found),
-        }
-        for name, value in rows.items():
-            relays[name].append(value)
-        calibrated = before.scores["perfect_channel"].position_rmse_m
-    return {
-        "direct": {
-            "rmse": own.position_rmse_m,
-            "calibrated": calibrated,
-            "nees": own.nees_per_dimension,
-            **learned_summary(half),
-            "parameters": parameters(whole),
-            "log_likelihood": whole.best.total,
-        },
-        "relayed": dict(relays),
     }
