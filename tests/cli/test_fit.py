@@ -80,6 +80,15 @@ def test_the_page_says_what_was_learned(folder):
         assert (folder / "out" / f"{name}.png").stat().st_size > 5000
 
 
+def test_the_losses_of_the_recording_are_told(folder):
+    """A tenth of the rows was lost, independently: the interval holds that, and the test finds no memory."""
+    (losses,) = json.loads((folder / "out" / "summary.json").read_text())["losses"].values()
+    share = losses["laws"]["independent"]["loss"]
+    assert share["low"] < 0.1 < share["high"] and share["estimate"] == losses["lost"] / 600
+    assert losses["memory_p"] > 0.01
+    assert "How measurements are lost" in (folder / "out" / "report.html").read_text()
+
+
 def test_other_numbers_are_refused(folder, tmp_path):
     other = tmp_path / "other.json"
     other.write_text(json.dumps({"values": {"plant noise": 0.1}}))

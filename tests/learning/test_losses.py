@@ -149,7 +149,7 @@ def test_the_law_that_foretells_best_is_chosen(learned):
 
 
 def test_independent_losses_are_told_from_bursts():
-    found = hg.learning.learn_losses((np.random.default_rng(2).random(1500) < 0.2).astype(float))
+    found = hg.learning.learn_losses((np.random.default_rng(2).random(600) < 0.2).astype(float))
     assert not found.memory.found
     assert abs(found.held_out["hidden"].gain) < 3 * found.held_out["hidden"].gain_error + 1e-3
     assert found.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing

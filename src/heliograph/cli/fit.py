@@ -2,6 +2,7 @@
 
 import re
 import sys
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,9 +11,10 @@ from cyclopts import Parameter
 from heliograph.cli.app import number, place
 
 if TYPE_CHECKING:
+    from heliograph.learning import Share
     from heliograph.report.fit_page import Learned
     from heliograph.report.progress import Advance
-    from heliograph.report.results import Results
+    from heliograph.report.results import Json, Results
 
 STEPS = 100  # that a climb takes at most
 
@@ -48,7 +50,7 @@ def fit(
     def work(advance: "Advance") -> "Learned":
         return learn(network, measurements, starts, seed, share, advance)
 
-    learned = write_results(out, 5, work, lambda found: results(found, out, network))
+    learned = write_results(out, 6, work, lambda found: results(found, out, network))
     print(learned.found)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
@@ -63,6 +65,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     from heliograph.files.recording import Recording, read_recording
     from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
+    from heliograph.learning.losses import learn_losses_of
+    from heliograph.learning.stretches import fates_of_measurements
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)
@@ -82,7 +86,10 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     advance("judging on held-out rows")
     judged = changes(start, found.network, recording.measurements, recording.inputs, cut) if cut < rows else []
     uniform = uniformity(found.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
-    return Learned(network, str(measurements), found, cut, rows - cut, judged, uniform)
+    advance("looking at losses")
+    fates = fates_of_measurements(recording.measurements)
+    losses = learn_losses_of({name: own for name, own in fates.items() if 0 < own[0].sum() < len(own[0])})
+    return Learned(network, str(measurements), found, cut, rows - cut, judged, uniform, losses)
 
 
 def results(learned: "Learned", out: Path, network: str) -> "Results":
@@ -96,7 +103,13 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
     def write(folder: Path) -> None:
         write_fitted(content, network, learned.measurements, folder, out)
 
-    filters = [
+    summary = {**content, "held_out_rows": learned.held_out, **_judgement(learned)}
+    return Results(fit_figures(learned), pages(learned), summary, write)
+
+
+def _judgement(learned: "Learned") -> "dict[str, Json]":
+    """Filters before and after, and losses, as JSON has them."""
+    filters: list[Json] = [
         {
             "node": one.node,
             "filter": one.filter,
@@ -109,5 +122,20 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
         }
         for one in learned.changes
     ]
-    summary = {**content, "held_out_rows": learned.held_out, "filters": filters}
-    return Results(fit_figures(learned), pages(learned), summary, write)
+    losses: dict[str, Json] = {
+        name: {
+            "packets": one.packets,
+            "lost": one.lost,
+            "best": one.best,
+            "memory_p": one.memory.likelihood_p,
+            "laws": {law: {key: _share(s) for key, s in own.shares().items()} for law, own in one.laws.items()},
+            "gains": {law: said.gain for law, said in one.held_out.items()},
+        }
+        for name, one in learned.losses.items()
+    }
+    return {"filters": filters, "losses": losses}
+
+
+def _share(share: "Share") -> "dict[str, Json]":
+    """Null where nothing was counted."""
+    return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

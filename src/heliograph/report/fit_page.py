@@ -12,6 +12,7 @@ from scipy.stats import binom
 from heliograph.files.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
+from heliograph.learning.losses import Losses
 from heliograph.learning.solution import Row
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -31,6 +32,7 @@ class Learned:
     held_out: int
     changes: list[Change]
     uniform: list[Uniformity]
+    losses: dict[str, Losses]
 
     @property
     def starts(self) -> dict[str, float]:
@@ -124,6 +126,7 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
             Section("What was learned", _table(learned, drawings)),
             Section("What else there is to say", _words(learned)),
             *_before_and_after(learned, drawings),
+            *_losses(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
                                Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
         ],
@@ -209,6 +212,25 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
         how = "Laws of gains count in full." if kinds == {True} else "Gaussians of the filters stand for some laws."
         sections.append(Section("Do the laws fit", [Picture(drawings["pits"], text, text), Text([how])]))
     return sections
+
+
+def _losses(learned: Learned) -> list[Section]:
+    """How measurements were lost, where some were."""
+    rows = []
+    for node, found in learned.losses.items():
+        for name, law in found.laws.items():
+            said = found.held_out.get(name)
+            gain = "–" if said is None else f"{said.gain:+.4f} ± {1.96 * said.gain_error:.4f}"
+            shares = [f"{key} {s.estimate:.3g} ({s.low:.3g} to {s.high:.3g})" for key, s in law.shares().items()]
+            best = "best" if name == found.best else ""
+            rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
+    caption = (
+        "Laws of the losses that the receiver is told of, with 95 % intervals, and what each foretells of the last "
+        "third of the rows: log-likelihood per packet more than independent losses. `hg.learning.learn_losses` makes a "
+        "channel of them."
+    )
+    table = Table(["lost", "law", "numbers", "gain", ""], rows, caption, wordy=True)
+    return [Section("How measurements are lost", [table])] if rows else []
 
 
 def pages(learned: Learned) -> "partial[Page]":
