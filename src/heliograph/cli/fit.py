@@ -115,10 +115,10 @@ def _judgement(learned: "Learned") -> "dict[str, Json]":
             "filter": one.filter,
             "gain": one.gain and one.gain.difference,
             "gain_error": one.gain and one.gain.standard_error,
-            "size_before": one.before.test and one.before.test.power,
-            "size_after": one.after.test and one.after.test.power,
-            "p_before": one.before.test and one.before.test.p_value,
-            "p_after": one.after.test and one.after.test.p_value,
+            "size_before": None if one.before.test is None else one.before.test.power,
+            "size_after": None if one.after.test is None else one.after.test.power,
+            "p_before": None if one.before.test is None else one.before.test.p_value,
+            "p_after": None if one.after.test is None else one.after.test.p_value,
         }
         for one in learned.changes
     ]

@@ -51,7 +51,8 @@ def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
             ]
             shape = "o" if method == "cosines" else "D"
             axes.scatter(*zip(*places, strict=True), s=26, color=COLOURS[method], marker=shape, label=method, zorder=3)
-        axes.set(title=PARAMETERS[name], xlim=(35, 101), xticks=[50, 75, 95])
+        axes.set(xlim=(35, 103), xticks=[50, 95])
+        axes.set_title(PARAMETERS[name].replace(" ", "\n"), fontsize=9)
         axes.set_yticks(range(len(keys)), [labelled(key) for key in keys])
     grid[0].invert_yaxis()
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)

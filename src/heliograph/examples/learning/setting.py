@@ -14,6 +14,7 @@ ARRIVAL = 0.8  # told
 UNTOLD = 0.7
 STEPS, SHORT = 2000, 500
 PERIOD, LEVEL = 60, 0.4  # of the input, a square wave
+FORMS: tuple[Form, ...] = ("linear", "conditional")
 METHODS: tuple[Method, ...] = ("hessian", "white", "bartlett", "cosines")
 
 RARE = 0.04  # probability of the large gain
@@ -39,10 +40,10 @@ class Row(NamedTuple):
 
 
 ROWS = (
-    *(Row(law, law, form, STEPS) for law in LAWS for form in ("linear", "conditional")),
+    *(Row(law, law, form, STEPS) for law in LAWS for form in FORMS),
     Row("rayleigh_short", "rayleigh", "linear", SHORT),
     Row("two_point_undriven", "two_point", "conditional", STEPS, driven=False),
-    Row("untold", "untold", "conditional", STEPS),
+    *(Row("untold", "untold", form, STEPS) for form in FORMS),
 )
 
 
