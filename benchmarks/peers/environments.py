@@ -8,7 +8,12 @@ import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).resolve().parents[2] / "build" / "peers"
-REQUIREMENTS = {"cuthbert": ("cuthbert==0.1.1",), "filterpy": ("filterpy==2.0.0",), "pykalman": ("pykalman==0.11.2",)}
+REQUIREMENTS = {
+    "cuthbert": ("cuthbert==0.1.1",),
+    "filterpy": ("filterpy==2.0.0",),
+    "pykalman": ("pykalman==0.11.2",),
+    "statsmodels": ("statsmodels==0.15.0",),
+}
 INSTALL = ("-m", "pip", "install", "--quiet", "--quiet", "--disable-pip-version-check")
 LONGEST = 600  # seconds for one environment
 

@@ -100,6 +100,9 @@ from .learning.fitting import (
 from .learning.identification import (
     identifiable as identifiable,
 )
+from .learning.tell_apart import (
+    samples_to_tell as samples_to_tell,
+)
 from .live.stream import (
     Stream as Stream,
 )

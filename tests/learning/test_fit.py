@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.learning.recordings import gathered
+from heliograph.learning.surface import Surface
 from tests.oracles.learning_links import likelihood
 
 STEPS = 400
@@ -67,3 +69,100 @@ def test_the_network_runs(found, recording):
     record = hg.run(found.network, {"node": recording.measurements["node"][0]}, INPUTS)
     assert record.measurements["node"].shape == (STEPS, 2)
     assert found.network.plant.noise.covariance[0, 0] == found.values["plant noise"]
+
+
+def test_scores_are_derivatives_of_the_likelihood(found, recording):
+    """By central differences, whose own error is of the order of the step's square."""
+    step, shifts = 1e-5, 1e-5 * np.eye(4)
+    for solution in found.solutions:
+        surface = solution.surface
+        x = solution.x + np.array([0.3, -0.2, 0.1, 0.4])
+        at = surface.found(x[None])
+        totals = surface.found(np.concatenate([x + shifts, x - shifts])).total
+        np.testing.assert_allclose(at.gradient[0], (totals[:4] - totals[4:]) / (2 * step), rtol=1e-6, atol=1e-4)
+        np.testing.assert_allclose(at.information, at.halves.sum(axis=1))
+        gradients = surface.found(solution.x[None]).gradient
+        assert np.abs(gradients).max() < 1e-5
+
+
+def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(found):
+    rows = {
+        method: found.rows(method, "conditional") for method in ("cosines", "bartlett", "white", "hessian", "bootstrap")
+    }
+    for each in zip(*rows.values(), strict=True):
+        errors = [row.standard_error for row in each]
+        assert max(errors) < 3 * min(errors)
+        assert all(row.low < row.estimate < row.high for row in each)
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found.covariance)), [row.standard_error for row in rows["cosines"]], rtol=1e-8
+    )
+    with pytest.raises(ValueError, match="method of intervals: expected one of cosines"):
+        found.rows("wald")
+
+
+def test_a_profile_ends_where_the_likelihood_has_fallen(found):
+    """At the end of an interval, with all others at their best, l is lower by half the 95 % point of chi-square."""
+    row = found.rows("profile", "linear")[1]
+    linear = found.solutions[0]
+    place = next(entry.place for entry in linear.parameters.entries if entry.name == row.name)
+    start = np.repeat(linear.x[None], 2, axis=0)
+    start[:, place] = np.log([row.low, row.high])
+    active = np.ones(start.shape, dtype=bool)
+    active[:, place] = False
+    fallen = linear.total - linear.surface.climb(start, active, lambda now: None).total
+    np.testing.assert_allclose(fallen, 1.9207, atol=0.01)  # two refinements leave an eighth of an eighth of an error
+
+
+def test_several_recordings_are_one_likelihood(found, recording):
+    z = recording.measurements["node"][0]
+    surface = found.solutions[0].surface
+    parts = gathered(found.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
+    assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
+    x = found.best.x[None]
+    whole = Surface(surface.objective, parts).found(x).total
+    first = surface.found(x).total
+    short = gathered(found.description.start, z[:150], INPUTS[:150], 4)
+    assert whole == pytest.approx(first + Surface(surface.objective, short).found(x).total, rel=1e-12)
+
+
+def test_who_interrupts_keeps_the_best_so_far(recording):
+    def stop(line):
+        if "linear: step 2" in line:
+            raise KeyboardInterrupt
+
+    found = hg.fit(network, recording, INPUTS, starts=3, progress=stop)
+    assert found.stopped and not found.converged
+    assert found.sentences[0] == "Stopped before the end: this is the best so far."
+    assert all(np.isfinite(row.estimate) for row in found.rows())
+
+
+def chain():
+    first = hg.hop(hg.Rayleigh(hg.free(0.7, "fading")), 0.2)
+    plant = hg.LinearPlant([[0.95]], 0.2, [0.0], [[1.0]], [[1.0]])
+    channel = hg.amplify_and_forward([first, hg.hop(hg.free(0.9, "gain"), hg.free(0.3, "last noise"))])
+    return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], 0.0), channel, {})})
+
+
+def test_a_ridge_is_told_before_the_data():
+    """The route's mean gain and its noise, gain^2 0.2 + last noise, are two of three numbers."""
+    before = hg.identifiable(chain, INPUTS)
+    assert before.ridges == 1 and before.identified == ()
+    assert before.sentences == (
+        "Of fading, gain and last noise only the product fading * gain and one other combination are identified; "
+        "fix one.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("build", "data", "message"),
+    [
+        (network, np.zeros((STEPS, 2)), "recording: expected measurements that vary, got 0 throughout"),
+        (network, np.full((STEPS, 2), np.nan), "at least 40 numbers that arrived for 4 free ones, got 0"),
+        (network, [], "recordings: expected at least one, got none"),
+        (network, {"other": np.zeros((STEPS, 2))}, r"measurements of the nodes \['node'\], got \['other'\]"),
+        (network, np.zeros((STEPS, 3)), r"measurements of 'node': expected shape \(any, 2\)"),
+    ],
+)
+def test_recordings_that_cannot_be_learned_from(build, data, message):
+    with pytest.raises(ValueError, match=message):
+        hg.fit(build, data, INPUTS)

@@ -10,6 +10,7 @@ from heliograph.cli.app import app
 from heliograph.cli.completion import completion
 from heliograph.cli.design import design
 from heliograph.cli.example import demo, example
+from heliograph.cli.fit import fit
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
 from heliograph.cli.reproduce import reproduce
@@ -22,7 +23,7 @@ from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
-COMMANDS = new, run, serve, replay, demo, example, reproduce, sweep, design, completion  # in the order of the help
+COMMANDS = new, run, fit, serve, replay, demo, example, reproduce, sweep, design, completion  # in the order of the help
 for one in COMMANDS:
     app.command(one)
 

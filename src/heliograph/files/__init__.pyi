@@ -1,5 +1,8 @@
 """Public names of the room; the package loads them when first used."""
 
+from .fitted import (
+    load_fitted as load_fitted,
+)
 from .network_file import (
     load_network as load_network,
 )

@@ -1,10 +1,51 @@
 """Public names of the room; the package loads them when first used."""
 
+from .choice import (
+    Comparison as Comparison,
+    compare_laws as compare_laws,
+)
+from .foretelling import (
+    Predictive as Predictive,
+    predictive as predictive,
+)
+from .hidden_losses import (
+    HiddenModeLosses as HiddenModeLosses,
+)
+from .loss_law import (
+    AbstractLossLaw as AbstractLossLaw,
+    IndependentLosses as IndependentLosses,
+    MarkovLosses as MarkovLosses,
+)
+from .loss_tests import (
+    LossMemory as LossMemory,
+    loss_memory as loss_memory,
+)
+from .losses import (
+    Losses as Losses,
+    learn_losses as learn_losses,
+    learn_losses_of as learn_losses_of,
+)
+from .running_losses import (
+    RunningRateLosses as RunningRateLosses,
+)
+from .shares import (
+    Share as Share,
+)
+from .stretches import (
+    fates_by_hop as fates_by_hop,
+    fates_by_node as fates_by_node,
+    fates_of_measurements as fates_of_measurements,
+    fates_of_sequence as fates_of_sequence,
+)
 from .fitting import (
     Fit as Fit,
 )
 from .identification import (
     Identifiability as Identifiability,
+)
+from .many import (
+    FitEach as FitEach,
+    fit_each as fit_each,
 )
 from .parameters import (
     Description as Description,

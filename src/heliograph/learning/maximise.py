@@ -10,7 +10,8 @@ from heliograph.numerics.types import Bool, Float
 MOST_STEPS = 100
 LONGEST = 1.5  # of a step, in each coordinate
 FLAT = 1e-10  # eigenvalue of the scaled information below which nothing is to be gained in a direction
-CLOSE = 1e-12  # twice the likelihood that a full step would gain: 1e-6 standard deviations away
+CLOSE = 1e-15  # twice the likelihood that a full step would gain: 3e-8 standard errors away
+NEAR = 1e-8  # the same where rounding lets nothing better be found: 1e-4 standard errors
 NOISE = 1e-13  # of a log-likelihood's own size: its rounding
 SOFTEST, HARDEST = 1e-7, 1e8  # damping that is none, and at which a start is given up
 
@@ -76,8 +77,9 @@ def _judged(state: _State, moving: np.ndarray) -> _State:
     """Which lanes have arrived: the gain that an undamped step promises is nothing."""
     whole = steps_of(state.gradient, state.information, np.zeros(len(state.x)), moving)
     promised = np.sum(np.clip(whole, -LONGEST, LONGEST) * np.nan_to_num(state.gradient), axis=1)
-    arrived = ~state.done & (promised < CLOSE + NOISE * np.abs(state.total))
-    return state._replace(done=state.done | arrived, converged=state.converged | arrived)
+    stuck = state.damping > HARDEST
+    arrived = ~state.done & (promised < np.where(stuck, NEAR, CLOSE))
+    return state._replace(done=state.done | stuck | arrived, converged=state.converged | arrived)
 
 
 def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
@@ -100,7 +102,7 @@ def _step(evaluate: Evaluate, state: _State, moving: np.ndarray) -> _State:
         np.where(pick[:, None], information, state.information),
         np.where(damping < SOFTEST, 0.0, damping),
         np.where(better, 2.0, np.where(going, state.growth * 2, state.growth)),
-        state.done | (going & (damping > HARDEST)),
+        state.done,
         state.converged,
     )
     return _judged(after, moving)

@@ -62,7 +62,8 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
         columns: list[np.ndarray] = []
         for name, z in zip(network.names, each, strict=True):
             like = len(columns[0]) if columns else None
-            columns.append(rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True))
+            found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(found_rows))
         steps, count = len(columns[0]), len(network.inputs)
         if own is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")

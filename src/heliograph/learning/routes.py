@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.learning.intervals import quantile
 from heliograph.learning.joint import joint_world
-from heliograph.model.over_time import OverTime
+from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.small_matrix import congruence, contract
 from heliograph.numerics.types import Array
 from heliograph.random_affine.second_moments import second_order
@@ -22,13 +22,13 @@ KINDS = ("mean gain", "gain variance", "noise")
 def route_sentences(solution: "Solution") -> list[str]:
     """Of each output: what is told of its mean gain, gain variance and noise, that of the sensor included."""
     description = solution.surface.objective.description
-    plant, sensor, channel = joint_world(description.start)
+    _, sensor, channel = joint_world(description.start)
     if isinstance(channel, OverTime) or isinstance(sensor, OverTime) or channel.remembers or channel.past:
         return []
-    del plant
 
     def totals(x: Array) -> jax.Array:
-        _, own, link = joint_world(description.at(description.parameters.values(x)))
+        world = joint_world(description.at(description.parameters.values(x)))
+        own, link = first(world[1]), first(world[2])
         found, r = second_order(link), jnp.asarray(own.noise.covariance)
         mean, p = jnp.asarray(found.mean_gain), found.mean_gain.shape[1]
         spread = jnp.asarray(found.nominal.center)

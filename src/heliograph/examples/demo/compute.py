@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,9 @@ from heliograph.random_affine.second_moments import second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.simulate import run
+
+if TYPE_CHECKING:
+    from heliograph.examples.demo.learned import Learned
 
 SEEDS = 5  # seeds of the relay for the spread: the one asked for and those after it
 NAMES = ("relay_aware", "extra_noise", "mean_gain", "perfect_channel", "open_loop")
@@ -60,11 +64,15 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All that the demonstration found: one trial for each seed, the first of them shown in full."""
+    """All that the demonstration found: one trial for each seed, the first of them shown in full.
+
+    learned: the constants learned from the ranges alone, where that was asked for.
+    """
 
     recording: PlazaRecording
     extra_variance: float
     trials: list[Trial]
+    learned: "Learned | None" = None
 
 
 def relay(channel: AbstractRandomAffine, signals: np.ndarray, seed: int) -> np.ndarray:
@@ -118,8 +126,10 @@ def position_nees(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
     return result
 
 
-def score(estimate: Estimate, truth: np.ndarray) -> Score:
-    """Score one filter's estimates of the position."""
+def score(estimate: Estimate, truth: np.ndarray, first: int = 0) -> Score:
+    """Score one filter's estimates of the position, from row `first` on."""
+    estimate = Estimate(np.asarray(estimate.mean)[first:], np.asarray(estimate.covariance)[first:], estimate.claim)
+    truth = truth[first:]
     nees = position_nees(estimate, truth)
     squared = np.sum((np.asarray(estimate.mean) - truth)[:, :2] ** 2, axis=1)
     claimed = np.trace(np.asarray(estimate.covariance)[:, :2, :2], axis1=1, axis2=2)

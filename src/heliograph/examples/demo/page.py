@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from heliograph.examples.demo import robot
 from heliograph.examples.demo.calibration import CALIBRATED, WINDOW
 from heliograph.examples.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
+from heliograph.examples.demo.learned import interval, said
 from heliograph.examples.demo.twin import Design
 from heliograph.report.figures import (
     BLUE,
@@ -75,6 +76,7 @@ def demo_page(outcome: Outcome, designs: Mapping[str, Design], drawings: Mapping
             _origin(outcome),
             _filters(outcome),
             _constants(outcome),
+            *_learned(outcome),
             _limits(outcome),
             _rerun(outcome),
         ],
@@ -222,6 +224,31 @@ def _constants(outcome: Outcome) -> Section:
     return Section(
         "How the constants were measured", [Table(["constant", "value", "how"], rows, wordy=True), Text([text])]
     )
+
+
+def _learned(outcome: Outcome) -> list[Section]:
+    found = outcome.learned
+    if found is None:
+        return []
+    calibrated = robot.Constants(robot.DRIVES[outcome.recording.name].gyro_rate)._asdict()
+    rows = [
+        [row.name.replace("_", " "), f"{calibrated[row.name]:.4g}", f"{row.estimate:.4g}", interval(row)]
+        for row in found.found.rows()
+    ]
+    caption = (
+        "Each constant as it was measured with the truth (the gyro's rate: at rest), and as the likelihood of the "
+        "ranges alone finds it, with its 95 % interval."
+    )
+    after, before = (one.position_rmse_m for one in (found.second_half, found.second_half_calibrated))
+    return [Section("What the ranges alone say", [
+        Text([
+            f"The same constants can be learned without the truth, by `hg.fit`: here from the first {found.rows} rows. "
+            "The filter with the learned constants hears the ranges without a relay, and is judged on the second half "
+            f"of the drive: it is off by **{after:.3f} m** where the calibrated one is off by {before:.3f} m.",
+            said(found),
+        ]),
+        Table(["constant", "calibrated", "learned", "95 %"], rows, caption),
+    ])]  # fmt: skip
 
 
 def _in_sample(outcome: Outcome) -> bool:

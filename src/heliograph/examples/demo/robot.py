@@ -29,6 +29,16 @@ class Drive(NamedTuple):
     start: np.ndarray  # m, m, rad: the truth's first pose
 
 
+class Constants(NamedTuple):
+    """What the model of the robot and its radios needs to know, in the units above."""
+
+    gyro_rate: float
+    range_scale: float = RANGE_SCALE
+    range_variance: float = RANGE_VARIANCE
+    position_walk: float = POSITION_WALK
+    heading_walk: float = HEADING_WALK
+
+
 DRIVES = {
     "plaza1": Drive(
         np.array([[-46.623, 11.026], [11.036, -6.959], [22.053, 23.848], [-17.665, 59.009]]),
@@ -54,14 +64,14 @@ def dead_reckoning(gyro_rate: float) -> Callable[[jax.Array, jax.Array], jax.Arr
     return move
 
 
-def drift(u: jax.Array) -> jax.Array:
+def drift(position_walk: float, heading_walk: float) -> Callable[[jax.Array], jax.Array]:
     """Covariance that one odometry step adds."""
-    return jnp.diag(jnp.array([POSITION_WALK * u[0], POSITION_WALK * u[0], HEADING_WALK * u[2]]))
+    return lambda u: jnp.diag(jnp.array([position_walk * u[0], position_walk * u[0], heading_walk * u[2]]))
 
 
-def ranges(beacons: np.ndarray) -> Callable[[jax.Array], jax.Array]:
+def ranges(beacons: np.ndarray, scale: float = RANGE_SCALE) -> Callable[[jax.Array], jax.Array]:
     """Range to each beacon."""
-    return lambda x: RANGE_SCALE * jnp.hypot(x[0] - beacons[:, 0], x[1] - beacons[:, 1])
+    return lambda x: scale * jnp.hypot(x[0] - beacons[:, 0], x[1] - beacons[:, 1])
 
 
 gain = hg.Discrete([0.8, 1.0, 1.2], [0.25, 0.5, 0.25])
@@ -69,17 +79,23 @@ relay = hg.amplify_and_forward([hg.hop(gain, HOP_VARIANCE), hg.hop(gain, HOP_VAR
 channel = hg.parallel([relay] * 4)  # a relay path of its own for each beacon
 
 
-def network_of(drive: Drive) -> hg.Network:
-    """The robot on this drive, heard through the relays."""
+def model(drive: Drive, constants: Constants) -> tuple[hg.Plant, hg.Sensor]:
+    """The robot on this drive, and its radios."""
     plant = hg.Plant(
-        dead_reckoning(drive.gyro_rate),
-        drift,
+        dead_reckoning(constants.gyro_rate),
+        drift(constants.position_walk, constants.heading_walk),
         drive.start,
         np.diag(START_DEVIATION**2),
         states=("x", "y", "heading"),
         inputs=("distance", "turn", "dt"),
     )
-    sensor = hg.Sensor(ranges(drive.beacons), RANGE_VARIANCE, outputs=("range_1", "range_2", "range_3", "range_4"))
+    outputs = ("range_1", "range_2", "range_3", "range_4")
+    return plant, hg.Sensor(ranges(drive.beacons, constants.range_scale), constants.range_variance, outputs=outputs)
+
+
+def network_of(drive: Drive) -> hg.Network:
+    """The robot on this drive, heard through the relays."""
+    plant, sensor = model(drive, Constants(drive.gyro_rate))
     filters = {
         "relay_aware": hg.cubature_filter(plant, sensor, channel),
         "mean_gain": hg.mean_gain_filter(plant, sensor, channel),

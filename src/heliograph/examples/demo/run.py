@@ -1,7 +1,7 @@
 """The demonstration as a folder of results, and its table on the terminal."""
 
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from functools import partial
 from pathlib import Path
 from textwrap import fill
@@ -13,6 +13,7 @@ import rich.table
 
 from heliograph.examples.demo import robot
 from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
+from heliograph.examples.demo.learned import learn, learned_line, learned_summary
 from heliograph.examples.demo.recording import find_recording, read_recording
 from heliograph.examples.demo.twin import Design, as_it_is, twins
 from heliograph.files.recording import write_estimates
@@ -23,7 +24,7 @@ from heliograph.report.results import Json, Results, write_results
 from heliograph.simulation.record import Record
 
 NAME = "demo"
-STAGES = 2 * SEEDS + 1  # of reading and computing
+STAGES = 2 * SEEDS + 2  # of reading, computing and learning
 
 
 class Found(NamedTuple):
@@ -49,7 +50,8 @@ def example(out: Path, seed: int = 0, recording: str = "plaza2") -> None:
         advance("reading the recording")
         drive = read_recording(recording)
         outcome = compute(drive, seed, advance)
-        return Found(outcome, designs(outcome, advance))
+        learned = learn(drive, advance)
+        return Found(replace(outcome, learned=learned), designs(outcome, advance))
 
     target = Path(out) / NAME
     print_table(write_results(target, STAGES, work, results, ("pyarrow",)).outcome, target)
@@ -88,14 +90,15 @@ def write_data(outcome: Outcome, folder: Path) -> None:
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:
-    """The scores by quantity and filter: of the first seed at the top, of all seeds under `seeds`."""
+    """The scores by quantity and filter: of the first seed at the top, of all under `seeds`; what was `learned`."""
     quantities = [field.name for field in fields(Score)]
     trials = outcome.trials
     spread = {q: {n: [getattr(t.scores[n], q) for t in trials] for n in NAMES} for q in quantities}
     top: dict[str, Json] = {q: {n: values[0] for n, values in by_name.items()} for q, by_name in spread.items()}
     drive = outcome.recording
     start: dict[str, Json] = {"recording": drive.name.capitalize(), "rows": len(drive.time), "seed": trials[0].seed}
-    return {**start, **top, "seeds": {"seed": [t.seed for t in trials], **spread}}
+    learned: dict[str, Json] = {} if outcome.learned is None else {"learned": learned_summary(outcome.learned)}
+    return {**start, **top, "seeds": {"seed": [t.seed for t in trials], **spread}, **learned}
 
 
 def print_table(outcome: Outcome, target: Path) -> None:
@@ -110,4 +113,6 @@ def print_table(outcome: Outcome, target: Path) -> None:
         table.add_row(*row)
     console = rich.console.Console()
     console.print(table)
+    if outcome.learned is not None:
+        console.print(learned_line(outcome.learned), highlight=False, markup=False)
     console.print(f"Report: {target / 'report.html'}", soft_wrap=True, highlight=False, markup=False)

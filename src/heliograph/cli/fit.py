@@ -1,0 +1,141 @@
+"""`heliograph fit`: the free numbers of a network, learned from measured data."""
+
+import re
+import sys
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from heliograph.cli.app import number, place
+
+if TYPE_CHECKING:
+    from heliograph.learning import Share
+    from heliograph.report.fit_page import Learned
+    from heliograph.report.progress import Advance
+    from heliograph.report.results import Json, Results
+
+STEPS = 100  # that a climb takes at most
+
+
+def fit(
+    network: str,
+    /,
+    *,
+    measurements: Annotated[Path, place("CSV or Parquet: time, inputs and received measurements.")],
+    out: Annotated[Path, place("Folder for fitted.json, fitted_network.py, figures and a page; made if missing.")],
+    starts: Annotated[int, number("From how many points to climb.")] = 6,
+    seed: Annotated[int, number("Seed of the starts.")] = 0,
+    held_out: Annotated[float, Parameter(help="Share of the rows, the last ones, that only judge.")] = 0.25,
+) -> None:
+    """Learn the numbers that your own network marks as free by hg.free, with intervals and what cannot be told.
+
+    The estimates come from the earlier rows; the filters with them are judged on the later ones. Ctrl-C ends the search
+    and keeps the best so far.
+
+    Parameters
+    ----------
+    network:
+        A Python file or module that holds a heliograph.Network with hg.free in it: my_network.py, or my_network.py:name
+        where it holds several. The name may be that of a function that returns one.
+    """
+    from heliograph.numerics.check import check_count, check_seed, scalar
+    from heliograph.report.results import write_results
+
+    share = float(scalar("--held-out", held_out, 0.0, 0.9))
+    check_count("--starts", starts)
+    check_seed("--seed", seed)
+
+    def work(advance: "Advance") -> "Learned":
+        return learn(network, measurements, starts, seed, share, advance)
+
+    learned = write_results(out, 6, work, lambda found: results(found, out, network))
+    print(learned.found)
+    for name in ("report.html", "fitted_network.py"):
+        print(out / name)
+    if learned.found.stopped:
+        print("heliograph: warning: stopped before the end; this is the best so far", file=sys.stderr)
+
+
+def learn(network: str, measurements: Path, starts: int, seed: int, held_out: float, advance: "Advance") -> "Learned":
+    """Fit to the earlier rows, judge on the later ones."""
+    advance("starting")
+    from heliograph.files.fitted import NetworkAgain
+    from heliograph.files.recording import Recording, read_recording
+    from heliograph.learning.fitting import fit as learn_from
+    from heliograph.learning.held_out import changes, uniformity
+    from heliograph.learning.losses import learn_losses_of
+    from heliograph.learning.stretches import fates_of_measurements
+    from heliograph.report.fit_page import Learned
+
+    build = NetworkAgain(network)
+    start = build()
+    recording = read_recording(measurements, start)
+    rows = len(recording.time)
+    cut = rows - int(held_out * rows)
+    early = Recording({k: z[:cut] for k, z in recording.measurements.items()}, recording.inputs[:cut],
+                      recording.time[:cut])  # fmt: skip
+
+    def say(line: str) -> None:
+        form, _, rest = line.partition(":")
+        step = re.match(r" step ([0-9]+)", rest)
+        advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
+
+    found = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    advance("judging on held-out rows")
+    judged = changes(start, found.network, recording.measurements, recording.inputs, cut) if cut < rows else []
+    uniform = uniformity(found.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
+    advance("looking at losses")
+    fates = fates_of_measurements(recording.measurements)
+    losses = learn_losses_of({name: own for name, own in fates.items() if 0 < own[0].sum() < len(own[0])})
+    return Learned(network, str(measurements), found, cut, rows - cut, judged, uniform, losses)
+
+
+def results(learned: "Learned", out: Path, network: str) -> "Results":
+    """Everything that the folder holds."""
+    from heliograph.files.fitted import as_json, write_fitted
+    from heliograph.report.fit_page import fit_figures, pages
+    from heliograph.report.results import Results
+
+    content = as_json(learned.found, network=learned.network, measurements=learned.measurements, rows=learned.learned)
+
+    def write(folder: Path) -> None:
+        write_fitted(content, network, learned.measurements, folder, out)
+
+    summary = {**content, "held_out_rows": learned.held_out, **_judgement(learned)}
+    return Results(fit_figures(learned), pages(learned), summary, write)
+
+
+def _judgement(learned: "Learned") -> "dict[str, Json]":
+    """Filters before and after, and losses, as JSON has them."""
+    filters: list[Json] = [
+        {
+            "node": one.node,
+            "filter": one.filter,
+            "gain": one.gain and one.gain.difference,
+            "gain_error": one.gain and one.gain.standard_error,
+            "size_before": None if one.before.test is None else one.before.test.power,
+            "size_after": None if one.after.test is None else one.after.test.power,
+            "p_before": None if one.before.test is None else one.before.test.p_value,
+            "p_after": None if one.after.test is None else one.after.test.p_value,
+        }
+        for one in learned.changes
+    ]
+    losses: dict[str, Json] = {
+        name: {
+            "packets": one.packets,
+            "lost": one.lost,
+            "best": one.best,
+            "memory_p": one.memory.likelihood_p,
+            "laws": {law: {key: _share(s) for key, s in own.shares().items()} for law, own in one.laws.items()},
+            "gains": {law: said.gain for law, said in one.held_out.items()},
+        }
+        for name, one in learned.losses.items()
+    }
+    return {"filters": filters, "losses": losses}
+
+
+def _share(share: "Share") -> "dict[str, Json]":
+    """Null where nothing was counted."""
+    return {key: value if isfinite(value) else None for key, value in share._asdict().items()}

@@ -1,0 +1,113 @@
+"""What a fit found, as a file, and the network with it: `fitted.json` and a Python file beside it that loads it."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from heliograph.files.network_file import load_network
+from heliograph.learning.fitting import Fit
+from heliograph.learning.parameters import describe
+from heliograph.numerics.check import fail
+from heliograph.simulation.network import Network
+
+FITTED = "fitted.json"
+NETWORK = "fitted_network.py"
+
+SOURCE = '''"""{network} with the numbers learned from {measurements}, which stand in {fitted}.
+
+    heliograph run {file} --measurements data.csv --report report
+"""
+
+from pathlib import Path
+
+import heliograph as hg
+
+HERE = Path(__file__).parent
+network = hg.files.load_fitted({reference}, HERE / "{fitted}")
+'''
+
+
+@dataclass(frozen=True)
+class NetworkAgain:
+    """The network of a file or module, built anew at each call: what `hg.free` marks in it may stand anywhere.
+
+    A file is run again; of an installed module a function that returns the network is called again.
+    """
+
+    reference: str
+
+    def __call__(self) -> Network:
+        """Load it."""
+        return load_network(self.reference)
+
+
+def as_json(found: Fit, **more: Any) -> dict[str, Any]:
+    """Values by name, the table, the sentences and how the search went, as JSON has them; None for NaN."""
+    return {
+        **more,
+        "values": {name: np.asarray(value).tolist() for name, value in found.values.items()},
+        "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in found.table],
+        "sentences": list(found.sentences),
+        "log_likelihood": dict(found.log_likelihood),
+        "ends": [_plain(float(end)) for end in found.ends],
+        "converged": found.converged,
+        "stopped": found.stopped,
+    }
+
+
+def write_fitted(content: Mapping[str, Any], reference: str, measurements: str, folder: Path, place: Path) -> None:
+    """Write `fitted.json` and `fitted_network.py` into a folder that will stand at `place`, where it finds the network.
+
+    A file is found by its way from there, so that both may be moved together.
+    """
+    (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    path, colon, name = _parts(reference)
+    if path is None:
+        found = repr(reference)
+    else:
+        way = Path(os.path.relpath(path.resolve(), place.resolve())).as_posix()
+        found = f'f"{{HERE}}/{way}{colon}{name}"'
+    text = SOURCE.format(network=_docstring(reference), measurements=_docstring(measurements), fitted=FITTED,
+                         file=NETWORK, reference=found)  # fmt: skip
+    (folder / NETWORK).write_text(text, encoding="utf-8")
+
+
+def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
+    """The network of a file or module, with the numbers in it that `hg.free` marks as a fit found them.
+
+    `reference` as for `load_network`; `fitted` is the file that `heliograph fit` wrote.
+
+    Raises:
+        ValueError: as `load_network`; no such file of numbers, or numbers that are not those which are free.
+    """
+    path, description = Path(fitted), describe(NetworkAgain(str(reference)))
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))["values"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise fail(f"fitted numbers {path}", "a file that `heliograph fit` wrote", type(error).__name__) from None
+    known = {one.name: one.start.shape for one in description.parameters.every}
+    if {name: np.shape(value) for name, value in values.items()} != known:
+        raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
+    return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _parts(reference: str) -> tuple[Path | None, str, str]:
+    """Path, colon and name; no path of a module."""
+    place, colon, name = reference.rpartition(":")
+    if not place or not name.isidentifier():
+        place, colon, name = reference, "", ""
+    is_file = place.endswith(".py") or os.sep in place or Path(place).is_file()
+    return (Path(place) if is_file else None), colon, name
+
+
+def _docstring(text: str) -> str:
+    return Path(text).name.replace("\\", "/").replace('"', "'")

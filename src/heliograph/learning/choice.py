@@ -1,0 +1,57 @@
+"""Which of two laws a recording speaks for: a test of the mean difference of their log-likelihoods."""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import norm
+
+from heliograph.learning.foretelling import Predictive
+from heliograph.learning.long_run import mean_and_error
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Float
+
+
+@readable
+class Comparison(NamedTuple):
+    """How much more likely one law finds a recording than another does.
+
+    difference: mean per step of log p_a - log p_b, nats, with its standard error, which allows for correlation over
+    time; z their ratio, p_value two-sided.
+    """
+
+    difference: float
+    standard_error: float
+    z: float
+    p_value: float
+
+    @property
+    def decided(self) -> bool:
+        """Whether the data speak for one of them, at 5 %: for the first where the difference is positive."""
+        return self.p_value < 0.05
+
+
+def compare_laws(a: Predictive, b: Predictive) -> Comparison:
+    """Test whether two laws foretell one recording equally well: z of the mean difference of log-likelihoods.
+
+    Steps where nothing arrived do not count.
+
+    Raises:
+        ValueError: different recordings, or fewer than 10 steps with a measurement.
+    Source: Vuong (1989); Newey and West (1987) for the standard error.
+    """
+    for name, item in (("first law", a), ("second law", b)):
+        instance(name, item, Predictive, "what `predictive` gives")
+    if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
+        raise fail("second law", "the same recording as the first", "another")
+    heard = ~np.all(np.isnan(a.pit), axis=1)
+    if heard.sum() < 10:
+        raise fail("recording", "at least 10 steps with a measurement", int(heard.sum()))
+    return compared((a.log_likelihood - b.log_likelihood)[heard])
+
+
+def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:
+    """The test of a mean difference."""
+    mean, error = mean_and_error(differences)
+    z = mean / error if error > 0 else 0.0
+    return Comparison(mean, error, float(z), float(2 * norm.sf(abs(z))))

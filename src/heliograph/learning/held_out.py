@@ -1,0 +1,133 @@
+"""What learning changed for a network's filters, on rows that were not learned from."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import ndtr
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.learning.choice import Comparison, compared
+from heliograph.learning.foretelling import predictive
+from heliograph.model.over_time import OverTime, first
+from heliograph.numerics.check import InputError
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.whiteness import MemoryTest, memory_of
+
+LAGS = 10  # of the test for memory, with ten rows for each at least
+
+
+@readable
+@dataclass(frozen=True)
+class Expected:
+    """How well a filter expected some rows: log-likelihood of each, innovations in claimed deviations, their test.
+
+    Shapes: log_likelihood (rows,), white (rows, received); the test is None where there are too few rows.
+    """
+
+    log_likelihood: Float[np.ndarray, " rows"]
+    white: Float[np.ndarray, "rows received"]
+    test: MemoryTest | None
+
+
+@readable
+@dataclass(frozen=True)
+class Change:
+    """One filter on the held-out rows, with the numbers that the network began with and with those learned.
+
+    gain: of log-likelihood per row, with its test; None where fewer than 10 rows were heard.
+    """
+
+    node: str
+    filter: str
+    before: Expected
+    after: Expected
+    gain: Comparison | None
+
+
+@readable
+@dataclass(frozen=True)
+class Uniformity:
+    """Probability integral transforms of one node's held-out rows under the learned network.
+
+    by_law: whether laws of gains count in full, or as the filter's Gaussians.
+
+    Shapes: pit (rows, received).
+    """
+
+    node: str
+    pit: Float[np.ndarray, "rows received"]
+    by_law: bool
+
+
+def changes(
+    before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
+) -> list[Change]:
+    """Every filter that claims a covariance, over all rows, judged from row `cut` on."""
+    found = []
+    for name, z in measurements.items():
+        for key, old in before.nodes[name].filters.items():
+            if old.claim == "none" or not old.received:
+                continue
+            one, other = (_expected(item, z, inputs, cut) for item in (old, after.nodes[name].filters[key]))
+            heard = ~np.all(np.isnan(one.white), axis=1)
+            gain = compared((other.log_likelihood - one.log_likelihood)[heard]) if heard.sum() >= LAGS else None
+            found.append(Change(name, key, one, other, gain))
+    return found
+
+
+def uniformity(
+    network: Network, found: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
+) -> list[Uniformity]:
+    """Pits of each node: by its laws where `predictive` knows its channel, else by its first filter's Gaussians."""
+    result = []
+    for name, z in measurements.items():
+        own, node = [change for change in found if change.node == name], network.nodes[name]
+        by_law = _by_law(network, node, z, inputs) if isinstance(node, Node) else None
+        if by_law is not None:
+            result.append(Uniformity(name, by_law[cut:], True))
+        elif own:
+            result.append(Uniformity(name, np.asarray(ndtr(own[0].after.white)), False))
+    return result
+
+
+def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> np.ndarray | None:
+    parts = (network.plant, node.sensor, node.channel)
+    if any(isinstance(part, OverTime) for part in parts) or first(node.channel).remembers:
+        return None
+    try:
+        return predictive(network.plant, node.sensor, first(node.channel), z, inputs).pit
+    except InputError:  # laws without nodes, or too many of them
+        return None
+
+
+def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
+    likelihood, white = (np.asarray(part)[cut:] for part in _heard(item, z, u))
+    lags = min(LAGS, len(white) // 10)
+    enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
+    return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
+
+
+@compiled
+def _heard(
+    item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> tuple[jax.Array, jax.Array]:
+    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance; NaN where nothing came."""
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
+        k, z_k, u_k = row
+        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
+        there = ~jnp.isnan(heard.value)
+        covariance = jnp.where(there[:, None] & there, heard.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
+        root = jnp.linalg.cholesky(covariance)
+        white = jax.scipy.linalg.solve_triangular(root, jnp.where(there, heard.value, 0.0), lower=True)
+        return after, (jnp.asarray(heard.log_likelihood), jnp.where(there, white, jnp.nan))
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    found = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return found[0], found[1]

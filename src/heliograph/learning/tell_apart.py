@@ -1,0 +1,142 @@
+"""How many samples tell two laws of a gain apart."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.stats import norm
+
+from heliograph.filters.gaussian import GaussianFilter, cubature_filter
+from heliograph.filters.linear import open_loop_filter
+from heliograph.learning.foretelling import NODES, Parts, expected_signals, of_signals
+from heliograph.learning.long_run import long_run_deviation
+from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.same import same
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.simulate import monte_carlo
+
+HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
+
+
+@readable
+class SamplesToTell(NamedTuple):
+    """How many steps the likelihood ratio needs, and what it gains in each.
+
+    samples: steps after which both errors are as small as asked; infinite where the laws look alike. information: mean
+    of log p_own - log p_other per step under the first law and under the second, nats; deviation: of that, in the long
+    run.
+    """
+
+    samples: float
+    information: tuple[float, float]
+    deviation: tuple[float, float]
+
+
+def samples_to_tell(
+    law_a: AbstractLaw,
+    law_b: AbstractLaw,
+    network: Network,
+    inputs: ArrayLike | None = None,
+    error: float = 0.05,
+    seed: int = 0,
+    nodes: int = NODES,
+) -> SamplesToTell:
+    """Steps of a network after which the likelihood ratio tells which of two laws a gain has, both errors `error`.
+
+    The gain is the network's only random one, or where it has several, those whose law equals one of the two. The
+    network is simulated under each law, and `predictive` computes log p_a - log p_b. Its sum over n steps is about
+    normal, with mean n I_a and variance n V_a under the first law, -n I_b and n V_b under the second; the threshold
+    between them that makes both errors equal gives n = (z (sqrt V_a + sqrt V_b) / (I_a + I_b))^2.
+
+    Shapes: inputs (steps, inputs); their length is that of the runs, 500 steps unless given.
+
+    Raises:
+        ValueError: a network with several nodes or none that hears a channel, no gain to put the laws in, an error
+            outside (0, 0.5).
+    """
+    for name, law in (("first law", law_a), ("second law", law_b)):
+        instance(name, law, AbstractLaw, "a law such as Rayleigh(1.0)")
+    check_seed("seed", seed), check_count("nodes", nodes)
+    level = float(scalar("error", error, 0.0, 0.5))
+    if level in (0.0, 0.5):
+        raise fail("error", "a number between 0 and 0.5", level)
+    name, node = _the_node(network)
+    count = HORIZON if inputs is None else len(np.asarray(inputs))
+    channels = [_with_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
+    found = []
+    for own, other in (channels, channels[::-1]):
+        ratio = _ratios(network, name, node, own, other, inputs, count, seed, nodes)
+        deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
+        found.append((float(ratio.mean()), float(deviation)))
+    (gain_a, deviation_a), (gain_b, deviation_b) = found
+    gain = gain_a + gain_b
+    needed = (norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
+    return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
+
+
+def _the_node(network: Network) -> tuple[str, Node]:
+    instance("network", network, Network, "a Network")
+    heard = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    if len(heard) != 1 or len(network.nodes) != 1:
+        raise fail("network", "one node that hears its sensor through a channel", f"{len(network.nodes)} nodes")
+    return next(iter(heard.items()))
+
+
+def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
+    """The channel with `law` in the place of the gain in question."""
+    one = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
+    laws = [leaf for leaf in jax.tree.leaves(one, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)]
+    of_pair = [leaf for leaf in laws if any(same(leaf, item) for item in pair)]
+    chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
+    if not of_pair and not 0 < len(chosen) == len(laws):
+        raise fail("network", "gains of one law, or some whose law is one of the two", f"{len(laws)} random gains")
+
+    def placed(leaf: object) -> object:
+        return law if any(leaf is item for item in chosen) else leaf
+
+    result: AbstractRandomAffine = jax.tree.map(placed, one, is_leaf=_is_law)
+    return result
+
+
+def _is_law(item: object) -> bool:
+    return isinstance(item, AbstractLaw)
+
+
+def _ratios(
+    network: Network,
+    name: str,
+    node: Node,
+    own: AbstractRandomAffine,
+    other: AbstractRandomAffine,
+    inputs: ArrayLike | None,
+    count: int,
+    seed: int,
+    nodes: int,
+) -> np.ndarray:
+    """log p_own - log p_other of each run and step, of data drawn under the first."""
+    plain = Node(node.sensor, own, {"open_loop": open_loop_filter(network.plant)})
+    world = Network(network.plant, {name: plain})
+    z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]
+    u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
+    said = []
+    for channel in (own, other):
+        heard = arrived(channel)
+        item, parts = cubature_filter(network.plant, node.sensor, heard), Parts.of(heard, nodes)
+        y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(item, z, u))
+        said.append(of_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
+    return np.asarray(said[0] - said[1])
+
+
+@compiled
+def _side_by_side(
+    item: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    return jax.vmap(lambda one: expected_signals(item, one, u))(jnp.asarray(z))

@@ -1,0 +1,238 @@
+"""What a fit found as figures and a page: estimates with intervals, what cannot be told, and what it changed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import binom
+
+from heliograph.files.quoting import in_figure, visible
+from heliograph.learning.fitting import Fit
+from heliograph.learning.held_out import Change, Uniformity
+from heliograph.learning.losses import Losses
+from heliograph.learning.solution import Row
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH
+from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
+
+MOST = 40  # numbers, filters and nodes that are drawn; tables hold all
+BINS = 20
+
+
+@dataclass(frozen=True)
+class Learned:
+    """All that the page tells: the fit, from `learned` rows, and what it changed on the `held_out` rows after them."""
+
+    network: str
+    measurements: str
+    found: Fit
+    learned: int
+    held_out: int
+    changes: list[Change]
+    uniform: list[Uniformity]
+    losses: dict[str, Losses]
+
+    @property
+    def starts(self) -> dict[str, float]:
+        """Where each number began."""
+        parameters = self.found.description.parameters
+        return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
+
+
+def fit_figures(learned: Learned) -> dict[str, Figure]:
+    """Estimates; correlations of innovations before and after; pits, by file name."""
+    drawn = {"estimates": _estimates(learned)}
+    tested = [one for one in learned.changes if one.before.test and one.after.test][:MOST]
+    if tested:
+        drawn["innovations"] = _correlations(tested)
+    heard = [one for one in learned.uniform if np.any(~np.isnan(one.pit))][:MOST]
+    if heard:
+        drawn["pits"] = _pits(heard)
+    return drawn
+
+
+@matplotlib.rc_context(STYLE)
+def _estimates(learned: Learned) -> Figure:
+    """A line for each number, on a scale of its own: start, estimates of both forms, intervals."""
+    rows = learned.found.rows()[:MOST]
+    forms = [one.form for one in learned.found.solutions]
+    by_form = {form: learned.found.rows(form=form) for form in forms}
+    figure = Figure(figsize=(WIDTH, 0.6 + 0.62 * len(rows)), layout="constrained")
+    grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
+    for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
+        for j, form in enumerate(reversed(forms)):
+            one = by_form[form][i]
+            color = BLUE if j == 0 else MUTED
+            if np.isfinite([one.low, one.high]).all():
+                axes.plot([one.low, one.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
+            axes.plot(one.estimate, -j, "o" if one.identified else "x", color=color, markersize=6)
+        axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
+        axes.set_ylim(-len(forms) + 0.4, 0.9)
+        axes.set_yticks([])
+        axes.set_ylabel(in_figure(row.name), rotation=0, ha="right", va="center")
+        axes.margins(x=0.08)
+        axes.grid(visible=False, axis="y")
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def _correlations(tested: list[Change]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.6 * len(tested)), layout="constrained")
+    grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, one in zip(grid, tested, strict=True):
+        for shift, color, part, label in ((-0.17, AMBER, one.before, "before"), (0.17, BLUE, one.after, "after")):
+            assert part.test is not None
+            lags = np.arange(1, len(part.test.correlation) + 1)
+            axes.bar(lags + shift, part.test.correlation, 0.3, color=color, label=label)
+            axes.errorbar(
+                lags + shift, part.test.correlation, 1.96 * part.test.standard_error, fmt="none", ecolor=MUTED, lw=1
+            )
+        axes.axhline(0.0, color=MUTED, linewidth=0.8)
+        axes.set_title(in_figure(f"{one.node}/{one.filter}"))
+        axes.set_ylabel("correlation")
+        axes.set_xticks(lags)
+    grid[0].legend(loc="upper right", ncols=2)
+    grid[-1].set_xlabel("rows apart")
+    return figure
+
+
+@matplotlib.rc_context(STYLE)
+def _pits(heard: list[Uniformity]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.5 * len(heard)), layout="constrained")
+    grid = figure.subplots(len(heard), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, one in zip(grid, heard, strict=True):
+        values = one.pit[~np.isnan(one.pit)]
+        count = len(values)
+        low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
+        axes.hist(values, np.linspace(0, 1, BINS + 1), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
+        axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0)
+        axes.axhline(1.0, color=MUTED, linewidth=0.8)
+        axes.set_title(in_figure(one.node))
+        axes.set_ylabel("density")
+    grid[-1].set_xlabel("probability of a smaller value")
+    return figure
+
+
+def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
+    """The report; `drawings` holds each figure as SVG."""
+    return Page(
+        kicker="Heliograph fit",
+        title=visible(learned.network),
+        lead=f"What {visible(learned.measurements)} says of the numbers that are free in the network.",
+        sections=[
+            Section("At a glance", _glance(learned)),
+            Section("What was learned", _table(learned, drawings)),
+            Section("What else there is to say", _words(learned)),
+            *_before_and_after(learned, drawings),
+            *_losses(learned),
+            Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
+                               Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
+        ],
+    )  # fmt: skip
+
+
+def _glance(learned: Learned) -> list[KeyFigures]:
+    told = [row for row in learned.found.rows() if row.identified]
+    keys = [
+        KeyFigure("numbers learned", f"{len(told)}", f"of {len(learned.found.rows())} free ones", BLUE),
+        KeyFigure("rows", f"{learned.learned:,}", f"learned from; {learned.held_out:,} held out", GREEN),
+    ]
+    gains = [one.gain for one in learned.changes if one.gain is not None]
+    if gains:
+        first = gains[0]
+        note = f"held-out log-likelihood per row, ± {1.96 * first.standard_error:.3f}"
+        keys.append(KeyFigure("gain", f"{first.difference:+.3f}", note, VERMILION))
+    return [KeyFigures(keys)]
+
+
+def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Table]:
+    starts = learned.starts
+    rows = [
+        [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
+        for row in learned.found.table
+    ]
+    caption = (
+        "95 % intervals by cosines, which allow for scores that are correlated over time. Of two forms the "
+        "**conditional** one counts, which is sharper; the **linear** one holds whatever the laws of the gains."
+    )
+    picture = Picture(
+        drawings["estimates"],
+        "Each number with its interval and its start, on a scale of its own.",
+        "Estimates with their intervals (blue: the form that counts, grey: the other), from the starts (triangles). "
+        "A cross: not told by the data.",
+    )
+    return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
+
+
+def _interval(row: Row) -> str:
+    if not row.identified:
+        return "not told"
+    if row.boundary:
+        return f"below {row.high:.3g}" if row.high > row.estimate else f"above {row.low:.3g}"
+    return f"{row.low:.4g} to {row.high:.4g}"
+
+
+def _words(learned: Learned) -> list[Points | Text]:
+    said = learned.found.sentences
+    if said:
+        return [Points([visible(line) for line in said])]
+    return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
+
+
+def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[Section]:
+    if not learned.changes:
+        return []
+    rows = []
+    for one in learned.changes:
+        test = [part.test for part in (one.before, one.after)]
+        sizes = ["–" if t is None else f"{t.power:.2f} ± {1.96 * t.power_error:.2f}" for t in test]
+        memory = ["–" if t is None else f"{t.correlation[0]:.2f} (p {t.p_value:.2g})" for t in test]
+        gain = "–" if one.gain is None else f"{one.gain.difference:+.3f} ± {1.96 * one.gain.standard_error:.3f}"
+        rows.append([visible(f"{one.node}/{one.filter}"), gain, *sizes, *memory])
+    headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
+    caption = (
+        f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
+        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 is honest. "
+        "**Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
+    )
+    blocks: list[Table | Picture] = [Table(headers, rows, caption)]
+    if "innovations" in drawings:
+        text = "Correlations of innovations some rows apart, with 95 % intervals: white ones have none."
+        blocks.append(Picture(drawings["innovations"], text, text))
+    sections = [Section("Before and after", blocks)]
+    if "pits" in drawings:
+        text = (
+            "Probability, under the learned network, of a smaller value than the one that came. Under the right laws "
+            "all are equally likely: 95 % of the bars end in the grey band. High in the middle: the network expects "
+            "too much spread; high at the ends: too little."
+        )
+        kinds = {one.by_law for one in learned.uniform}
+        how = "Laws of gains count in full." if kinds == {True} else "Gaussians of the filters stand for some laws."
+        sections.append(Section("Do the laws fit", [Picture(drawings["pits"], text, text), Text([how])]))
+    return sections
+
+
+def _losses(learned: Learned) -> list[Section]:
+    """How measurements were lost, where some were."""
+    rows = []
+    for node, found in learned.losses.items():
+        for name, law in found.laws.items():
+            said = found.held_out.get(name)
+            gain = "–" if said is None else f"{said.gain:+.4f} ± {1.96 * said.gain_error:.4f}"
+            shares = [f"{key} {s.estimate:.3g} ({s.low:.3g} to {s.high:.3g})" for key, s in law.shares().items()]
+            best = "best" if name == found.best else ""
+            rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
+    caption = (
+        "Laws of the losses that the receiver is told of, with 95 % intervals, and what each foretells of the last "
+        "third of the rows: log-likelihood per packet more than independent losses. `hg.learning.learn_losses` makes a "
+        "channel of them."
+    )
+    table = Table(["lost", "law", "numbers", "gain", ""], rows, caption, wordy=True)
+    return [Section("How measurements are lost", [table])] if rows else []
+
+
+def pages(learned: Learned) -> "partial[Page]":
+    """The page, once the figures are drawn."""
+    return partial(fit_page, learned)

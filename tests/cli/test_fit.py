@@ -1,0 +1,134 @@
+"""`heliograph fit` on one recording: what it writes, and that what it writes runs."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.cli.command import main
+from heliograph.files.fitted import load_fitted
+from heliograph.files.recording import Recording, write_recording
+
+SOURCE = """
+import numpy as np
+import heliograph as hg
+
+plant = hg.LinearPlant([[0.95]], hg.free({plant}, "plant noise"), [0.0], 1.0)
+sensor = hg.LinearSensor([[1.0]], 0.05, outputs=["far"])
+channel = hg.hop(1.0, noise=hg.free({hop}, "hop noise"))
+filters = {{"aware": hg.linear_filter(plant, sensor, channel)}}
+network = hg.Network(plant, {{"a": hg.Node(sensor, hg.erasure(channel, 0.9), filters)}})
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A network file, what it measured with other numbers, and what the command found there."""
+    place = tmp_path_factory.mktemp("fit")
+    (place / "cart.py").write_text(SOURCE.format(plant=1.0, hop=1.0))
+    (place / "truth.py").write_text(SOURCE.format(plant=0.2, hop=0.5))
+    network = hg.files.load_network(str(place / "truth.py"))
+    z = hg.monte_carlo(network, horizon=600, runs=1, key=1).measurements["a"][0]
+    write_recording(Recording({"a": z}, np.zeros((600, 0)), np.arange(600.0)), network, place / "data.csv")
+    command = ["fit", str(place / "cart.py"), "--measurements", str(place / "data.csv"), "--out", str(place / "out")]
+    assert main([*command, "--starts", "2"]) == 0
+    return place
+
+
+def test_the_numbers_are_found_with_their_intervals(folder):
+    found = json.loads((folder / "out" / "fitted.json").read_text())
+    rows = {row["name"]: row for row in found["table"]}
+    for name, truth in {"plant noise": 0.2, "hop noise": 0.5}.items():
+        assert rows[name]["low"] < truth < rows[name]["high"]
+        assert found["values"][name] == rows[name]["estimate"]
+    assert found["rows"] == 450 and found["converged"] and not found["stopped"]
+
+
+def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tmp_path):
+    shutil.copytree(folder, tmp_path / "moved")
+    out = tmp_path / "estimates.csv"
+    code = main(["run", str(tmp_path / "moved" / "out" / "fitted_network.py"), "--measurements",
+                 str(folder / "data.csv"), "--out", str(out)])  # fmt: skip
+    assert code == 0 and out.is_file()
+
+
+def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
+    """By the difference of the log-likelihoods of both filters over the last 150 rows, computed another way."""
+    summary = json.loads((folder / "out" / "summary.json").read_text())
+    (one,) = summary["filters"]
+    assert summary["held_out_rows"] == 150
+    assert one["gain"] > 2 * one["gain_error"]
+    assert abs(one["size_after"] - 1) < abs(one["size_before"] - 1)
+    before = hg.files.load_network(str(folder / "cart.py"))
+    after = hg.files.load_network(str(folder / "out" / "fitted_network.py"))
+    z = hg.files.read_recording(folder / "data.csv", before).measurements["a"]
+    whole, early = (
+        [hg.log_likelihood(n.nodes["a"].filters["aware"], part) for n in (before, after)] for part in (z, z[:450])
+    )
+    heard = np.count_nonzero(~np.isnan(z[450:]))
+    gain = (whole[1] - early[1] - whole[0] + early[0]) / heard
+    assert one["gain"] == pytest.approx(gain, rel=1e-9)
+
+
+def test_the_page_says_what_was_learned(folder):
+    page = (folder / "out" / "report.html").read_text()
+    for words in ("hop noise", "plant noise", "Before and after", "Do the laws fit", "fitted_network.py"):
+        assert words in page
+    for name in ("estimates", "innovations", "pits"):
+        assert (folder / "out" / f"{name}.png").stat().st_size > 5000
+
+
+def test_the_losses_of_the_recording_are_told(folder):
+    """A tenth of the rows was lost, independently: the interval holds that, and the test finds no memory."""
+    (losses,) = json.loads((folder / "out" / "summary.json").read_text())["losses"].values()
+    share = losses["laws"]["independent"]["loss"]
+    assert share["low"] < 0.1 < share["high"] and share["estimate"] == losses["lost"] / 600
+    assert losses["memory_p"] > 0.01
+    assert "How measurements are lost" in (folder / "out" / "report.html").read_text()
+
+
+def test_other_numbers_are_refused(folder, tmp_path):
+    other = tmp_path / "other.json"
+    other.write_text(json.dumps({"values": {"plant noise": 0.1}}))
+    with pytest.raises(ValueError, match="expected those that are free in the network"):
+        load_fitted(folder / "cart.py", other)
+    other.write_text("[]")
+    with pytest.raises(ValueError, match="expected a file that `heliograph fit` wrote"):
+        load_fitted(folder / "cart.py", other)
+
+
+def test_a_network_in_which_nothing_is_free_is_told(folder, tmp_path, capsys):
+    path = tmp_path / "still.py"
+    path.write_text(SOURCE.format(plant=1.0, hop=1.0).replace("hg.free(1.0, ", "(lambda x, y: x)(1.0, "))
+    out = str(tmp_path / "out")
+    assert main(["fit", str(path), "--measurements", str(folder / "data.csv"), "--out", out]) == 2
+    assert "expected at least one number marked by hg.free" in capsys.readouterr().err
+    assert main(["fit", str(path), "--measurements", "none.csv", "--out", out, "--held-out", "1"]) == 2
+    assert "--held-out: expected a number from 0 to 0.9, got 1" in capsys.readouterr().err
+
+
+def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypatch):
+    """The interrupt comes at the third look at how far the search has come."""
+    from heliograph.learning import fitting
+
+    seen = []
+
+    def interrupted(progress):
+        def say(line):
+            seen.append(line)
+            if len(seen) == 3:
+                raise KeyboardInterrupt
+            progress(line)
+
+        return say
+
+    real = fitting.fit
+    monkeypatch.setattr(fitting, "fit", lambda *a, progress, **k: real(*a, progress=interrupted(progress), **k))
+    out = tmp_path / "out"
+    command = ["fit", str(folder / "cart.py"), "--measurements", str(folder / "data.csv"), "--out", str(out)]
+    assert main([*command, "--starts", "2"]) == 0  # the command itself was not interrupted
+    found = json.loads((out / "fitted.json").read_text())
+    assert found["stopped"] and "best so far" in found["sentences"][0]
+    assert np.isfinite(list(found["values"].values())).all()

@@ -1,0 +1,112 @@
+"""Climbing, intervals and ridges on functions whose answers are known; nothing is compiled."""
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from heliograph.learning.intervals import bartlett, block_sums, cosines, white
+from heliograph.learning.maximise import maximise
+from heliograph.learning.parameters import Parameter, Parameters
+from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
+from heliograph.numerics.domain import POSITIVE, REAL
+
+RNG = np.random.default_rng(0)
+
+
+def residuals(x):
+    """Of the curve a exp(-b t) at 30 times, (lanes, 30), with derivatives (lanes, 30, 2)."""
+    t = np.linspace(0.0, 3.0, 30)
+    seen = 2.0 * np.exp(-0.7 * t) + 0.1 * np.random.default_rng(1).normal(size=30)
+    curve = np.exp(x[:, :1] - np.exp(x[:, 1:]) * t)
+    slope = np.stack([curve, -curve * np.exp(x[:, 1:]) * t], axis=2)
+    return seen - curve, slope
+
+
+def evaluate(x):
+    r, slope = residuals(x)
+    information = np.einsum("lti,ltj->lij", slope, slope)
+    return -np.sum(r**2, axis=1) / 2, np.einsum("lt,lti->li", r, slope), information
+
+
+def test_the_climb_ends_where_another_package_ends():
+    start = np.array([[0.0, 0.0], [1.0, 1.0], [-1.0, -2.0]])
+    found = maximise(evaluate, start)
+    theirs = optimize.least_squares(lambda x: residuals(x[None])[0][0], start[0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert found.converged.all()
+    np.testing.assert_allclose(found.x, np.repeat(theirs.x[None], 3, axis=0), atol=1e-7)
+
+
+def test_what_does_not_move_stays_and_the_impossible_is_given_up():
+    fixed = maximise(evaluate, np.array([[0.0, 0.3]]), np.array([[True, False]]))
+    assert fixed.converged[0] and fixed.x[0, 1] == 0.3
+    assert abs(evaluate(fixed.x)[1][0, 0]) < 1e-6
+    nowhere = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
+    assert not nowhere.converged[0]
+
+
+def test_long_run_covariances_of_an_autoregression():
+    """s_t = .5 s_(t-1) + e_t has the long-run variance 1 / .25 = 4, and 4/3 at each step."""
+    steps, runs = 20_000, 3
+    scores = []
+    for _ in range(runs):
+        s, e = np.zeros(steps), RNG.normal(size=steps)
+        for t in range(1, steps):
+            s[t] = 0.5 * s[t - 1] + e[t]
+        scores.append(s[:, None])
+    whole = runs * steps
+    spread = 4 * 4 * np.sqrt(2 / (runs * 0.4 * steps ** (2 / 3)))  # four standard errors
+    assert cosines(scores).covariance[0, 0] / whole == pytest.approx(4.0, abs=spread)
+    assert white(scores).covariance[0, 0] / whole == pytest.approx(4 / 3, rel=0.05)
+    assert 3.2 < bartlett(scores).covariance[0, 0] / whole < 4.2  # its weights take off lag / (L + 1), L = 13
+    drawn = block_sums(scores, 2000, 0)
+    assert np.var(drawn) / whole == pytest.approx(4.0, rel=0.2)
+    assert cosines(scores[:1]).freedom == int(0.4 * steps ** (2 / 3))
+    assert cosines(scores).freedom == pytest.approx(3 * int(0.4 * steps ** (2 / 3)))
+
+
+def parameters(*domains):
+    names = "abcdefg"
+    return Parameters(tuple(Parameter(names[i], np.array(1.0), d) for i, d in enumerate(domains)))
+
+
+def informed(told, parameters, points):
+    """Ranks of the information of what is told, functions of the values, at points of the line."""
+    ranks = []
+    for x in points:
+        values, turned = parameters.entries_at(x), parameters.jacobian(x)
+        step = 1e-6 * np.eye(len(values))
+        rows = np.stack([(told(values + h) - told(values - h)) / 2e-6 for h in step], axis=1) @ turned
+        ranks.append(rank_of(rows.T @ rows + 0.0))
+    return ranks
+
+
+def groups_of(told, *domains):
+    own = parameters(*domains)
+    points = [np.random.default_rng(i).uniform(0.3, 1.0, len(domains)) for i in range(3)]
+    with np.errstate(all="ignore"):
+        return confounded(own, points, informed(told, own, points))
+
+
+def test_a_product_is_found_and_put_in_words():
+    (group,) = groups_of(lambda v: np.array([v[0] * v[1], v[2]]), REAL, POSITIVE, POSITIVE)
+    assert group.places == (0, 1) and group.fix == 1
+    assert product_text(["a", "b"], group.exponents[0]) == "a * b"
+
+
+def test_a_power_and_a_sum():
+    (group,) = groups_of(lambda v: np.array([v[0] ** 2 * v[1]]), REAL, POSITIVE)
+    assert product_text(["a", "b"], group.exponents[0]) == "a^2 * b"
+    (group,) = groups_of(lambda v: np.array([0.5 * v[0] + v[1]]), POSITIVE, POSITIVE)
+    assert not len(group.exponents)
+    assert sum_text(["a", "b"], group.weights[0]) == "a + 2 b"
+
+
+def test_two_ridges_apart_one_that_is_neither_and_nothing_at_all():
+    first, second = groups_of(lambda v: np.array([v[0] * v[1], v[2] / v[3]]), *(POSITIVE,) * 4)
+    assert (first.places, second.places) == ((0, 1), (2, 3))
+    assert product_text(["c", "d"], second.exponents[0]) == "c / d"
+    (group,) = groups_of(lambda v: np.array([v[0] * v[1] + v[2]]), *(POSITIVE,) * 3)
+    assert group.fix == 2 and not len(group.exponents) and not len(group.weights)
+    (group,) = groups_of(lambda v: np.array([v[0], 0 * v[1]]), *(POSITIVE,) * 2)
+    assert group.places == (1,) and group.fix == 1
+    assert groups_of(lambda v: v, *(POSITIVE,) * 3) == []
