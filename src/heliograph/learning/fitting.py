@@ -223,7 +223,10 @@ def _settled(surface: Surface, found: Maximum, lane: int, ridges: int, say: Prog
             x, active[place] = moved, False
     if not active.all():
         say(f"{surface.objective.form}: again without {int((~active).sum())} at a limit")
-        again = surface.climb(x[None], active[None], lambda now: None)
+        try:
+            again = surface.climb(x[None], active[None], lambda now: None)
+        except StoppedError as stopped:
+            again = stopped.best
         x, total, converged = again.x[0], float(again.total[0]), bool(again.converged[0])
     return Solution(surface, x, total, active, converged, steps, ridges)
 
