@@ -12,6 +12,9 @@ def serve(
     window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0,
     ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0,
     leap: Annotated[float | None, Parameter(help="How much later than all before it; any, unless given.")] = None,
+    broker: Annotated[
+        str | None, Parameter(help="mqtt://host:port/topic or nats://host:port/topic, instead of standard input.")
+    ] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
 ) -> None:
     """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
@@ -27,6 +30,8 @@ def serve(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import fail
+    from heliograph.serving.address import address
+    from heliograph.serving.broker import connected
     from heliograph.serving.fleet import Options
     from heliograph.serving.loop import keep_running
     from heliograph.serving.message import schema as message_schema
@@ -40,5 +45,10 @@ def serve(
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
     options = Options(window, ahead, float("inf") if leap is None else leap)
+    where = None if broker is None else address(broker)
     service = Service(load_network(network), options)
-    asyncio.run(keep_running(service, Pipe()))
+
+    async def work() -> None:
+        await keep_running(service, Pipe() if where is None else connected(where))
+
+    asyncio.run(work())
