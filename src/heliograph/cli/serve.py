@@ -1,8 +1,11 @@
 """`heliograph serve`: the filters of a network kept running, from messages to estimates."""
 
+from pathlib import Path
 from typing import Annotated
 
 from cyclopts import Parameter
+
+from heliograph.cli.app import place
 
 
 def serve(
@@ -12,9 +15,12 @@ def serve(
     window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0,
     ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0,
     leap: Annotated[float | None, Parameter(help="How much later than all before it; any, unless given.")] = None,
-    broker: Annotated[
-        str | None, Parameter(help="mqtt://host:port/topic or nats://host:port/topic, instead of standard input.")
-    ] = None,
+    store: Annotated[str | None, Parameter(help="File or PostgreSQL URL that keeps the state.")] = (None),
+    process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
+    from_snapshot: Annotated[Path | None, place("Store of which to begin from the plants.")] = None,
+    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
+    parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
+    page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
 ) -> None:
     """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
@@ -31,24 +37,16 @@ def serve(
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import fail
     from heliograph.serving.address import address
-    from heliograph.serving.broker import connected
     from heliograph.serving.fleet import Options
-    from heliograph.serving.loop import keep_running
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.pipe import Pipe
-    from heliograph.serving.service import Service
+    from heliograph.serving.running import Wanted, run
 
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
         return
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
-    options = Options(window, ahead, float("inf") if leap is None else leap)
     where = None if broker is None else address(broker)
-    service = Service(load_network(network), options)
-
-    async def work() -> None:
-        await keep_running(service, Pipe() if where is None else connected(where))
-
-    asyncio.run(work())
+    options = Options(window, ahead, float("inf") if leap is None else leap)
+    asyncio.run(run(Wanted(load_network(network), options, store, process, from_snapshot, where, parts, page)))

@@ -1,6 +1,7 @@
 """Plants of one network: each takes its events as a timeline does; what is due is stepped for all of them at once."""
 
 from collections.abc import Iterable
+from datetime import datetime
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -13,7 +14,6 @@ from heliograph.numerics.check import fail
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
 from heliograph.serving.pool import Pool
-from heliograph.simulation.network import Network
 
 FAR = 100_000  # steps that an event may be after the newest one: each of them has to be computed
 
@@ -45,26 +45,36 @@ class Fleet:
     of time in each plant. Which plants share a fleet, and how events are cut into batches, changes no bit.
     """
 
-    def __init__(self, network: Network, options: Options):
-        self.network, self.options, self.lanes = network, options, Lanes(network)
-        self.pool = Pool(self.lanes)
+    def __init__(self, lanes: Lanes, options: Options):
+        network = self.network = lanes.network
+        self.options, self.lanes = options, lanes
+        self.pool = Pool(lanes)
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self.lanes.given
-        ends = np.cumsum([size for _, size in self._sizes.values()]).tolist()
-        self._places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
+        sizes = [size for _, size in self._sizes.values()]
+        self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
         covered = steps_covered(network)
         self._end = np.inf if covered is None else covered - 1
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
         self._joint = self.lanes.dt is None or network.common is not None
 
-    def begin(self, name: str, time: float) -> Plant:
+    def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
         """A new plant, whose continuous time starts at `time`."""
         begun = -1.0 if self.lanes.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
         base = HeldRow((begun, BEFORE, 0), slot, self._places[-1].stop)
         base.numbers[-1] = begun
-        return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0)
+        return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
+
+    def end(self, plant: Plant) -> None:
+        """Let go of a plant: its slots are free."""
+        self.pool.give([row.slot for row in plant.rows.held])
+
+    def size(self, place: int) -> int:
+        """How many numbers an event of the node at this place has."""
+        part = self._places[place]
+        return part.stop - part.start
 
     def rows(self, base: HeldRow) -> Rows:
         """Rows that begin with this one."""

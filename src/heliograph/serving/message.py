@@ -8,7 +8,8 @@ from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, V
 from heliograph.numerics.check import fail, shown
 
 Name = Annotated[str, Field(max_length=200)]
-Moment = Annotated[float | AwareDatetime, Field(description="Seconds or steps, or an ISO 8601 date with a zone.")]
+Moment = float | AwareDatetime
+MOMENT = "a finite number, or an ISO 8601 date with a zone"
 LONGEST = 1 << 20  # bytes of a message; what is longer is refused unread
 
 
@@ -44,8 +45,9 @@ def read_message(payload: bytes) -> Message:
         return _READER.validate_json(payload)
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise fail(f"message{where and ', ' + where}", first["msg"], shown(first["input"])) from None
+        part = str(first["loc"][0]) if first["loc"] else ""
+        wanted = MOMENT if part in ("time", "arrival") else first["msg"][:1].lower() + first["msg"][1:]
+        raise fail(f"message, {part}" if part else "message", wanted, shown(first["input"])) from None
 
 
 def seconds(moment: float | datetime, origin: datetime | None) -> float:
@@ -56,10 +58,10 @@ def seconds(moment: float | datetime, origin: datetime | None) -> float:
     """
     if isinstance(moment, datetime):
         if origin is None:
-            raise fail("message, time", "a number, as in the first message", moment.isoformat())
+            raise fail("message, time", "a number, as this plant's times are", moment.isoformat())
         return (moment - origin).total_seconds()
     if origin is not None:
-        raise fail("message, time", "a date, as in the first message", moment)
+        raise fail("message, time", "a date, as this plant's times are", moment)
     return moment
 
 

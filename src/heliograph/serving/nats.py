@@ -27,7 +27,7 @@ from heliograph.serving.address import Address
 from heliograph.serving.output import Output
 from heliograph.serving.partition import WHOLE, Part, word
 from heliograph.serving.retry import Retry
-from heliograph.serving.transport import Batch
+from heliograph.serving.transport import Batch, TakenOverError
 
 MOST = 1000  # messages of a batch
 WAIT = 5.0  # seconds that one request for messages stays open
@@ -145,7 +145,7 @@ class Nats:
         mine = f"part-{self.part.number}-of-{self.part.of}-"
         others = [c for c in await server.consumers_info(self.stream) if c.name.startswith(mine)]
         if self._name and others and self._name not in [c.name for c in others]:
-            raise fail(f"{self.address}, part {self.part.number}", "one reader", "another that took over")
+            raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         floors = [c.ack_floor.stream_seq for c in others if c.ack_floor is not None]
         begun = self._settled if others else 0  # a stream without its consumers is a new one
         self._settled = min(max([begun, *floors]), newest)

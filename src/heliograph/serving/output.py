@@ -6,13 +6,15 @@ from pydantic import BaseModel, Field, TypeAdapter
 
 from heliograph.model.estimate import Claim
 
+Kind = Literal["provisional", "final", "refused"]
+
 
 class Output(NamedTuple):
     """A line of JSON about a plant. `number` counts what is told exactly once; provisional estimates have none."""
 
     number: int | None
     plant: str
-    kind: Literal["provisional", "final", "refused"]
+    kind: Kind
     body: bytes
 
 
@@ -29,7 +31,7 @@ class Told(BaseModel):
 class Estimates(BaseModel):
     """The filters of a plant after the row at `time`, by node and filter; those of several nodes under "fused"."""
 
-    id: int | None = Field(description="Counts what is told once; told again after a restart it has the same.")
+    id: int | None = Field(None, description="Of final ones: counts what is told once; told again it is the same.")
     kind: Literal["provisional", "final"] = Field(description="Provisional ones may change by what comes late.")
     plant: str
     time: float | str

@@ -1,6 +1,7 @@
 """One plant of a fleet: the rows it holds, the verdict on each message, and its links' tallies."""
 
 from dataclasses import dataclass, field
+from datetime import datetime
 
 from heliograph.live.event import Known, Verdict
 from heliograph.live.rows import HeldRow, Rows
@@ -39,12 +40,15 @@ class Link:
 class Plant:
     """Rows held, of which those from `dirty` on have to be stepped anew and those before `base` are final.
 
-    `now` is the newest arrival; `forced`: rows that became final before their time, for want of room.
+    `now` is the newest arrival; `forced`: rows that became final before their time, for want of room. `origin`: the
+    moment that its times are counted from, where they are dates. `version` counts its commits.
     """
 
     name: str
     rows: Rows
     now: float
+    origin: datetime | None = None
+    version: int = 0
     base: int = 0
     dirty: int | None = None
     forced: int = 0

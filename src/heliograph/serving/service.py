@@ -1,5 +1,6 @@
 """The service: batches of messages in, what is to be told out; all that it knows is committed in between."""
 
+from collections import OrderedDict
 from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime, time, timedelta
 from time import perf_counter
@@ -7,13 +8,15 @@ from typing import Any, NamedTuple
 
 from heliograph.live.event import INPUTS, Verdict
 from heliograph.numerics.check import InputError, shown
-from heliograph.serving.fleet import Fleet, Options, Settled
+from heliograph.serving.fleet import Fleet, Settled
+from heliograph.serving.keeping import ConflictError, Entry, Keeps, Kept
+from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.message import Message, read_message, seconds
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
 from heliograph.serving.telling import Teller, line
-from heliograph.simulation.network import Network
 
+ROWS = 200_000  # that are held in memory before plants which were not heard for long leave it for the store
 WHY: dict[Verdict, str] = {
     "duplicate": "held already",
     "conflict": "held already with other values, which stay",
@@ -37,14 +40,12 @@ class Service:
     It knows no transport: `take` uses a batch and gives what is to be told of it, after the commit. One call at a time.
     """
 
-    def __init__(self, network: Network, options: Options):
-        self.fleet = Fleet(network, options)
-        self.plants = dict[str, Plant]()
+    def __init__(self, fleet: Fleet, store: Keeps):
+        self.fleet, self.store = fleet, store
+        self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.last = 0, Taken(0, 0, 0.0, 0.0)
-        self._teller = Teller(self.fleet.lanes)
-        self._number = 0  # of what is told once
-        self._origin: datetime | None = None  # that times are counted from where they are dates
-        self._begun = False
+        self._teller = Teller(fleet.lanes)
+        self._told: int | None = None  # up to where, since the last commit
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
         """Use messages, each a JSON object, and commit; what is to be told of it.
@@ -52,99 +53,142 @@ class Service:
         Nothing in a message stops the service: what cannot be used is counted and told, with the reason.
         """
         begun = perf_counter()
-        touched = dict[str, Plant]()
-        outputs = []
-        used = set[str]()
-        for payload in payloads:
+        messages = [_read(payload) for payload in payloads]
+        self._load({message.plant for message in messages if isinstance(message, Message)})
+        while True:
             try:
-                message = read_message(payload)
+                outputs, committed = self._taken(messages, payloads)
+                break
+            except ConflictError:
+                self._load({message.plant for message in messages if isinstance(message, Message)})
+        self.last = Taken(len(payloads), len(outputs), perf_counter() - begun, committed)
+        return outputs
+
+    def unpublished(self) -> list[Output]:
+        """What was committed before a restart and may not have been told."""
+        return self.store.untold()
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """These were told: remembered with the next commit."""
+        self._told = max((each.number for each in outputs if each.number is not None), default=self._told)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
+        settled = self.fleet.settle(plant.end() for plant in self.plants.values() if ended and not self.store.keeps)
+        return self._commit({}, self._finals(settled), 0)
+
+    def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
+        """Use messages and commit; what is to be told, and how long the commit took."""
+        touched, used, entries, malformed = dict[str, Plant](), set[str](), list[Entry](), 0
+        for message, payload in zip(messages, payloads, strict=True):
+            try:
+                if isinstance(message, str):
+                    raise InputError(message)
                 plant, verdict = self._use(message)
             except InputError as error:
-                self.malformed += 1
-                outputs.append(self._refused(None, {}, "malformed", f"{error}: {shown(payload)}"))
+                malformed += 1
+                entries.append(_refused(None, {}, "malformed", f"{error}: {shown(payload)}"))
                 continue
             touched[plant.name] = plant
             if verdict == "used":
                 used.add(plant.name)
             else:
-                outputs.append(self._refuse(message, verdict))
+                entries.append(_refusal(message, verdict))
         settled = self.fleet.settle(touched.values())
-        outputs += self._finals(settled) + self._provisional(each for each in settled if each.plant.name in used)
+        entries += self._finals(settled)
+        provisional = self._provisional([each for each in settled if each.plant.name in used])
         self.fleet.forget(settled)
-        self.last = Taken(len(payloads), len(outputs), perf_counter() - begun, 0.0)
+        begun = perf_counter()
+        outputs = self._commit(touched, entries, malformed)
+        committed = perf_counter() - begun
+        self.malformed += malformed
+        return outputs + provisional, committed
+
+    def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
+        """Keep what changed. If that fails, what is in memory of it is forgotten: the store is right."""
+        kept = {}
+        if self.store.keeps:
+            kept = {name: Kept(plant.version, plant_bytes(plant, self.fleet)) for name, plant in touched.items()}
+        try:
+            outputs = self.store.commit(kept, entries, malformed, self._told)
+        except BaseException:
+            for name in touched:
+                self.fleet.end(self.plants.pop(name))
+            raise
+        self._told = None
+        for name, plant in touched.items():
+            plant.version += 1
+            self.plants.move_to_end(name)
+        while self.store.keeps and self.fleet.pool.used > ROWS:
+            self.fleet.end(self.plants.popitem(last=False)[1])
         return outputs
 
-    def unpublished(self) -> list[Output]:
-        """What was committed before a restart and may not have been told."""
-        return []
-
-    def published(self, outputs: Sequence[Output]) -> None:
-        """These were told: remembered with the next commit."""
-
-    def finish(self, ended: bool) -> list[Output]:
-        """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
-        if not ended:
-            return []
-        settled = self.fleet.settle(plant.end() for plant in self.plants.values())
-        outputs = self._finals(settled)
-        self.fleet.forget(settled)
-        return outputs
+    def _load(self, names: Iterable[str]) -> None:
+        """Have the plants of these names in memory, where they are kept."""
+        for name, kept in self.store.load([name for name in names if name not in self.plants]).items():
+            plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
+            plant.version = kept.version
 
     def _use(self, message: Message) -> tuple[Plant, Verdict]:
         """Give a message to its plant."""
-        at, came = self._times(message)
         plant = self.plants.get(message.plant)
+        origin = self._origin(message) if plant is None else plant.origin
+        at = seconds(message.time, origin)
         now = at if plant is None else plant.now
-        arrival = max(now, at) if came is None else came
+        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
         if plant is None:
-            plant = self.plants[message.plant] = self.fleet.begin(message.plant, at)
+            plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
         if inputs is not None:
             self.fleet.take(plant, inputs)
         verdict = self.fleet.take(plant, event)
         plant.link(message.node).count(verdict, message.sequence)
         return plant, verdict
 
-    def _times(self, message: Message) -> tuple[float, float | None]:
-        """When it was measured and when it came, as numbers."""
-        if not self._begun:
-            if isinstance(message.time, datetime):
-                self._origin = datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
-            self._begun = True
-        at = seconds(message.time, self._origin)
-        return at, None if message.arrival is None else seconds(message.arrival, self._origin)
+    def _origin(self, message: Message) -> datetime | None:
+        """The midnight before a plant's first message, in UTC, where its times are dates."""
+        if not isinstance(message.time, datetime) or self.fleet.lanes.dt is None:
+            return None
+        return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
 
-    def _finals(self, settled: Iterable[Settled]) -> list[Output]:
-        """What is told of rows in which something was heard."""
-        rows = [(each.plant.name, row) for each in settled for row in each.final if row.hears()]
+    def _finals(self, settled: Iterable[Settled]) -> list[Entry]:
+        """What is told once: the rows that are final now and in which something was heard."""
+        rows = [(each.plant, row) for each in settled for row in each.final if row.hears()]
         told = self.fleet.told([row.slot for _, row in rows])
-        return [self._estimates("final", plant, row.key[0], numbers)
-                for (plant, row), numbers in zip(rows, told, strict=True)]  # fmt: skip
+        return [
+            Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
+            for (plant, row), numbers in zip(rows, told, strict=True)
+        ]
 
-    def _provisional(self, settled: Iterable[Settled]) -> list[Output]:
-        rows = [(each.plant.name, each.newest) for each in settled]
-        told = self.fleet.told([row.slot for _, row in rows])
-        bodies = [self._teller.estimates(None, "provisional", plant, self._moment(row.key[0]), numbers)
-                  for (plant, row), numbers in zip(rows, told, strict=True)]  # fmt: skip
-        return [Output(None, plant, "provisional", body) for (plant, _), body in zip(rows, bodies, strict=True)]
+    def _provisional(self, settled: Sequence[Settled]) -> list[Output]:
+        """What is known now."""
+        told = self.fleet.told([each.newest.slot for each in settled])
+        return [
+            Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
+            for (plant, _, newest, _), numbers in zip(settled, told, strict=True)
+        ]
 
-    def _estimates(self, kind: str, plant: str, at: float, told: list[float]) -> Output:
-        self._number += 1
-        body = self._teller.estimates(self._number, kind, plant, self._moment(at), told)
-        return Output(self._number, plant, "final", body)
+    def _estimates(self, kind: str, plant: Plant, at: float, told: list[float]) -> bytes:
+        moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
+        return self._teller.estimates(kind, plant.name, moment, told)
 
-    def _refuse(self, message: Message, why: Verdict) -> Output:
-        moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
-        parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-        return self._refused(message.plant, parts, why, WHY[why])
 
-    def _refused(self, plant: str | None, parts: dict[str, Any], why: str, detail: str) -> Output:
-        self._number += 1
-        found = {"id": self._number, "kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
-        return Output(self._number, plant or "", "refused", line(found | parts | {"reason": why, "detail": detail}))
+def _read(payload: bytes) -> Message | str:
+    """The message, or why it is none."""
+    try:
+        return read_message(payload)
+    except InputError as error:
+        return str(error)
 
-    def _moment(self, at: float) -> float | str:
-        """A time as it was told."""
-        return at if self._origin is None else (self._origin + timedelta(seconds=at)).isoformat()
+
+def _refusal(message: Message, why: Verdict) -> Entry:
+    moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
+    parts = {"node": message.node, "sequence": message.sequence, "time": moment}
+    return _refused(message.plant, parts, why, WHY[why])
+
+
+def _refused(plant: str | None, parts: dict[str, Any], why: str, detail: str) -> Entry:
+    found = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
+    return Entry(plant or "", "refused", line(found | parts | {"reason": why, "detail": detail}))

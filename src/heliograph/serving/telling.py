@@ -16,12 +16,12 @@ class Teller:
         for place in lanes.places:
             self._nodes.setdefault(place.node, []).append(place)
 
-    def estimates(self, number: int | None, kind: str, plant: str, time: float | str, told: list[float]) -> bytes:
+    def estimates(self, kind: str, plant: str, time: float | str, told: list[float]) -> bytes:
         """The filters' estimates after a row, from the numbers that they told there."""
         found = {
             node: {place.filter: self._filter(place, told) for place in places} for node, places in self._nodes.items()
         }
-        return line({"id": number, "kind": kind, "plant": plant, "time": time, "estimates": found})
+        return line({"kind": kind, "plant": plant, "time": time, "estimates": found})
 
     def _filter(self, place: Place, told: list[float]) -> dict[str, Any]:
         n, mean, begin, surprise = self._n, place.mean, place.covariance, place.surprise

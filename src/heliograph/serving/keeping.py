@@ -1,0 +1,53 @@
+"""What a service asks of whatever keeps its state."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, Protocol
+
+from heliograph.serving.output import Kind, Output
+
+
+class Kept(NamedTuple):
+    """A plant in the store; its version counts its commits, 0 before the first."""
+
+    version: int
+    body: bytes
+
+
+class Entry(NamedTuple):
+    """What is to be told once: its line of JSON lacks the number, which the commit gives."""
+
+    plant: str
+    kind: Kind
+    body: bytes
+
+    def numbered(self, number: int) -> Output:
+        """The output with its number."""
+        return Output(number, self.plant, self.kind, b'{"id":%d,' % number + self.body[1:])
+
+
+class ConflictError(Exception):
+    """Another process has committed a plant since it was read: read it again, and use the messages again."""
+
+
+class Keeps(Protocol):
+    """What a service needs of a store."""
+
+    keeps: bool
+
+    def load(self, names: Iterable[str]) -> dict[str, Kept]:
+        """The plants of these names that are kept."""
+
+    def commit(
+        self, plants: Mapping[str, Kept], entries: Sequence[Entry], malformed: int, told: int | None
+    ) -> list[Output]:
+        """Keep plants, of the versions they had before, and what is to be told; `told`: up to where it was.
+
+        Raises:
+            ConflictError: a plant has another version.
+        """
+
+    def untold(self) -> list[Output]:
+        """What this process committed and may not have told."""
+
+    def close(self) -> None:
+        """Let go of what it holds."""

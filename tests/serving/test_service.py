@@ -1,0 +1,139 @@
+"""A service against timelines: the same verdicts and estimates, whatever the batches; and what it refuses."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+from pydantic import TypeAdapter
+
+import heliograph as hg
+from heliograph.serving.nowhere import Nowhere
+from heliograph.serving.output import AnyOutput
+from heliograph.serving.service import Service
+from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
+
+READER = TypeAdapter(AnyOutput)
+
+
+def served(network, sent, size, **options):
+    """All that is told, as JSON, of messages in batches of this size."""
+    service = Service(fleet(network, **options), Nowhere())
+    told = []
+    for begin in range(0, len(sent), size):
+        told += service.take(sent[begin : begin + size])
+    told += service.finish(ended=True)
+    for one in told:
+        READER.validate_json(one.body)
+    return service, [json.loads(one.body) for one in told]
+
+
+def finals(told, plant):
+    return [
+        {k: v for k, v in one.items() if k != "id"} for one in told if one["kind"] == "final" and one["plant"] == plant
+    ]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_verdicts_and_estimates_are_those_of_a_timeline(whole):
+    """Within 1e-12: two programs that are compiled apart; the estimates are of order one."""
+    network = stepping() if whole else moving()
+    found = messages(3, 60, seed=1, whole=whole, longest=9.0)  # some later than the window
+    found += found[-20:]
+    service, told = served(network, lines(found), 17)
+    for plant in ("p0", "p1", "p2"):
+        mine = [one for one in found if one["plant"] == plant]
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            timeline = hg.Timeline(network, WINDOW, start=0.0 if whole else mine[0]["time"])
+        for one in mine:
+            if "inputs" in one:
+                timeline.push("inputs", one["sequence"], one["time"], one["inputs"], one["arrival"])
+            values = [np.nan if z is None else z for z in one["values"]]
+            timeline.push(one["node"], one["sequence"], one["time"], values, one["arrival"])
+        links = service.plants[plant].links
+        for node in "ab":
+            assert {v: getattr(links[node], v) for v in timeline.counts[node]} == timeline.counts[node]
+        assert sum(links[node].late for node in "ab") > 0
+        assert sum(links[node].duplicate for node in "ab") > 0
+        timeline.advance(1e3)
+        record, mine = timeline.final(), finals(told, plant)
+        np.testing.assert_array_equal(record.time, [one["time"] for one in mine])
+        for node, filters in record.estimates.items():
+            for name, estimate in filters.items():
+                got = [one["estimates"][node][name] for one in mine]
+                np.testing.assert_allclose([one["mean"] for one in got], estimate.mean, atol=1e-12, rtol=0)
+                np.testing.assert_allclose([one["covariance"] for one in got], estimate.covariance, atol=1e-12, rtol=0)
+                assert {one["claim"] for one in got} == {estimate.claim}
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_no_bit_depends_on_batches_or_on_other_plants(whole):
+    network = stepping() if whole else moving()
+    found = messages(5, 30, seed=2, whole=whole)
+    _, together = served(network, lines(found), len(found))
+    _, one_by_one = served(network, lines(found), 1)
+    alone = served(network, lines([one for one in found if one["plant"] == "p3"]), 7)[1]
+    for i in range(5):
+        assert finals(together, f"p{i}") == finals(one_by_one, f"p{i}") != []
+    assert finals(together, "p3") == finals(alone, "p3")
+
+
+def test_any_order_and_twice_is_the_same(tmp_path):
+    found = messages(2, 30, seed=3, whole=True)
+    again = [found[i] for i in np.random.default_rng(0).permutation(len(found))]
+    one, two = (served(stepping(), lines(each), 8, window=100.0)[1] for each in (found, again + found))
+    for plant in ("p0", "p1"):
+        assert finals(one, plant) == finals(two, plant)
+
+
+def test_surprise_is_that_of_the_innovation():
+    """e^2 / S of the filter stepped by itself; 1e-12, two programs that are compiled apart."""
+    network = stepping()
+    alone = network.nodes["a"].filters["linear"]
+    z = [0.3, 1.9, None, 0.7, -0.4]
+    sent = [{"node": "a", "sequence": k, "time": k, "values": [value]} for k, value in enumerate(z)]
+    _, told = served(network, lines(sent), 2)
+    mine = [one["estimates"]["a"]["linear"] for one in told if one["kind"] == "final"]
+    assert [one["heard"] for one in mine] == [1, 1, 0, 1, 1] and mine[2]["nis"] is None
+    state = alone.init()
+    for k, (value, one) in enumerate(zip(z, mine, strict=True)):
+        state, said = alone.correct(alone.predict(state, [0.0], k), [np.nan if value is None else value], k)
+        if value is not None:
+            np.testing.assert_allclose(one["nis"], said.value[0] ** 2 / said.covariance[0, 0], rtol=1e-12)
+
+
+BAD = {
+    b"no json": "invalid JSON",
+    b"[1]": "",
+    b'{"node": "a"}': "sequence: expected field required",
+    b'{"node": "c", "sequence": 0, "time": 1, "values": [1]}': "one of a, b, inputs",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [1, 2]}': "1 numbers",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [NaN]}': "values",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [1e999]}': "values",
+    b'{"node": "a", "sequence": 0, "time": Infinity, "values": [1]}': "time",
+    b'{"node": "a", "sequence": 0, "time": 1.5, "values": [1]}': "a step",
+    b'{"node": "a", "sequence": 0, "time": -1, "values": [1]}': "a step",
+    b'{"node": "a", "sequence": 0, "time": 1e300, "values": [1]}': "future",
+    b'{"node": "a", "sequence": -1, "time": 1, "values": [1]}': "sequence",
+    b'{"node": "a", "sequence": 99999999999999999999, "time": 1, "values": [1]}': "sequence",
+    b'{"node": "a", "sequence": 0, "time": "2026-11-21T10:00:00", "values": [1]}': "with a zone, got '2026",
+    b'{"node": "a", "sequence": 0, "time": "2026-11-21T10:00:00Z", "values": [1]}': "a number",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [1], "more": 1}': "more",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [1], "inputs": []}': "1 numbers",
+    b"\xff\xfe": "",
+    b"[" * 5000: "",
+}
+
+
+def test_what_is_bad_is_told_and_changes_nothing():
+    good = lines(messages(1, 20, seed=4, whole=True))
+    bad = {payload.replace(b'{"node"', b'{"plant": "p0", "node"'): reason for payload, reason in BAD.items()}
+    mixed = [good[0], *(line for i, one in enumerate(good[1:]) for line in (one, list(bad)[i % len(bad)]))]
+    _, clean = served(stepping(), good, 6)
+    service, told = served(stepping(), mixed, 6)
+    assert finals(told, "p0") == finals(clean, "p0") and service.malformed == len(bad) - 1
+    for payload, reason in bad.items():
+        _, told = served(stepping(), [good[0], payload], 2)
+        refused = [one for one in told if one["kind"] == "refused"]
+        assert len(refused) == 1 and reason in refused[0]["reason"] + refused[0]["detail"], (payload, told)
