@@ -17,7 +17,7 @@ NOW = {  # one clock for all: the database's
     "sqlite": text("SELECT (julianday('now') - 2440587.5) * 86400.0"),
     "postgresql": text("SELECT extract(epoch FROM clock_timestamp())::float8"),
 }
-TERM = 15.0  # seconds that a lease lasts: so long after a process died its parts are idle
+TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts are idle
 
 
 class Leases:
