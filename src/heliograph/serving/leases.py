@@ -38,9 +38,8 @@ class Leases:
         with self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
             alive = self._alive(connection, now)
-            held = (
-                connection.execute(select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)).tuples().all()
-            )
+            leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
+            held = [(row.number, row.process) for row in connection.execute(leased)]
             mine = [number for number, process in sorted(held) if process == self.process]
             taken = {number for number, _ in held}
             free = [number for number in range(self.parts) if number not in taken]
