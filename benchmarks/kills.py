@@ -1,0 +1,157 @@
+"""A service that is killed with -9 at random moments, and what that changes: nothing may.
+
+Run: python benchmarks/kills.py [KILLS]. A fleet's messages, late and out of order, go through the pipe of
+`heliograph serve`; after each kill all of them are sent again from the first. At the end the states of all plants and
+the journal are compared with those of a service that was never disturbed, byte by byte, and what was read from the pipe
+with the journal. Exit code 1 if anything differs.
+"""
+
+import json
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from threading import Thread
+from time import sleep
+from typing import Any
+
+from heliograph.files.network_file import load_network
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.identity import identity
+from heliograph.serving.kept import plant_bytes, plant_from
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.service import Service
+from heliograph.serving.store import JOURNAL, Store
+
+NETWORK = """
+import jax.numpy as jnp
+import heliograph as hg
+plant = hg.Plant(lambda x, u: x + u[0] * u[1], lambda u: jnp.diag(0.3 * u[1:]), [0.0], 1.0, inputs=["speed", "dt"])
+sensor, hop = hg.LinearSensor([[1.0]], 0.1), hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)
+node = hg.Node(sensor, hop, {"cubature": hg.cubature_filter(plant, sensor, hop)})
+network = hg.Network(plant, {"a": node, "b": node})
+"""
+PLANTS, EACH, WINDOW, LATEST = 5, 400, 5.0, 3.0
+PART = 40  # lines that are written at once
+PAUSE = 0.01  # seconds between
+
+
+def messages(seed: int) -> list[bytes]:
+    """Of each plant, a third late, some twice, in the order of their arrival."""
+    chance, found = random.Random(seed), []
+    for plant in range(PLANTS):
+        for i in range(EACH):
+            time = 0.4 * i + chance.uniform(0, 0.3)
+            one = {"plant": f"p{plant}", "node": "ab"[i % 2], "sequence": i // 2, "time": time,
+                   "values": [chance.gauss(1, 0.5)],
+                   "arrival": time + (chance.uniform(0, LATEST) if chance.random() < 1 / 3 else 0.0)}  # fmt: skip
+            one |= {"inputs": [chance.gauss(0, 0.1)]} if i % 6 == 0 else {}
+            found += [one] * (2 if chance.random() < 0.1 else 1)
+    return [json.dumps(one).encode() + b"\n" for one in sorted(found, key=lambda one: one["arrival"])]
+
+
+class Running:
+    """`heliograph serve` in a process of its own; `told` has the lines that came out of it."""
+
+    def __init__(self, network: Path, store: Path):
+        options = "--store", str(store), "--window", str(WINDOW)
+        command = [sys.executable, "-m", "heliograph", "serve", str(network), *options]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+        self.told: list[dict[str, Any]] = []
+        self._reader = Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.endswith(b"\n"):  # a line that the kill cut is told again
+                self.told.append(json.loads(line))
+
+    def write(self, lines: list[bytes]) -> None:
+        """Send these, a part at a time, and then the end; until it no longer listens."""
+        assert self.process.stdin is not None
+        try:
+            for begin in range(0, len(lines), PART):
+                self.process.stdin.write(b"".join(lines[begin : begin + PART]))
+                self.process.stdin.flush()
+                sleep(PAUSE)
+            self.process.stdin.close()
+        except BrokenPipeError:
+            return
+
+    def end(self) -> int:
+        """Wait for its end; its exit code."""
+        code = self.process.wait()
+        self._reader.join()
+        return code
+
+
+def killed(count: int, seed: int, folder: Path) -> dict[str, Any]:
+    """What became of a service that was killed so often."""
+    chance, sent = random.Random(seed), messages(seed)
+    network, store = folder / "network.py", folder / "killed.db"
+    network.write_text(NETWORK)
+    told, differently = dict[int, dict[str, Any]](), 0
+    for kill in range(count + 1):
+        running = Running(network, store)
+        writer = Thread(target=running.write, args=(sent,))
+        writer.start()
+        if kill < count:
+            while not running.told:  # before the first answer there is nothing to lose
+                sleep(PAUSE)
+            sleep(chance.uniform(0, PAUSE * len(sent) / PART))
+            running.process.send_signal(signal.SIGKILL)
+        writer.join()
+        code = running.end()
+        for one in running.told:
+            if "id" in one:
+                differently += told.setdefault(one["id"], one) != one
+    found = compared(network, store, sent, told)
+    return {"kills": count, "messages": len(sent), "exit_code": code, "told_differently": differently, **found}
+
+
+def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict[str, Any]]) -> dict[str, Any]:
+    """The store against that of a service that was never disturbed, and what was read against the journal."""
+    fleet = Fleet(Lanes(load_network(str(network))), Options(WINDOW))
+    mine = identity(fleet)
+    calm = Service(fleet, Store(str(store.with_name("calm.db")), mine))
+    calm.take(sent)
+    names, both = [f"p{i}" for i in range(PLANTS)], []
+    for place in (calm.store, Store(str(store), mine)):
+        assert isinstance(place, Store)
+        plants = {name: plant_from(name, kept.body, fleet) for name, kept in place.load(names).items()}
+        for plant in plants.values():
+            plant.links = {}  # what came again was counted
+        with place._engine.connect() as connection:
+            rows = {row.id: json.loads(row.body) for row in connection.execute(JOURNAL.select()).all()}
+        finals = sorted(
+            (one["plant"], one["time"], one["estimates"]) for one in rows.values() if one["kind"] == "final"
+        )
+        both.append(({name: plant_bytes(plant, fleet) for name, plant in plants.items()}, finals))
+    (states, finals), (killed_states, killed_finals) = both
+    moments = [(plant, time) for plant, time, _ in killed_finals]
+    return {
+        "states_identical": states == killed_states,
+        "finals": len(finals),
+        "finals_identical": finals == killed_finals,
+        "counted_twice": len(moments) - len(set(moments)),
+        "lost": sum(number not in told for number in rows),
+        "told_and_not_kept": sum(rows.get(number) != one for number, one in told.items()),
+    }
+
+
+def sound(found: dict[str, Any]) -> bool:
+    """Whether nothing changed."""
+    clean = all(
+        found[name] == 0 for name in ("exit_code", "told_differently", "counted_twice", "lost", "told_and_not_kept")
+    )
+    return clean and found["states_identical"] and found["finals_identical"] and found["finals"] > 0
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as folder:
+        result = killed(int(sys.argv[1]) if len(sys.argv) > 1 else 50, 0, Path(folder))
+    print(json.dumps(result))
+    sys.exit(not sound(result))
