@@ -27,7 +27,8 @@ test: .venv/.test  ## Lint, check types and run the tests
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
 	@$(BIN)/python benchmarks/run.py
 
-soak: .venv/.test  ## Try ten thousand random networks (an hour or more; goes on where it was stopped)
+soak: .venv/.test  ## Kill a service fifty times; try ten thousand random networks (an hour or more; goes on where stopped)
+	@$(BIN)/python benchmarks/kills.py
 	@$(BIN)/python benchmarks/soak.py
 
 clean:  ## Remove the environment and everything made by the other targets

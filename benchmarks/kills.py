@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from threading import Thread
 from time import sleep
@@ -23,7 +24,7 @@ from heliograph.serving.identity import identity
 from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
-from heliograph.serving.store import JOURNAL, Store
+from heliograph.serving.store import Store
 
 NETWORK = """
 import jax.numpy as jnp
@@ -83,8 +84,12 @@ class Running:
 
     def end(self) -> int:
         """Wait for its end; its exit code."""
+        assert self.process.stdin is not None and self.process.stdout is not None
         code = self.process.wait()
         self._reader.join()
+        self.process.stdout.close()
+        with suppress(BrokenPipeError):
+            self.process.stdin.close()
         return code
 
 
@@ -124,11 +129,11 @@ def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict
         plants = {name: plant_from(name, kept.body, fleet) for name, kept in place.load(names).items()}
         for plant in plants.values():
             plant.links = {}  # what came again was counted
-        with place._engine.connect() as connection:
-            rows = {row.id: json.loads(row.body) for row in connection.execute(JOURNAL.select()).all()}
+        rows = {each.number: json.loads(each.body) for each in place.entries()}
         finals = sorted(
             (one["plant"], one["time"], one["estimates"]) for one in rows.values() if one["kind"] == "final"
         )
+        place.close()
         both.append(({name: plant_bytes(plant, fleet) for name, plant in plants.items()}, finals))
     (states, finals), (killed_states, killed_finals) = both
     moments = [(plant, time) for plant, time, _ in killed_finals]

@@ -167,3 +167,31 @@ def test_streams_of_one_filter_share_what_they_do_not_change():
 def test_what_is_no_filter_makes_no_stream():
     with pytest.raises(ValueError, match="stream: expected a filter, got LinearPlant"):
         hg.Stream(PLANT)
+
+
+def test_a_stream_that_was_saved_goes_on_with_the_same_bits():
+    filter_ = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
+    z = np.random.default_rng(0).normal(size=(6, 2))
+    one = hg.Stream(filter_)
+    for row in z[:3]:
+        one.push(row, [0.1])
+    other = hg.Stream.restore(filter_, one.save())
+    assert other.steps == 3
+    for row in z[3:]:
+        a, b = one.push(row, [0.1]), other.push(row, [0.1])
+        assert np.array_equal(a.mean, b.mean) and np.array_equal(a.covariance, b.covariance)
+
+
+def test_the_snapshot_of_another_filter_is_refused_with_what_differs():
+    data = hg.Stream(hg.linear_filter(PLANT, SENSOR, hg.perfect(2))).save()
+    same = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
+    hg.Stream.restore(same, data)  # equal is the same
+    for other, what in (
+        (hg.linear_filter(PLANT, hg.LinearSensor(np.eye(2), 0.6), hg.perfect(2)), r"\(numbers: \w+\)"),
+        (hg.linear_filter(PLANT, ROW, hg.perfect()), "numbers heard: 1"),
+        (hg.cubature_filter(PLANT, SENSOR, hg.perfect(2)), "filter: "),
+    ):
+        with pytest.raises(ValueError, match=what):
+            hg.Stream.restore(other, data)
+    with pytest.raises(ValueError, match="what save returned"):
+        hg.Stream.restore(same, data[:-9])

@@ -8,7 +8,7 @@ import pytest
 from heliograph.serving.identity import identity
 from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.service import Service
-from heliograph.serving.store import JOURNAL, Store
+from heliograph.serving.store import Store
 from tests.serving.worlds import fleet, lines, messages, moving, stepping
 
 
@@ -39,10 +39,9 @@ class Dying(Store):
 
 def journal(store):
     """What was told once, by plant and time or reason, without its number; a refusal may come again with a message."""
-    with store._engine.connect() as connection:
-        rows = connection.execute(JOURNAL.select().order_by(JOURNAL.c.id)).all()
-    assert [row.id for row in rows] == list(range(1, len(rows) + 1))
-    return [{k: v for k, v in json.loads(row.body).items() if k != "id"} for row in rows if row.kind == "final"]
+    told = store.entries()
+    assert [one.number for one in told] == list(range(1, len(told) + 1))
+    return [{k: v for k, v in json.loads(one.body).items() if k != "id"} for one in told if one.kind == "final"]
 
 
 def by_plant(told):
@@ -122,8 +121,7 @@ def test_the_journal_is_bounded(tmp_path):
     service = Service(fleet(stepping()), Store(str(tmp_path / "a.db"), {}, journal=10))
     for line in lines(messages(1, 60, seed=8, whole=True)):
         service.take([line])
-    with service.store._engine.connect() as connection:
-        assert len(connection.execute(JOURNAL.select()).all()) == 10
+    assert len(service.store.entries()) == 10
 
 
 def test_the_state_of_something_else_is_refused(tmp_path):

@@ -10,6 +10,7 @@ from heliograph.cli.app import app
 from heliograph.cli.completion import completion
 from heliograph.cli.example import demo, example
 from heliograph.cli.new import new
+from heliograph.cli.replay import replay
 from heliograph.cli.reproduce import reproduce
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
@@ -20,7 +21,7 @@ from heliograph.simulation.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
-for one in (new, run, serve, demo, example, reproduce, sweep, completion):  # in the order of the help
+for one in (new, run, serve, replay, demo, example, reproduce, sweep, completion):  # in the order of the help
     app.command(one)
 
 

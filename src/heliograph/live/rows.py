@@ -16,7 +16,8 @@ class HeldRow:
     """A row of the tape: its slot there, its numbers (all that nodes heard, inputs given, time), and its events."""
 
     def __init__(self, key: Key, slot: int, size: int):
-        self.key, self.slot, self.numbers = key, slot, np.full(size + 1, np.nan)
+        self.key, self.slot, self.numbers = key, slot, np.empty(size + 1)
+        self.numbers.fill(np.nan)
         self.numbers[-1] = key[0]
         self.events: dict[tuple[int, int, float], Float[np.ndarray, " size"]] = {}
 
@@ -55,6 +56,8 @@ class Rows:
         """The verdict on an event, once this is the watermark."""
         if event.time > event.arrival + ahead:
             return "future"
+        if self.key(event) > self.keys[-1]:  # as most are: nothing can be said against what is newest
+            return "used"
         base = self.settle(watermark)[0]
         place, row = self.find(event)
         held = None if row is None else row.events.get(event.name)
@@ -70,8 +73,10 @@ class Rows:
     def find(self, event: Known) -> tuple[int, HeldRow | None]:
         """Where the event's row stands, and the row, if there is one."""
         key = self.key(event)
+        if key > self.keys[-1]:
+            return len(self.keys), None
         place = bisect_left(self.keys, key)
-        there = place < len(self.keys) and self.keys[place] == key
+        there = self.keys[place] == key
         return place, self.held[place] if there else None
 
     def insert(self, place: int, row: HeldRow) -> None:

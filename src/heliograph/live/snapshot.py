@@ -33,7 +33,7 @@ def unpacked(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
             arrays = {name: file[name] for name in file.files}
         return json.loads(arrays.pop(HEAD).tobytes()), arrays
     except (BadZipFile, ValueError, KeyError, OSError, EOFError, TypeError):
-        raise fail("snapshot", "what Timeline.save returned", shown(data)) from None
+        raise fail("snapshot", "what save returned", shown(data)) from None
 
 
 def row_arrays(rows: Sequence[HeldRow]) -> dict[str, np.ndarray]:

@@ -1,6 +1,5 @@
 """One filter on live data: push a measurement, read the estimate."""
 
-from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 from weakref import WeakValueDictionary
@@ -10,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.live.identity import Identity, check_same, short_name, versions
 from heliograph.live.mould import Mould, cast
+from heliograph.live.snapshot import packed, unpacked
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, PyTree
-
-Program = Callable[..., tuple[PyTree, list[jax.Array]]]
 
 
 @readable
@@ -56,6 +55,26 @@ class Stream:
         result: Estimate = placed.estimate.unflatten([np.asarray(leaf) for leaf in told])
         return result
 
+    def save(self) -> bytes:
+        """State and steps, for `restore`: after it, the same pushes give the same bits."""
+        leaves = {f"state.{i}": leaf for i, leaf in enumerate(jax.tree.leaves(to_numpy(self._state)))}
+        return packed({"steps": self.steps, "of": self._placed.identity()}, leaves)
+
+    @classmethod
+    def restore(cls, filter_: AbstractFilter, data: bytes) -> "Stream":
+        """The stream that was saved, of the same filter.
+
+        Raises:
+            ValueError: bytes that `save` did not return; the state of another filter, version or precision.
+        """
+        new, (head, arrays) = cls(filter_), unpacked(data)
+        check_same("snapshot", new._placed.identity(), head.get("of", {}))
+        new.steps = int(head["steps"])
+        leaves, structure = jax.tree.flatten(new._state)
+        with jax.enable_x64(True):
+            new._state = jax.tree.unflatten(structure, [jnp.array(arrays[f"state.{i}"]) for i in range(len(leaves))])
+        return new
+
     def __getstate__(self) -> dict[str, Any]:
         """Filter, steps and state, in double precision wherever it is read: what is compiled is no part of it."""
         return {"filter": self.filter, "steps": self.steps, "_state": to_numpy(self._state)}
@@ -74,7 +93,24 @@ class _Placed:
             self.numbers, mould = cast(filter_)
             self.run = _program(mould)
             self.start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
+        self._like = np.zeros(filter_.received), np.zeros(len(filter_.inputs)), np.asarray(0)
         self.estimate: Any = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
+
+    def identity(self) -> Identity:
+        """Versions, names, numbers, and what a step computes, which counts for functions."""
+        with jax.enable_x64(True):
+            text = self.run.lower(self.numbers, self.start, *self._like).as_text()
+        item = self.filter
+        return {
+            **versions(),
+            "precision": ", ".join(sorted({str(leaf.dtype) for leaf in self.numbers})),
+            "filter": type(item).__name__,
+            "states": ", ".join(item.states),
+            "inputs": ", ".join(item.inputs),
+            "numbers heard": str(item.received),
+            "numbers": short_name(self.numbers),
+            "what is computed": short_name(text),
+        }
 
 
 _SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id of a filter, which its entry keeps
@@ -88,7 +124,7 @@ def _place(filter_: AbstractFilter) -> _Placed:
 
 
 @lru_cache
-def _program(mould: Mould) -> Program:
+def _program(mould: Mould) -> Any:
     """One step of every filter that differs in numbers alone."""
 
     def step(

@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.model.over_time import steps_covered
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
 from heliograph.serving.pool import Pool
@@ -47,7 +47,7 @@ class Fleet:
 
     def __init__(self, lanes: Lanes, options: Options):
         network = self.network = lanes.network
-        self.options, self.lanes = options, lanes
+        self.options, self.lanes = _checked(options), lanes
         self.pool = Pool(lanes)
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self.lanes.given
@@ -128,6 +128,12 @@ class Fleet:
         """Give slots back, once what was told there is read."""
         for each in settled:
             self.pool.give(each.left)
+
+
+def _checked(options: Options) -> Options:
+    leap = options.leap if options.leap == np.inf else scalar("leap", options.leap, 0)
+    window, ahead = (float(scalar(name, getattr(options, name), 0)) for name in ("window", "ahead"))
+    return Options(window, ahead, float(leap), check_count("capacity", options.capacity))
 
 
 Round = tuple[list[int], list[int], list[float]]  # slots to step from, slots to step into, and the number of the step

@@ -1,17 +1,8 @@
 """What a network is to whoever kept its state: a state goes on only where everything computes as it did."""
 
-from collections.abc import Mapping
-from hashlib import sha256
-
-import jax
-import numpy as np
-
-import heliograph
-from heliograph.numerics.check import fail
+from heliograph.live.identity import Identity, short_name, versions
 from heliograph.numerics.types import PyTree
 from heliograph.serving.fleet import Fleet
-
-Identity = dict[str, str]
 
 
 def identity(fleet: Fleet) -> Identity:
@@ -23,38 +14,14 @@ def identity(fleet: Fleet) -> Identity:
     parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
     parts |= {f"fusion {name!r}": item for name, item in network.fused.items()}
     return {
-        "heliograph": heliograph.__version__,
-        "jax": jax.__version__,
+        **versions(),
         "precision": "single" if network.single else "double",
         "states": ", ".join(network.states),
         "inputs": ", ".join(network.inputs),
         "nodes": ", ".join(f"{name} ({node.received} heard)" for name, node in network.nodes.items()),
         "filters": ", ".join(f"{place.node}/{place.filter}" for place in lanes.places),
         **{f"option {name}": f"{value!r}" for name, value in fleet.options._asdict().items()},
-        "numbers of the plant": _numbers(network.plant),
-        **{f"numbers of {name}": _numbers(part) for name, part in parts.items()},
-        "what is computed": sha256(lanes.program().encode()).hexdigest()[:16],
+        "numbers of the plant": short_name(network.plant),
+        **{f"numbers of {name}": short_name(part) for name, part in parts.items()},
+        "what is computed": short_name(lanes.program()),
     }
-
-
-def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> None:
-    """Refuse what was kept of something else, and say in what it differs.
-
-    Raises:
-        ValueError: anything that differs.
-    """
-    names = [name for name in {**mine, **other} if mine.get(name) != other.get(name)]
-    if names:
-        here = "; ".join(f"{name}: {mine.get(name, 'none')}" for name in names)
-        there = "; ".join(f"{name}: {other.get(name, 'none')}" for name in names)
-        raise fail(what, f"the state of this network as it is here ({here})", f"one that differs ({there})")
-
-
-def _numbers(part: PyTree) -> str:
-    """A short name of all arrays in a part."""
-    found = sha256()
-    for leaf in jax.tree.leaves(part):
-        if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
-            array = np.asarray(leaf)
-            found.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
-    return found.hexdigest()[:16]

@@ -2,7 +2,6 @@
 
 import json
 import struct
-from dataclasses import astuple
 from datetime import datetime
 
 import numpy as np
@@ -19,7 +18,7 @@ def plant_bytes(plant: Plant, fleet: Fleet) -> bytes:
     """All that is held of a plant that was settled: a head of JSON, whole numbers, doubles."""
     rows = plant.rows.held
     origin = None if plant.origin is None else plant.origin.isoformat()
-    links = {node: astuple(link) for node, link in plant.links.items()}
+    links = {node: list(vars(link).values()) for node, link in plant.links.items()}
     head = to_json({"now": plant.now, "forced": plant.forced, "origin": origin, "links": links})
     events = [(i, name, values) for i, row in enumerate(rows) for name, values in row.events.items()]
     whole = [number for row in rows for number in row.key[1:]]

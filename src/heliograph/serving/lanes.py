@@ -16,6 +16,7 @@ from heliograph.live.mould import Mould, cast
 from heliograph.live.player import player
 from heliograph.live.tape import Ears
 from heliograph.model.estimate import Claim
+from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.small_matrix import runs_last, squared_distance
 from heliograph.numerics.types import Float, PyTree
@@ -47,6 +48,8 @@ class Lanes:
     """
 
     def __init__(self, network: Network):
+        if not any(network.claims().values()):
+            raise fail("network", "at least one filter to run", "none")
         shared = player(network)
         self.network, self.dt, self.uneven = network, shared.dt, shared.uneven
         self.received, self.given, self.inputs = shared.received, shared.given, len(network.inputs)

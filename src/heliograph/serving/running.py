@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -55,8 +56,11 @@ class Wanted:
 
 async def run(wanted: Wanted) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
-    lanes = Lanes(wanted.network)
     async with _watched(wanted) as look:
+        lanes = Lanes(wanted.network)
+        if lanes.uneven:
+            what = f"predictions depend on when others are asked for: {lanes.uneven}"
+            print(f"heliograph: warning: {what}", file=sys.stderr)
         if wanted.parts is None:
             await _alone(wanted, lanes, look)
         else:

@@ -1,7 +1,9 @@
 """The service: batches of messages in, what is to be told out; all that it knows is committed in between."""
 
+import gc
 from collections import OrderedDict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime, time, timedelta
 from time import perf_counter
 from typing import Any, NamedTuple
@@ -52,6 +54,10 @@ class Service:
 
         Nothing in a message stops the service: what cannot be used is counted and told, with the reason.
         """
+        with _without_collection():
+            return self._take(payloads)
+
+    def _take(self, payloads: Sequence[bytes]) -> list[Output]:
         begun = perf_counter()
         messages = [_read(payload) for payload in payloads]
         self._load({message.plant for message in messages if isinstance(message, Message)})
@@ -173,6 +179,18 @@ class Service:
     def _estimates(self, kind: str, plant: Plant, at: float, told: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
         return self._teller.estimates(kind, plant.name, moment, told)
+
+
+@contextmanager
+def _without_collection() -> Iterator[None]:
+    """A batch makes many objects and no cycles: searching for some would take half of its time."""
+    before = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if before:
+            gc.enable()
 
 
 def _read(payload: bytes) -> Message | str:

@@ -23,28 +23,28 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError, DBAPIError
 
-from heliograph.numerics.check import fail
-from heliograph.serving.identity import Identity, check_same
+from heliograph.live.identity import Identity, check_same
+from heliograph.numerics.check import InputError, fail
 from heliograph.serving.keeping import ConflictError, Entry, Kept
 from heliograph.serving.output import Output
 
 TABLES = MetaData()
 PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
                Column("body", LargeBinary))  # fmt: skip
-JOURNAL = Table("journal", TABLES, Column("id", BigInteger, primary_key=True, autoincrement=False),
-                Column("process", String(200)), Column("plant", String(200)), Column("kind", String(20)),
-                Column("body", Text))  # fmt: skip
+JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, autoincrement=False),
+                Column("process", String(200)), Column("lines", Text))  # fmt: skip
 NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger))
 WHOSE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
 TOLD, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
+IDENTITY = "identity"
 AT_ONCE = 500  # names in one question
 
 
 class Store:
     """Plants and the journal in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
 
-    The journal keeps the last `journal` entries. Where a plant was committed by another process since it was read,
-    nothing is committed.
+    The journal keeps the last `journal` entries and some more. Where a plant was committed by another process since it
+    was read, nothing is committed.
 
     Raises:
         ValueError: a place that cannot be opened; the state of another network, version or precision.
@@ -58,15 +58,23 @@ class Store:
         self._engine = _engine(self.url)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
         try:
-            TABLES.create_all(self._engine)
-            with self._engine.begin() as connection:
-                found = dict(connection.execute(select(WHOSE.c.name, WHOSE.c.value)).all())
-                if not found:
-                    connection.execute(self._insert(WHOSE), [{"name": "identity", "value": json.dumps(mine)}])
+            check_same(f"store {self.name}", mine, self._whose(mine))
         except DBAPIError as error:
+            self.close()
             raise fail(f"store {self.name}", "a database that can be written", str(error.orig)) from None
-        if found:
-            check_same(f"store {self.name}", mine, json.loads(found["identity"]))
+        except InputError:
+            self.close()
+            raise
+
+    def _whose(self, mine: Identity) -> Identity:
+        """What the store is of: of this network, if it is new."""
+        TABLES.create_all(self._engine)
+        with self._engine.begin() as connection:
+            kept = connection.execute(select(WHOSE.c.value).where(WHOSE.c.name == IDENTITY)).scalar()
+            if kept is None:
+                connection.execute(self._insert(WHOSE), [{"name": IDENTITY, "value": json.dumps(mine)}])
+        found: Identity = mine if kept is None else json.loads(kept)
+        return found
 
     @property
     def name(self) -> str:
@@ -98,10 +106,9 @@ class Store:
                 rows = [{"name": n, "version": kept.version + 1, "body": kept.body} for n, kept in plants.items()]
                 self._put(connection, PLANTS, rows)
             if outputs:
-                connection.execute(JOURNAL.insert(), [
-                    {"id": each.number, "process": self.process, "plant": each.plant, "kind": each.kind,
-                     "body": each.body.decode()} for each in outputs])  # fmt: skip
-                connection.execute(delete(JOURNAL).where(JOURNAL.c.id <= newest - self.journal))
+                lines = b"\n".join([each.body for each in outputs]).decode()
+                connection.execute(JOURNAL.insert(), [{"last": newest, "process": self.process, "lines": lines}])
+                connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
             if malformed:
                 self._count(connection, MALFORMED, malformed)
             if told is not None:
@@ -110,11 +117,17 @@ class Store:
 
     def untold(self) -> list[Output]:
         """What this process committed and may not have told."""
+        told = self.number(TOLD.format(self.process))
+        return [each for each in self.entries(told, self.process) if each.number is not None and each.number > told]
+
+    def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
+        """What the journal keeps from the batch on that has number `after` + 1; of one process, or of all."""
+        wanted = JOURNAL.c.last > after
+        if process is not None:
+            wanted &= JOURNAL.c.process == process
         with self._engine.connect() as connection:
-            after = self.number(TOLD.format(self.process))
-            mine = (JOURNAL.c.id > after) & (JOURNAL.c.process == self.process)
-            rows = connection.execute(select(JOURNAL).where(mine).order_by(JOURNAL.c.id)).all()
-        return [Output(row.id, row.plant, row.kind, row.body.encode()) for row in rows]
+            found = connection.execute(select(JOURNAL.c.lines).where(wanted).order_by(JOURNAL.c.last)).scalars().all()
+        return [_output(line) for lines in found for line in lines.split("\n")]
 
     def number(self, name: str) -> int:
         """A count that is kept."""
@@ -163,6 +176,11 @@ def _of(connection: Connection, columns: Sequence[Column[Any]], names: list[str]
 def engine_at(place: str) -> Engine:
     """The database of a store."""
     return _engine(_url(place))
+
+
+def _output(line: str) -> Output:
+    parts = json.loads(line)
+    return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())
 
 
 def _url(place: str) -> URL:

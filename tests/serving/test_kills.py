@@ -1,0 +1,18 @@
+"""A real process, killed with -9 while it works: what `make soak` does fifty times."""
+
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")
+
+
+def test_a_killed_service_loses_nothing_and_counts_nothing_twice(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(FOLDER)
+    import kills
+
+    found = kills.killed(2, 1, tmp_path)
+    assert kills.sound(found), found
+    for name, wrong in (("lost", 1), ("finals_identical", False), ("exit_code", 2)):
+        assert not kills.sound(found | {name: wrong})
