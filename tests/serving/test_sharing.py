@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip("nats")
 pytest.importorskip("sqlalchemy")
 import nats
+from sqlalchemy import Engine
 
 import heliograph
 from heliograph.examples.live.server import Server
@@ -32,7 +33,11 @@ NETWORK = "from tests.serving.worlds import stepping\nnetwork = stepping()\n"
 
 
 def test_processes_share_evenly_and_take_over_what_nobody_renews(tmp_path):
-    engine = engine_at(str(tmp_path / "store.sqlite"))
+    shared(engine_at(str(tmp_path / "store.sqlite")))
+
+
+def shared(engine: Engine) -> None:
+    """Three processes join, leave and die."""
     one, two, three = (Leases(engine, name, 5, term=0.5) for name in ("one", "two", "three"))
     assert one.renew() == {0, 1, 2, 3, 4}
     assert two.renew() == set() and one.renew() == {0, 1, 2}  # one still works at 3 and 4, until it says that it left
@@ -46,6 +51,7 @@ def test_processes_share_evenly_and_take_over_what_nobody_renews(tmp_path):
     time.sleep(0.6)  # one and three died
     two.release(0)  # what is not one's own stays
     assert two.renew() == {0, 1, 2, 3, 4} and one.renew() == set()
+    engine.dispose()
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts
 
 
 class Leases:
-    """A process's share of `parts`: as many as of each other that lives, and one more at most.
+    """A process's share of `parts`: all that live have as many, or one more.
 
     A lease makes it likely that one process reads a part at a time, which keeps messages in order; that no message is
     used twice does not rest on it, nor on clocks: a plant's commit fails if another was made since it was read.
@@ -37,13 +37,12 @@ class Leases:
         """Say that this process lives, and lease its parts anew: those that it keeps and those that nobody has."""
         with self.engine.begin() as connection:
             now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
-            alive = self._alive(connection, now)
+            fair = self._fair(connection, now)
             leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
             held = [(row.number, row.process) for row in connection.execute(leased)]
             mine = [number for number, process in sorted(held) if process == self.process]
             taken = {number for number, _ in held}
             free = [number for number in range(self.parts) if number not in taken]
-            fair = -(-self.parts // alive)
             wanted = (mine + free)[:fair]
             return {number for number in wanted if self._lease(connection, number, now)}
 
@@ -58,12 +57,14 @@ class Leases:
             connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
             connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
 
-    def _alive(self, connection: Connection, now: float) -> int:
-        """How many processes live, this one among them."""
+    def _fair(self, connection: Connection, now: float) -> int:
+        """How many parts are this process's, which lives; those left over are the first ones' by name."""
         connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
-        return len(connection.execute(select(PROCESSES.c.name)).all())
+        alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
+        each, over = divmod(self.parts, len(alive))
+        return each + (alive.index(self.process) < over)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
         """Whether the part is ours: it was, or its lease was over."""

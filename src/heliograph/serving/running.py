@@ -130,4 +130,8 @@ async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:
             kept.close()
 
     name = wanted.process or f"{socket.gethostname()} {os.getpid()}"
-    await keep_sharing(Leases(engine_at(place), name, parts), serve)
+    engine = engine_at(place)
+    try:
+        await keep_sharing(Leases(engine, name, parts), serve)
+    finally:
+        engine.dispose()
