@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import shutil
+import subprocess
 from collections.abc import Awaitable, Callable, Iterator
 
 import pytest
@@ -183,6 +185,63 @@ def test_a_session_keeps_what_was_not_acknowledged(server: Server):
         await second.close()
 
     asyncio.run(work())
+
+
+def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
+    async def work() -> None:
+        where = at(server, "mqtt", "parted")
+        readers = [Mqtt(where, Part(i, 2)) for i in range(2)]
+        await asyncio.sleep(0.5)
+        for plant in ("a", "b", "c", "d"):
+            below = f"{part_of(plant, 2)}/{word(plant)}"
+            await asyncio.to_thread(published, where, [plant.encode()], below)
+        for i, reader in enumerate(readers):
+            mine = [plant for plant in "abcd" if part_of(plant, 2) == i]
+            assert mine and [body.decode() for body in await received(reader, len(mine))] == mine
+        await asyncio.gather(*[reader.close() for reader in readers])
+
+    asyncio.run(work())
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate")
+@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho leaves sockets to the collector
+def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog):
+    make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
+    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    what = ["-subj", "/CN=here", "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate]
+    subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", *what], check=True, capture_output=True)
+    tls = f'tls {{ cert_file: "{certificate}", key_file: "{key}" }}\n'
+    server = Server(tmp_path)
+    text = server.file.read_text().replace("mqtt {", f"mqtt {{ {tls}")
+    server.file.write_text(f'{text}{tls}authorization {{ user: me, password: "s3cret word" }}\n')
+    server.start()
+    scheme = "nats+tls" if kind == "nats" else "mqtts"
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    where = f"{scheme}://127.0.0.1:{getattr(server, kind)}/safe"
+    outputs = [Output(i, "", "final", str(i).encode()) for i in range(3)]
+
+    async def told(url: str, environment: dict[str, str]) -> bool:
+        transport = make(address(url, environment))
+        try:
+            await asyncio.wait_for(transport.publish(outputs), 3)
+        except TimeoutError:
+            return False
+        finally:
+            await transport.close()
+        return True
+
+    who = {"HELIOGRAPH_BROKER_USER": "me", "HELIOGRAPH_BROKER_PASSWORD": "s3cret word"}
+    try:
+        with caplog.at_level(logging.DEBUG):
+            assert asyncio.run(told(where, who))
+            assert asyncio.run(told(where.replace("://", "://me:s3cret%20word@"), {}))
+            assert not asyncio.run(told(where, who | {"HELIOGRAPH_BROKER_PASSWORD": "s3cret"}))
+            monkeypatch.delenv("SSL_CERT_FILE")  # nobody vouches for it now
+            assert not asyncio.run(told(where, who))
+    finally:
+        server.kill()
+    assert "trying again" in caplog.text and "s3cret" not in caplog.text
 
 
 @pytest.mark.parametrize("kind", ["nats", "mqtt"])

@@ -54,6 +54,7 @@ class _Connection:
             CallbackAPIVersion.VERSION2, identity, clean_session=not session, protocol=MQTTv311, manual_ack=session
         )
         client.on_connect, client.on_disconnect = self.connected, self.disconnected
+        client.on_connect_fail = self.failed
         client.max_inflight_messages_set(MOST)
         client.reconnect_delay_set(1, int(LONGEST))
         if address.user is not None:
@@ -75,6 +76,11 @@ class _Connection:
     ) -> None:
         if self.open:
             LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
+
+    def failed(self, client: Client, data: object) -> None:
+        """Nobody answers there, or nobody who is trusted."""
+        if self.open:
+            LOG.warning("%s: no connection; trying again", self.address)
 
     def close(self) -> None:
         with self.room:

@@ -9,8 +9,8 @@ from heliograph.examples.live.killed import WINDOW
 from heliograph.report.figures import BLUE, GREEN, VERMILION, Curve, paths
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
-COMMAND = """heliograph serve heliograph.examples.live.mower:network --window 10 --store mower.sqlite \\
-    --broker nats://127.0.0.1:4222/live --page 8000"""
+COMMAND = """heliograph serve heliograph.examples.live.mower:network --window 10 \\
+    --store mower.sqlite --broker nats://127.0.0.1:4222/live --page 8000"""
 
 
 def live_figures(outcome: Outcome) -> dict[str, Figure]:
