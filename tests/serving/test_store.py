@@ -53,7 +53,7 @@ def states(service):
     found = {}
     for name, kept in service.store.load([f"p{i}" for i in range(4)]).items():
         plant = plant_from(name, kept.body, service.fleet)
-        plant.links = {}
+        plant.links, plant.forced = {}, 0
         found[name] = plant_bytes(plant, service.fleet)
     return found
 

@@ -53,6 +53,7 @@ class Fleet:
         self._sizes[INPUTS] = -1, self.lanes.given
         sizes = [size for _, size in self._sizes.values()]
         self._places = [slice(int(end) - size, int(end)) for end, size in zip(np.cumsum(sizes), sizes, strict=True)]
+        self._width = self._places[-1].stop
         covered = steps_covered(network)
         self._end = np.inf if covered is None else covered - 1
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
@@ -63,7 +64,7 @@ class Fleet:
         begun = -1.0 if self.lanes.dt is None else time
         slot = self.pool.take()
         self.pool.start(slot, begun)
-        base = HeldRow((begun, BEFORE, 0), slot, self._places[-1].stop)
+        base = HeldRow((begun, BEFORE, 0), slot, self._width)
         base.numbers[-1] = begun
         return Plant(name, self.rows(base), time if self.lanes.dt is not None else 0.0, origin)
 
@@ -100,15 +101,21 @@ class Fleet:
         """Judge an event and hold it if it is used."""
         if event.time > plant.now + self._leap:
             return "future"
-        verdict = plant.judge(event, self.options.window, self.options.ahead)
-        if verdict == "used":
-            slot = self.pool.take()
-            if not plant.use(event, self.options.window, slot):
-                self.pool.give([slot])
+        rows, now = plant.rows, max(plant.now, event.arrival)
+        verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
+        if verdict != "used":
+            return verdict
+        place, row = rows.find(event)
+        if row is None:
+            row = HeldRow(rows.key(event), self.pool.take(), self._width)
+            rows.insert(place, row)
+        rows.fill(row, event)
+        plant.dirty = place if plant.dirty is None else min(plant.dirty, place)
+        plant.now = now
         return verdict
 
-    def settle(self, touched: Iterable[Plant]) -> list[Settled]:
-        """Step what is due, and let what is older than the window become final."""
+    def settle(self, touched: Iterable[Plant], all_: bool = False) -> list[Settled]:
+        """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
         chains = [chain for plant in plants if (chain := plant.chain())]
         for chain in chains:
@@ -116,7 +123,8 @@ class Fleet:
             self.pool.table[slots, self.pool.numbers] = np.array([row.numbers for row in chain])
         for before, after, at in _rounds(chains, self.lanes.dt is None):
             self.pool.step(np.array(before), np.array(after), np.array(at))
-        ends = [(plant, *plant.settle()) for plant in plants]
+        back = -np.inf if all_ else self.options.window
+        ends = [(plant, *plant.settle(plant.now - back)) for plant in plants]
         return [Settled(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
 
     def told(self, slots: list[int]) -> list[list[float]]:

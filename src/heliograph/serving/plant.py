@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from datetime import datetime
 
-from heliograph.live.event import Known, Verdict
+from heliograph.live.event import Verdict
 from heliograph.live.rows import HeldRow, Rows
 
 REBOOT = 1000  # a number that falls by more, or to 0, begins anew: the node was started again
@@ -38,7 +38,7 @@ class Link:
 
 @dataclass
 class Plant:
-    """Rows held, of which those from `dirty` on have to be stepped anew and those before `base` are final.
+    """Rows held, of which those from `dirty` on have to be stepped anew.
 
     `now` is the newest arrival; `forced`: rows that became final before their time, for want of room. `origin`: the
     moment that its times are counted from, where they are dates. `version` counts its commits.
@@ -49,7 +49,6 @@ class Plant:
     now: float
     origin: datetime | None = None
     version: int = 0
-    base: int = 0
     dirty: int | None = None
     forced: int = 0
     links: dict[str, Link] = field(default_factory=dict)
@@ -61,39 +60,17 @@ class Plant:
             found = self.links[node] = Link()
         return found
 
-    def judge(self, event: Known, window: float, ahead: float) -> Verdict:
-        """The verdict on an event; its arrival is not yet told to the others."""
-        return self.rows.verdict(event, max(self.now, event.arrival) - window, ahead)
-
-    def use(self, event: Known, window: float, slot: int) -> bool:
-        """Hold an event, in this slot if it makes a row of its own: whether it does."""
-        rows = self.rows
-        place, row = rows.find(event)
-        new = row is None
-        if row is None:
-            row = HeldRow(rows.key(event), slot, rows.places[-1].stop)
-            rows.insert(place, row)
-        rows.fill(row, event)
-        self.dirty = place if self.dirty is None else min(self.dirty, place)
-        self.now = max(self.now, event.arrival)
-        base, forced = rows.settle(self.now - window)
-        self.forced += max(0, base - max(base - forced, self.base))
-        self.base = base
-        return new
-
     def chain(self) -> list[HeldRow]:
         """The rows to step over again, after the one that they begin from."""
         chain = [] if self.dirty is None else self.rows.held[self.dirty - 1 :]
         self.dirty = None
         return chain
 
-    def end(self) -> "Plant":
-        """Have all rows become final."""
-        self.base = len(self.rows.held) - 1
-        return self
-
-    def settle(self) -> tuple[list[HeldRow], list[int]]:
-        """The rows that are final now, and the slots that are not needed any more."""
-        final, left = self.rows.drop(self.base) if self.base else ([], [])
-        self.base = 0
+    def settle(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
+        """The rows that are final once this is the watermark, and the slots that are not needed any more."""
+        base, forced = self.rows.settle(watermark)
+        if not base:
+            return [], []
+        self.forced += forced
+        final, left = self.rows.drop(base)
         return final, [row.slot for row in left]

@@ -80,8 +80,11 @@ class Service:
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
-        settled = self.fleet.settle(plant.end() for plant in self.plants.values() if ended and not self.store.keeps)
-        return self._commit({}, self._finals(settled), 0)
+        last = list(self.plants.values()) if ended and not self.store.keeps else []
+        settled = self.fleet.settle(last, all_=True)
+        entries = self._finals(settled)
+        self.fleet.forget(settled)
+        return self._commit({}, entries, 0)
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
         """Use messages and commit; what is to be told, and how long the commit took."""

@@ -1,0 +1,102 @@
+"""A fleet of plants of the README's network behind one process and behind two, from JSON lines held in memory.
+
+Run: python benchmarks/fleet.py. Microseconds of a step, which here is a message; least over ROUNDS. Where the state is
+kept, every batch is committed to a disk. With two processes, each has half of the plants and a store of its own.
+"""
+
+import json
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from timeline import readme_network
+
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.identity import identity
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.message import read_message
+from heliograph.serving.nowhere import Nowhere
+from heliograph.serving.service import Service
+from heliograph.serving.store import Store
+
+PLANTS, EACH, BATCH, SPACING, WINDOW, ROUNDS = 1000, 60, 8192, 0.5, 5.0, 3
+LIMIT = 20  # 50,000 steps a second, on two cores
+
+
+def lines(plants: int) -> list[bytes]:
+    """Messages of all plants in turn, in order."""
+    z = np.random.default_rng(0).normal(5.0, 1.0, (EACH, plants, 2)).tolist()
+    found = []
+    for i in range(EACH):
+        for plant in range(plants):
+            one = {"plant": f"p{plant}", "node": "cart", "sequence": i, "time": SPACING * i, "values": z[i][plant]}
+            found.append(json.dumps(one).encode())
+    return found
+
+
+def rounds(plants: int, stored: bool) -> tuple[float, float]:
+    """Least seconds of all messages, and those of it that committing took."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        lanes = Lanes(readme_network())
+    sent = lines(plants)
+    Service(Fleet(lanes, Options(WINDOW)), Nowhere()).take(sent[:1])  # compiled
+    found = []
+    for _ in range(ROUNDS):
+        with tempfile.TemporaryDirectory(dir=Path(__file__).parent) as folder:  # on a disk, not in memory
+            fleet = Fleet(lanes, Options(WINDOW))
+            service = Service(fleet, Store(f"{folder}/fleet.db", identity(fleet)) if stored else Nowhere())
+            begun, committed = time.perf_counter(), 0.0
+            for begin in range(0, len(sent), BATCH):
+                service.take(sent[begin : begin + BATCH])
+                committed += service.last.committed
+            found.append((time.perf_counter() - begun, committed))
+            service.store.close()
+    return min(found)
+
+
+def half(_: int) -> float:
+    """One of two processes."""
+    return rounds(PLANTS // 2, True)[0]
+
+
+def least(function: Callable[[], object]) -> float:
+    """Least microseconds of a call a message."""
+    taken = []
+    for _ in range(ROUNDS):
+        begun = time.perf_counter()
+        function()
+        taken.append((time.perf_counter() - begun) * 1e6 / (PLANTS * EACH))
+    return min(taken)
+
+
+def measure() -> dict[str, Any]:
+    """A step in microseconds, and where its time goes."""
+    count = PLANTS * EACH
+    memory, (stored, committed) = rounds(PLANTS, False)[0], rounds(PLANTS, True)
+    sent = lines(PLANTS)
+    with ProcessPoolExecutor(2, get_context("spawn")) as pool:
+        both = max(pool.map(half, range(2)))
+    values = {
+        "one process, nothing kept": memory / count * 1e6,
+        "one process": stored / count * 1e6,
+        "of it committing": committed / count * 1e6,
+        "of it reading JSON": least(lambda: [read_message(line) for line in sent]),
+        "two processes": both / count * 1e6,
+    }
+    return {"unit": "us", "values": values, "at_most": {"two processes": LIMIT}}
+
+
+def main() -> None:
+    for name, value in measure()["values"].items():
+        print(f"{name}: {value:.3g}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,111 @@
+"""The commands of the README and of docs/run_it_live.md that talk through pipes, and what they refuse."""
+
+import json
+import os
+import re
+import shlex
+from contextlib import contextmanager
+from pathlib import Path
+
+from pydantic import TypeAdapter
+
+from heliograph import cli
+from heliograph.serving.message import Message
+from heliograph.serving.output import AnyOutput, Estimates
+from tests.serving.worlds import lines, messages
+
+ROOT = Path(__file__).resolve().parents[2]
+PIPED = re.compile(r"^\$ (heliograph (?:replay|serve).*)$", re.MULTILINE)
+SMALL = """
+import heliograph as hg
+plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5, [[1.0]], inputs=["push"])
+sensor, hop = hg.LinearSensor([[1.0]], 0.1), hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), 0.05)
+node = hg.Node(sensor, hop, {"linear": hg.linear_filter(plant, sensor, hop)})
+network = hg.Network(plant, {"a": node, "b": node}, {"both": hg.Fusion("linear", hg.fusion.EqualIntersection())})
+"""
+
+
+@contextmanager
+def standard(number, path, flags):
+    """A standard file that is another one for a while."""
+    kept, other = os.dup(number), os.open(path, flags, 0o600)
+    os.dup2(other, number)
+    try:
+        yield
+    finally:
+        os.dup2(kept, number)
+        os.close(kept)
+        os.close(other)
+
+
+def piped(command, capfd):
+    """What a line of a shell gives: its parts one after another, each reading what the one before wrote."""
+    command, _, source = command.partition(" < ")
+    source = Path(source or os.devnull)
+    for i, part in enumerate(command.split(" | ")):
+        target = Path(f"piped{i}")
+        with (
+            capfd.disabled(),
+            standard(0, source, os.O_RDONLY),
+            standard(1, target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC),
+        ):
+            assert cli.main(shlex.split(part)[1:]) == 0
+        source = target
+    return [json.loads(line) for line in source.read_text().splitlines()]
+
+
+def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    (command,) = PIPED.findall((ROOT / "README.md").read_text())
+    page = PIPED.findall((ROOT / "docs/run_it_live.md").read_text())
+    assert page[0] == command
+    assert cli.main(["new", "cart.py"]) == 0
+    rows = [f"{k / 10},0.0,0.1,{k / 10 + 0.01 * (k % 7)},{10 - k / 10}" for k in range(200)]
+    Path("data.csv").write_text("\n".join(["time,acceleration,dt,left,right", *rows]))
+    told = piped(command.replace("--speed 10", "--speed 1000"), capfd)
+    reader = TypeAdapter(AnyOutput)
+    for one in told:
+        reader.validate_python(one)
+    finals = [one["time"] for one in told if one["kind"] == "final"]
+    assert finals == sorted(finals)
+    assert len(finals) > 150
+    assert {one["reason"] for one in told if one["kind"] == "refused"} == {"duplicate"}
+    (tmp_path / "messages.jsonl").write_text((tmp_path / "piped0").read_text())
+    again = piped(page[1], capfd)
+    kept = [one["estimates"] for one in again if one["kind"] == "final"]  # of the rest may still change
+    assert kept == [one["estimates"] for one in told if one["kind"] == "final"][: len(kept)] and len(kept) > 50
+
+
+def test_what_serve_and_replay_refuse_is_one_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("net.py").write_text(SMALL)
+    Path("link.csv").write_text("lag\n1.0\n")
+    Path("events.csv").write_text("node,sequence,time,values\na,0,0,1.0\n")
+    for words, what in (
+        (["serve"], "serve: expected a network"),
+        (["serve", "net.py", "--window", "-1"], "window"),
+        (["serve", "net.py", "--from-snapshot", "a.db"], "--store FILE"),
+        (["serve", "net.py", "--store", "b.db", "--from-snapshot", "a.db"], "nothing of that name"),
+        (["replay", "events.csv", "--network", "net.py", "--speed", "0"], "--speed"),
+        (["replay", "events.csv", "--network", "net.py", "--loss", "2"], "loss"),
+        (["replay", "events.csv", "--network", "net.py", "--loss", "0.1", "--trace", "events.csv"], "--trace"),
+        (["replay", "events.csv", "--network", "net.py", "--trace", "link.csv"], "delay"),
+    ):
+        assert cli.main(words) == 2
+        told = capsys.readouterr().err
+        assert told.startswith("heliograph: ") and what in told and told.count("\n") == 1, told
+
+
+def test_the_schema_is_that_of_messages_and_outputs(capsys):
+    assert cli.main(["serve", "--schema"]) == 0
+    schema = json.loads(capsys.readouterr().out)
+    assert set(schema) == {"message", "output"}
+    assert schema["message"]["required"] == ["node", "sequence", "time"]
+    assert set(schema["message"]["properties"]) == set(Message.model_fields)
+    assert set(schema["output"]["$defs"]["Estimates"]["properties"]) == set(Estimates.model_fields)
+    page = (ROOT / "docs/run_it_live.md").read_text()
+    (example,) = re.findall(r"```json\n(.*?)```", page, re.DOTALL)
+    Message.model_validate_json(example)
+    assert {f"`{name}`" for name in Message.model_fields} <= set(re.findall(r"^\| (`\w+`) \|", page, re.MULTILINE))
+    for line in lines(messages(1, 3, 0, whole=True)):
+        Message.model_validate_json(line)
