@@ -63,12 +63,12 @@ class Nats:
             try:
                 messages = await reader.fetch(MOST, WAIT)
             except TimeoutError:
-                if not self._connected():
-                    self._reader = None
-                continue
+                messages = []
             except AWAY as error:
                 self._reader = None
                 await self._retry.wait(error)
+                continue
+            if not messages:  # none came meanwhile, or the connection broke, which `_reading` sees
                 continue
             count = messages[-1].metadata.sequence.consumer
             if count != self._read + len(messages):  # some were lost on the way here

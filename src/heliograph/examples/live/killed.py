@@ -77,20 +77,20 @@ async def killed(
     client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
     try:
         run.start()
-        await _until(partial(_told, client, 0))
+        await run.until(partial(_told, client, 0))
         for kill in range(kills):
             advance(f"killing it, {kill + 1} of {kills}")
             part = slice(len(lines) * kill // (kills + 1), len(lines) * (kill + 1) // (kills + 1))
             sending = asyncio.ensure_future(_send(client, lines[part]))
-            await _until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
+            await run.until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
             await asyncio.sleep(generator.uniform(0, SOON))
             run.kill()
             await sending
             run.start()
         advance("what is left")
         await _send(client, lines[len(lines) * kills // (kills + 1) :])
-        await _until(partial(_told, client, count))
-        await _until(partial(_idle, client))
+        await run.until(partial(_told, client, count))
+        await run.until(partial(_idle, client))
         pictures = await asyncio.to_thread(look, f"http://127.0.0.1:{port}/")
         run.stop()
         bodies = await _everything(client)
@@ -117,6 +117,15 @@ class _Run:
         if self.process is not None:
             self.process.kill()
             self.process.wait()
+
+    async def until(self, holds: Callable[[], Awaitable[bool]]) -> None:
+        """Wait until this holds, while it works."""
+        assert self.process is not None
+        async with asyncio.timeout(PATIENCE):
+            while not await holds():
+                if (code := self.process.poll()) is not None:
+                    raise RuntimeError(f"serve: expected to go on, ended with {code}")
+                await asyncio.sleep(0.02)
 
     def stop(self) -> None:
         """As a system stops it: it ends well."""
@@ -147,12 +156,6 @@ async def _idle(client: Client) -> bool:
     """Whether every message was acknowledged."""
     readers = await client.jetstream(timeout=60).consumers_info(TOPIC)
     return bool(readers) and all(not reader.num_pending and not reader.num_ack_pending for reader in readers)
-
-
-async def _until(holds: Callable[[], Awaitable[bool]]) -> None:
-    async with asyncio.timeout(PATIENCE):
-        while not await holds():
-            await asyncio.sleep(0.02)
 
 
 async def _everything(client: Client) -> list[bytes]:
