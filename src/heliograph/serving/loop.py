@@ -81,8 +81,9 @@ async def _unless(stop: asyncio.Event, waiting: Coroutine[Any, Any, T]) -> T | N
     stopped.cancel()
     if task.done():
         return task.result()
-    task.cancel()
-    await asyncio.wait({task})
+    while not task.done():  # again: a client may take it for the end of its own wait, as wait_for of Python 3.11 does
+        task.cancel()
+        await asyncio.wait({task}, timeout=1.0)
     return None if task.cancelled() else task.result()
 
 
