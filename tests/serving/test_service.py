@@ -137,3 +137,24 @@ def test_what_is_bad_is_told_and_changes_nothing():
         _, told = served(stepping(), [good[0], payload], 2)
         refused = [one for one in told if one["kind"] == "refused"]
         assert len(refused) == 1 and reason in refused[0]["reason"] + refused[0]["detail"], (payload, told)
+
+
+def test_no_plant_begins_with_a_wrong_clock():
+    """Its time would start there, and all that is right would be late."""
+    wrong = {"plant": "p", "node": "a", "sequence": 0, "time": 1e9, "values": [1.0], "arrival": 1.0}
+    right = {"plant": "p", "node": "a", "sequence": 1, "time": 1.0, "values": [1.0], "arrival": 1.0}
+    service, told = served(moving(), lines([wrong, right]), 2)
+    assert [one["reason"] for one in told if one["kind"] == "refused"] == ["future"]
+    assert len(finals(told, "p")) == 1 and service.plants["p"].links["a"].used == 1
+    _, told = served(moving(), lines([right, right | {"time": 500.0, "sequence": 2, "arrival": 500.0}]), 1, leap=60.0)
+    assert [one["reason"] for one in told if one["kind"] == "refused"] == ["future"]
+
+
+def test_memory_is_bounded_by_the_window():
+    """One plant for 2,000 rows at a time: those of the window and of the batch are held, and no more."""
+    service = Service(fleet(moving()), Nowhere())
+    z = np.random.default_rng(0).normal(size=2000)
+    sent = lines([{"node": "a", "sequence": k, "time": 0.1 * k, "values": [float(z[k])]} for k in range(2000)])
+    for begin in range(0, 2000, 50):
+        service.take(sent[begin : begin + 50])
+        assert service.fleet.pool.used <= WINDOW / 0.1 + 50 + 2

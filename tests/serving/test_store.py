@@ -154,3 +154,15 @@ def test_a_store_that_cannot_be_opened_is_one_line_without_its_password(place):
     with pytest.raises(ValueError, match="store") as error:
         Store(place, {})
     assert "secret" not in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_disk_that_takes_nothing_more_ends_the_service_in_one_line(tmp_path):
+    service = Service(fleet(stepping()), Store(str(tmp_path / "a.db"), {}))
+    sent = lines(messages(1, 10, seed=9, whole=True))
+    service.take(sent[:5])
+    before = states(service)
+    with service.store._engine.begin() as connection:
+        connection.exec_driver_sql("CREATE TRIGGER full BEFORE INSERT ON journal BEGIN SELECT RAISE(FAIL, 'full'); END")
+    with pytest.raises(ValueError, match=r"store .*a\.db: expected a database that takes a commit, got .*full"):
+        service.take([*sent[5:], b"junk"])
+    assert states(service) == before and service.plants == {}

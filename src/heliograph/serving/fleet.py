@@ -15,7 +15,7 @@ from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
 from heliograph.serving.pool import Pool
 
-FAR = 100_000  # steps that an event may be after the newest one: each of them has to be computed
+FAR = 10_000  # steps that an event may be after the newest one: each of them has to be computed, while others wait
 
 
 class Options(NamedTuple):

@@ -98,9 +98,10 @@ class Service:
                 malformed += 1
                 entries.append(_refused(None, {}, "malformed", f"{error}: {shown(payload)}"))
                 continue
-            touched[plant.name] = plant
+            if plant is not None:
+                touched[plant.name] = plant
             if verdict == "used":
-                used.add(plant.name)
+                used.add(message.plant)
             else:
                 entries.append(_refusal(message, verdict))
         settled = self.fleet.settle(touched.values())
@@ -138,8 +139,8 @@ class Service:
             plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
             plant.version = kept.version
 
-    def _use(self, message: Message) -> tuple[Plant, Verdict]:
-        """Give a message to its plant."""
+    def _use(self, message: Message) -> tuple[Plant | None, Verdict]:
+        """Give a message to its plant, which is None if it would have begun with one that is refused."""
         plant = self.plants.get(message.plant)
         origin = self._origin(message) if plant is None else plant.origin
         at = seconds(message.time, origin)
@@ -149,6 +150,8 @@ class Service:
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
         if plant is None:
+            if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
+                return None, "future"
             plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
         if inputs is not None:
             self.fleet.take(plant, inputs)

@@ -96,6 +96,14 @@ class Store:
         Raises:
             ConflictError: a plant has another version.
         """
+        try:
+            return self._committed(plants, entries, malformed, told)
+        except DBAPIError as error:
+            raise fail(f"store {self.name}", "a database that takes a commit", str(error.orig)) from None
+
+    def _committed(
+        self, plants: Mapping[str, Kept], entries: Sequence[Entry], malformed: int, told: int | None
+    ) -> list[Output]:
         with self._engine.begin() as connection:
             newest = self._count(connection, NEWEST, len(entries))
             found = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
