@@ -9,7 +9,8 @@ import pytest
 
 from heliograph.serving.identity import identity
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
+from heliograph.serving.store import Store, engine_at
+from tests.serving import test_sharing
 from tests.serving.test_store import by_plant, journal, states
 from tests.serving.worlds import fleet, lines, messages, stepping
 
@@ -66,3 +67,7 @@ def test_processes_share_a_store_in_postgresql(tmp_path, database):
         Store(database, identity(fleet(network, window=6.0)))
     for service in many:
         service.store.close()
+
+
+def test_parts_are_leased_in_postgresql(database):
+    test_sharing.shared(engine_at(database))

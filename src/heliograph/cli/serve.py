@@ -1,16 +1,11 @@
 """`heliograph serve`: the filters of a network kept running, from messages to estimates."""
 
-import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import Parameter
 
 from heliograph.cli.app import place
-
-if TYPE_CHECKING:
-    from heliograph.serving.fleet import Fleet
-    from heliograph.serving.keeping import Keeps
 
 
 def serve(
@@ -23,6 +18,9 @@ def serve(
     store: Annotated[str | None, Parameter(help="File or PostgreSQL URL that keeps the state.")] = (None),
     process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
     from_snapshot: Annotated[Path | None, place("Store of which to begin from the plants.")] = None,
+    broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
+    parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
+    page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
     schema: Annotated[bool, Parameter(help="Print the JSON schema of messages and outputs.", negative="")] = False,
 ) -> None:
     """Keep the filters of your own network running: messages as JSON lines in, estimates as JSON lines out.
@@ -38,45 +36,17 @@ def serve(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import fail
-    from heliograph.serving.fleet import Fleet, Options
-    from heliograph.serving.lanes import Lanes
-    from heliograph.serving.loop import keep_running
+    from heliograph.serving.address import address
+    from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.pipe import Pipe
-    from heliograph.serving.service import Service
+    from heliograph.serving.running import Wanted, run
 
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
         return
     if network is None:
         raise fail("serve", "a network, such as my_network.py", "none")
-    lanes = Lanes(load_network(network))
-    if lanes.uneven:
-        print(f"heliograph: warning: predictions depend on when others are asked for: {lanes.uneven}", file=sys.stderr)
-    fleet = Fleet(lanes, Options(window, ahead, float("inf") if leap is None else leap))
-    kept = _kept(fleet, store, process, from_snapshot)
-    try:
-        asyncio.run(keep_running(Service(fleet, kept), Pipe()))
-    finally:
-        kept.close()
-
-
-def _kept(fleet: "Fleet", store: str | None, process: str, snapshot: Path | None) -> "Keeps":
-    """Where the state is kept, with what it begins from."""
-    from heliograph.numerics.check import fail
-    from heliograph.serving.identity import identity
-    from heliograph.serving.nowhere import Nowhere
-    from heliograph.serving.store import Store
-
-    if store is None:
-        if snapshot is not None:
-            raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
-        return Nowhere()
-    mine = identity(fleet)
-    kept = Store(store, mine, process)
-    if snapshot is not None:
-        if not snapshot.is_file():
-            raise fail(f"snapshot {snapshot}", "a store's file", "nothing of that name")
-        kept.begin_from(str(snapshot), mine)
-    return kept
+    where = None if broker is None else address(broker)
+    options = Options(window, ahead, float("inf") if leap is None else leap)
+    asyncio.run(run(Wanted(load_network(network), options, store, process, from_snapshot, where, parts, page)))

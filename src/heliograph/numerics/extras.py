@@ -27,7 +27,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "prometheus_client": "live",
     "starlette": "live",
     "uvicorn": "live",
-    "aiomqtt": "live",
+    "paho": "live",
     "nats": "live",
     "psycopg": "postgres",
 }

@@ -34,14 +34,19 @@ class Takes(Protocol):
 async def keep_running(service: Takes, transport: Transport) -> None:
     """Serve until the transport ends, or until SIGTERM or SIGINT: then what was received is committed and told."""
     stop = asyncio.Event()
-    with _signals(stop):
-        try:
-            await _publish(service, transport, service.unpublished(), stop)
-            ended = await _serve(service, transport, stop)
-            await _publish(service, transport, await asyncio.to_thread(service.finish, ended), stop)
-            await asyncio.to_thread(service.finish, False)
-        finally:
-            await transport.close()
+    with signals(stop):
+        await serve_until(stop, service, transport)
+
+
+async def serve_until(stop: asyncio.Event, service: Takes, transport: Transport) -> None:
+    """Serve until the transport ends or until `stop`: then what was received is committed and told."""
+    try:
+        await _publish(service, transport, service.unpublished(), stop)
+        ended = await _serve(service, transport, stop)
+        await _publish(service, transport, await asyncio.to_thread(service.finish, ended), stop)
+        await asyncio.to_thread(service.finish, False)
+    finally:
+        await transport.close()
 
 
 async def _serve(service: Takes, transport: Transport, stop: asyncio.Event) -> bool:
@@ -76,13 +81,14 @@ async def _unless(stop: asyncio.Event, waiting: Coroutine[Any, Any, T]) -> T | N
     stopped.cancel()
     if task.done():
         return task.result()
-    task.cancel()
-    await asyncio.wait({task})
+    while not task.done():  # again: a client may take it for the end of its own wait, as wait_for of Python 3.11 does
+        task.cancel()
+        await asyncio.wait({task}, timeout=1.0)
     return None if task.cancelled() else task.result()
 
 
 @contextmanager
-def _signals(stop: asyncio.Event) -> Iterator[None]:
+def signals(stop: asyncio.Event) -> Iterator[None]:
     """Have the signals to stop say so."""
     loop, numbers = asyncio.get_running_loop(), (signal.SIGTERM, signal.SIGINT)
     before = [signal.getsignal(number) for number in numbers]

@@ -181,6 +181,11 @@ def _of(connection: Connection, columns: Sequence[Column[Any]], names: list[str]
     return found
 
 
+def engine_at(place: str) -> Engine:
+    """The database of a store."""
+    return _engine(_url(place))
+
+
 def _output(line: str) -> Output:
     parts = json.loads(line)
     return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())

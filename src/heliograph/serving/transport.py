@@ -3,6 +3,7 @@
 from collections.abc import Awaitable, Callable, Sequence
 from typing import NamedTuple, Protocol
 
+from heliograph.numerics.check import InputError
 from heliograph.serving.output import Output
 
 
@@ -11,6 +12,10 @@ class Batch(NamedTuple):
 
     payloads: Sequence[bytes]
     acknowledge: Callable[[], Awaitable[None]]
+
+
+class TakenOverError(InputError):
+    """Another process reads these messages now."""
 
 
 class Transport(Protocol):

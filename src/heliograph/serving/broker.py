@@ -1,0 +1,16 @@
+"""The transport of a broker."""
+
+from heliograph.serving.address import Address
+from heliograph.serving.partition import WHOLE, Part
+from heliograph.serving.transport import Transport
+
+
+def connected(address: Address, part: Part = WHOLE) -> Transport:
+    """Messages of a part of the plants, through the broker at this address."""
+    if address.kind == "mqtt":
+        from heliograph.serving.mqtt import Mqtt
+
+        return Mqtt(address, part)
+    from heliograph.serving.nats import Nats
+
+    return Nats(address, part)

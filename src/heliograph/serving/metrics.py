@@ -1,0 +1,54 @@
+"""What a service does, as Prometheus reads it."""
+
+from collections.abc import Iterable
+
+from prometheus_client import generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
+
+from heliograph.live.event import VERDICTS
+from heliograph.serving.watch import Watch
+
+
+class Tallies(Collector):
+    """Numbers that a watch has when it is asked. By node and filter, not by plant, of which there may be many."""
+
+    def __init__(self, watch: Watch):
+        self.watch = watch
+        watch.registry.register(self)
+
+    def collect(self) -> Iterable[Metric]:
+        """As they are now."""
+        yield from _links(self.watch)
+        yield from _surprises(self.watch)
+        yield GaugeMetricFamily("heliograph_plants", "Plants known.", sum(1 for _ in self.watch.plants()))
+        malformed = sum(service.malformed for service in self.watch.services)
+        yield CounterMetricFamily("heliograph_malformed", "Messages that could not be read.", malformed)
+
+    def text(self) -> bytes:
+        """All metrics, as text."""
+        with self.watch.lock:
+            return generate_latest(self.watch.registry)
+
+
+def _links(watch: Watch) -> Iterable[Metric]:
+    messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
+    lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
+    for node, tally in watch.links().items():
+        for verdict in VERDICTS:
+            messages.add_metric([node, verdict], tally[verdict])
+        lost.add_metric([node], tally["lost"])
+    return messages, lost
+
+
+def _surprises(watch: Watch) -> Iterable[Metric]:
+    labels = ["node", "filter"]
+    ratio = GaugeMetricFamily(
+        "heliograph_nis", "Normalised innovation squared over its expectation, of the last rows; 1.", labels=labels
+    )
+    low = GaugeMetricFamily("heliograph_nis_low", "Least that is expected of an honest filter.", labels=labels)
+    high = GaugeMetricFamily("heliograph_nis_high", "Most that is expected of an honest filter.", labels=labels)
+    for key, one in watch.surprises.items():
+        for metric, value in zip((ratio, low, high), (one.ratio, *one.band()), strict=True):
+            metric.add_metric(list(key), value)
+    return ratio, low, high

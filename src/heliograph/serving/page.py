@@ -1,0 +1,179 @@
+"""The page to watch a service on, and its metrics, on one port: for this machine, or with a token for others."""
+
+import asyncio
+import hmac
+import ipaddress
+import json
+import os
+import socket
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from importlib.resources import files
+from typing import NamedTuple
+
+import uvicorn
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.applications import Starlette
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import Route
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from heliograph.numerics.check import fail
+from heliograph.serving.metrics import Tallies
+from heliograph.serving.watch import Watch
+
+TOKEN = "HELIOGRAPH_PAGE_TOKEN"
+EVERY = 0.5  # seconds between looks
+LOOPBACK = ["localhost", "127.0.0.1", "[::1]"]
+KINDS = {"page.css": "text/css", "page.js": "text/javascript"}
+POLICY = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+
+
+class Door(NamedTuple):
+    """Where the page is, and the token that is asked for there (None: nobody else reaches it)."""
+
+    host: str
+    port: int
+    token: str | None
+
+
+def door(place: str, environment: Mapping[str, str] = os.environ) -> Door:
+    """`PORT`, of this machine alone, or `ADDRESS:PORT`, which takes a token from HELIOGRAPH_PAGE_TOKEN.
+
+    Raises:
+        ValueError: no such place; one that others reach without a token of 16 characters at least.
+    """
+    host, _, port = place.rpartition(":")
+    host = host.strip("[]") or "127.0.0.1"
+    if not (port.isascii() and port.isdigit() and int(port) < 65536):
+        raise fail("page", "a port, or address:port", repr(place))
+    if _is_loopback(host):
+        return Door(host, int(port), None)
+    token = environment.get(TOKEN, "")
+    if len(token) < 16:
+        raise fail(f"page at {host}", f"a token of 16 characters at least in {TOKEN}", f"one of {len(token)}")
+    return Door(host, int(port), token)
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def application(watch: Watch, token: str | None) -> Starlette:
+    """The page at /, its data at /events, metrics at /metrics."""
+    tallies = Tallies(watch)
+
+    def page(_: Request) -> Response:
+        first = json.dumps(watch.view(None)).replace("<", "\\u003c")  # no name ends the element that it stands in
+        return Response(_text("page.html").replace("null", first, 1), media_type="text/html", headers=POLICY)
+
+    def metrics(_: Request) -> Response:
+        return Response(tallies.text(), media_type=CONTENT_TYPE_LATEST)
+
+    def events(request: Request) -> Response:
+        return StreamingResponse(_events(watch, request), media_type="text/event-stream")
+
+    middleware = [Middleware(Guarded, token)]
+    if token is None:  # a page of elsewhere that names itself 127.0.0.1 does not get in
+        middleware.insert(0, Middleware(TrustedHostMiddleware, allowed_hosts=LOOPBACK, www_redirect=False))
+    routes = [Route("/", page), Route("/metrics", metrics), Route("/events", events)]
+    return Starlette(routes=[*routes, *(Route(f"/{name}", file) for name in KINDS)], middleware=middleware)
+
+
+def _text(name: str) -> str:
+    return (files("heliograph.serving") / "browser" / name).read_text("utf-8")
+
+
+def file(request: Request) -> Response:
+    """A part of the page."""
+    name = request.url.path.removeprefix("/")
+    return Response(_text(name), media_type=KINDS[name], headers=POLICY)
+
+
+async def _events(watch: Watch, request: Request) -> AsyncIterator[str]:
+    """What is new, whenever something is; a comment else, so that a reader that went is noticed."""
+    plant, since, before = request.query_params.get("plant"), 0, None
+    while not await request.is_disconnected():
+        view = await asyncio.to_thread(watch.view, plant, since)
+        plant, since = view["plant"] if view["points"] else plant, view["newest"]
+        told = json.dumps(view)
+        yield f"data: {told}\n\n" if told != before else ": \n\n"
+        before = told
+        await asyncio.sleep(EVERY)
+
+
+class Guarded:
+    """Lets in who brings the token: as `Authorization: Bearer`, or once as ?token=, which is then kept as a cookie."""
+
+    def __init__(self, app: ASGIApp, token: str | None):
+        self.app, self.token = app, token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or self.token is None:
+            await self.app(scope, receive, send)
+            return
+        asked = HTTPConnection(scope)
+        if self._is(asked.query_params.get("token", "")):
+            answer: Response = RedirectResponse("/", 303)
+            answer.set_cookie("heliograph", self.token, httponly=True, samesite="strict")
+            await answer(scope, receive, send)
+        elif self._is(asked.cookies.get("heliograph", "")) or self._is(_bearer(asked)):
+            await self.app(scope, receive, send)
+        else:
+            await PlainTextResponse("a token is needed: ?token=", 401)(scope, receive, send)
+
+    def _is(self, given: str) -> bool:
+        return hmac.compare_digest(given.encode(), str(self.token).encode())
+
+
+def _bearer(asked: HTTPConnection) -> str:
+    kind, _, token = asked.headers.get("authorization", "").partition(" ")
+    return token if kind.lower() == "bearer" else ""
+
+
+class _Page(uvicorn.Server):
+    """Serves the page beside the service, which is the one that signals stop."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """None: they stop the service, and with it the page."""
+        yield
+
+
+@asynccontextmanager
+async def shown(watch: Watch, at: Door) -> AsyncIterator[int]:
+    """The page, as long as this lasts; the port that it is at.
+
+    Raises:
+        ValueError: a place that is taken, or not this machine's.
+    """
+    try:
+        listener = socket.create_server((at.host, at.port), family=_family(at.host))
+    except OSError as error:
+        raise fail("page", "a free port of this machine", f"{at.host}:{at.port}, {error.strerror}") from None
+    config = uvicorn.Config(
+        application(watch, at.token), log_level="warning", access_log=False, timeout_graceful_shutdown=1
+    )
+    server = _Page(config)
+    serving = asyncio.ensure_future(server.serve([listener]))
+    try:
+        yield int(listener.getsockname()[1])
+    finally:
+        server.should_exit = True
+        await serving
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET

@@ -1,0 +1,36 @@
+"""Which share of the plants a message belongs to, by the plant's name: all messages of a plant are in one share.
+
+A broker that hands each message to whichever process is free (a shared subscription of MQTT 5, a consumer with many
+readers) would spread a plant over processes. So plants are cut into a fixed number of parts by a hash of their names,
+and a part is read by one process at a time. The hash is FNV-1a of 32 bits, modulo the number of parts, since that is
+what a NATS server computes itself; a sender to MQTT writes the part into the topic.
+"""
+
+from typing import NamedTuple
+from urllib.parse import quote
+
+OFFSET, PRIME = 0x811C9DC5, 0x01000193
+NAMELESS = "_"  # the word for the plant that has no name
+
+
+class Part(NamedTuple):
+    """The `number`-th part, from 0, `of` so many."""
+
+    number: int = 0
+    of: int = 1
+
+
+WHOLE = Part()
+
+
+def word(plant: str) -> str:
+    """A plant's name as one word of a topic or subject: letters, digits and hyphens stay, others are %XX."""
+    return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
+
+
+def part_of(plant: str, parts: int) -> int:
+    """The part that a plant is in."""
+    value = OFFSET
+    for byte in word(plant).encode():
+        value = (value ^ byte) * PRIME & 0xFFFFFFFF
+    return value % parts

@@ -1,0 +1,137 @@
+"""A service as it was asked for: what it reads from, where it keeps its state, who shares it, and who may look."""
+
+import asyncio
+import os
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from heliograph.numerics.check import check_count, fail
+from heliograph.serving.address import Address
+from heliograph.serving.broker import connected
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.identity import identity
+from heliograph.serving.keeping import Keeps
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.loop import Takes, serve_until, signals
+from heliograph.serving.nowhere import Nowhere
+from heliograph.serving.partition import Part
+from heliograph.serving.pipe import Pipe
+from heliograph.serving.service import Service
+from heliograph.serving.sharing import keep_sharing
+from heliograph.simulation.network import Network
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a service is to be; `parts`: how many parts of the plants several processes share among them.
+
+    Raises:
+        ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
+    """
+
+    network: Network
+    options: Options
+    store: str | None = None
+    process: str = ""
+    snapshot: Path | None = None
+    broker: Address | None = None
+    parts: int | None = None
+    page: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.snapshot is not None:
+            if self.store is None:
+                raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
+            if not self.snapshot.is_file():
+                raise fail(f"snapshot {self.snapshot}", "a store's file", "nothing of that name")
+        if self.parts is not None:
+            check_count("--parts", self.parts)
+            if self.store is None or self.broker is None:
+                raise fail("--parts", "a store and a broker that all processes share", "not both")
+
+
+async def run(wanted: Wanted) -> None:
+    """Serve until the messages end, or until SIGTERM or SIGINT."""
+    async with _watched(wanted) as look:
+        lanes = Lanes(wanted.network)
+        if lanes.uneven:
+            what = f"predictions depend on when others are asked for: {lanes.uneven}"
+            print(f"heliograph: warning: {what}", file=sys.stderr)
+        if wanted.parts is None:
+            await _alone(wanted, lanes, look)
+        else:
+            await _shared(wanted, lanes, look, wanted.parts)
+
+
+Look = Callable[[Service], Takes]
+
+
+@asynccontextmanager
+async def _watched(wanted: Wanted) -> AsyncIterator[Look]:
+    """Services as a page shows them, if there is one."""
+    if wanted.page is None:
+        yield lambda service: service
+        return
+    from heliograph.serving.page import door, shown
+    from heliograph.serving.watch import Watch
+
+    watch = Watch(wanted.network.states)
+    async with shown(watch, door(wanted.page)):
+        yield watch.over
+
+
+async def _alone(wanted: Wanted, lanes: Lanes, look: Look) -> None:
+    """One process: all messages."""
+    stop = asyncio.Event()
+    fleet = Fleet(lanes, wanted.options)
+    kept = _kept(wanted, fleet)
+    try:
+        with signals(stop):
+            transport = Pipe() if wanted.broker is None else connected(wanted.broker)
+            await serve_until(stop, look(Service(fleet, kept)), transport)
+    finally:
+        kept.close()
+
+
+def _kept(wanted: Wanted, fleet: Fleet) -> Keeps:
+    """Where the state is kept, with what it begins from."""
+    if wanted.store is None:
+        return Nowhere()
+    from heliograph.serving.store import Store
+
+    mine = identity(fleet)
+    kept = Store(wanted.store, mine, wanted.process)
+    if wanted.snapshot is not None:
+        kept.begin_from(str(wanted.snapshot), mine)
+    return kept
+
+
+async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:
+    """One process of several: the parts that it leases."""
+    from heliograph.serving.leases import Leases
+    from heliograph.serving.store import Store, engine_at
+
+    place, broker = str(wanted.store), wanted.broker
+    assert broker is not None  # as Wanted checked
+    fleet = Fleet(lanes, wanted.options)
+    _kept(wanted, fleet).close()
+    mine = identity(fleet)
+
+    async def serve(number: int, stop: asyncio.Event) -> None:
+        kept = Store(place, mine, f"part {number} of {parts}")  # whoever has the part tells what it had to tell
+        try:
+            service = look(Service(Fleet(lanes, wanted.options), kept))
+            await serve_until(stop, service, connected(broker, Part(number, parts)))
+        finally:
+            kept.close()
+
+    name = wanted.process or f"{socket.gethostname()} {os.getpid()}"
+    engine = engine_at(place)
+    try:
+        await keep_sharing(Leases(engine, name, parts), serve)
+    finally:
+        engine.dispose()

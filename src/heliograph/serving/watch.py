@@ -1,0 +1,237 @@
+"""What services do, for somebody who looks: estimates with their bands, links, tests, and what is doubtful."""
+
+import math
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, TypeVar
+
+from prometheus_client import CollectorRegistry, Histogram
+from pydantic_core import from_json
+
+from heliograph.live.event import VERDICTS
+from heliograph.serving.loop import Takes
+from heliograph.serving.output import Output
+from heliograph.serving.surprise import Surprise
+
+T = TypeVar("T")
+PLANTS = 200  # plants whose estimates are remembered, those that were heard last
+POINTS = 800  # estimates remembered of each, final ones and those that are not yet
+LISTED = 1000  # plants that can be chosen from
+WARNINGS = 50
+
+
+class Link(Protocol):
+    """Numbers of messages of a node: by verdict, and `lost`, the gaps in its counts."""
+
+    lost: int
+    used: int
+    duplicate: int
+    conflict: int
+    late: int
+    future: int
+
+
+class Plant(Protocol):
+    """A plant's links, by node."""
+
+    @property
+    def links(self) -> Mapping[str, Link]:
+        """By node."""
+
+
+class Taken(Protocol):
+    """What the last batch was."""
+
+    @property
+    def took(self) -> float:
+        """Seconds, in all."""
+
+    @property
+    def committed(self) -> float:
+        """Seconds of it, to commit."""
+
+
+class Serves(Takes, Protocol):
+    """A service as it is watched."""
+
+    @property
+    def plants(self) -> Mapping[str, Plant]:
+        """Plants in memory, by name."""
+
+    @property
+    def malformed(self) -> int:
+        """Messages that could not be read."""
+
+    @property
+    def last(self) -> Taken:
+        """What the last batch was."""
+
+
+class Point(NamedTuple):
+    """A plant's estimates at a time: by node and filter means and deviations. `number` counts the points.
+
+    A final one comes after the provisional ones of its time, and takes their place.
+    """
+
+    number: int
+    time: float | str
+    estimates: dict[str, dict[str, dict[str, Any]]]
+
+
+class Watch:
+    """Looks at any number of services of one network; asked from another thread it waits for the batch at work."""
+
+    def __init__(self, states: Sequence[str]):
+        self.states = list(states)
+        self.lock = threading.Lock()
+        self.services: list[Serves] = []
+        self.surprises: dict[tuple[str, str], Surprise] = {}
+        self._own: OrderedDict[str, dict[tuple[str, str], Surprise]] = OrderedDict()
+        self._points: OrderedDict[str, deque[Point]] = OrderedDict()
+        self._count = 0
+        self.registry = CollectorRegistry()
+        self.took = Histogram("heliograph_batch_seconds", "From messages to what is told.", registry=self.registry)
+        self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
+
+    def over(self, service: Serves) -> "Watched":
+        """The service, watched."""
+        self.services.append(service)
+        return Watched(service, self)
+
+    def note(self, outputs: Sequence[Output], last: Taken) -> None:
+        """Remember what is worth a look."""
+        self.took.observe(last.took)
+        self.committed.observe(last.committed)
+        for output in outputs:
+            if output.kind != "refused":
+                told = from_json(output.body)
+                self._keep(output.plant, told)
+                if output.kind == "final":
+                    self._test(output.plant, told["estimates"])
+
+    def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
+        own = _newest(self._own, plant, dict)
+        for node, filters in estimates.items():
+            for name, told in filters.items():
+                if told.get("nis") is not None:
+                    for found in (self.surprises, own):
+                        one = found.setdefault((node, name), Surprise(told["claim"]))
+                        one.add(told["nis"], told["heard"])
+
+    def _keep(self, plant: str, told: Mapping[str, Any]) -> None:
+        self._count += 1
+        estimates = {
+            node: {name: _band(found) for name, found in filters.items()} for node, filters in told["estimates"].items()
+        }
+        points = _newest(self._points, plant, lambda: deque(maxlen=POINTS))
+        points.append(Point(self._count, told["time"], estimates))
+
+    def plants(self) -> Iterator[tuple[str, Plant]]:
+        """All plants of all services."""
+        for service in self.services:
+            yield from service.plants.items()
+
+    def links(self) -> dict[str, dict[str, int]]:
+        """By node, over all plants: numbers of messages by verdict, and lost ones."""
+        return _added(plant for _, plant in self.plants())
+
+    def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
+        """What the page shows of a plant (None: of the one heard last): estimates after the point `since`."""
+        with self.lock:
+            name = next(reversed(self._points), "") if plant is None else plant
+            found = [each for known, each in self.plants() if known == name]
+            points = [point for point in self._points.get(name, ()) if point.number > since]
+            tests = self._own.get(name, {})
+            names = sorted(known for known, _ in self.plants())
+            return {
+                "count": len(names),
+                "plants": names[:LISTED],
+                "plant": name,
+                "states": self.states,
+                "since": since,
+                "newest": self._count,
+                "points": [point._asdict() for point in points],
+                "links": _added(found),
+                "tests": [_told(node, filter_, one) for (node, filter_), one in tests.items()],
+                "warnings": list(self._warnings(found, tests))[:WARNINGS],
+                "malformed": sum(service.malformed for service in self.services),
+                "all": _added(each for _, each in self.plants()),
+            }
+
+    def _warnings(self, plants: Sequence[Plant], tests: Mapping[tuple[str, str], Surprise]) -> Iterator[str]:
+        for (node, filter_), one in tests.items():
+            if doubt := one.doubt():
+                yield f"{node}/{filter_}: {doubt}"
+        for node, link in _added(plants).items():
+            if link["late"]:
+                yield f"{node}: {link['late']} came too late to be used; a longer --window would hold what they change"
+            if link["future"]:
+                yield f"{node}: {link['future']} are later than they can be; its clock is wrong"
+            if link["conflict"]:
+                yield f"{node}: {link['conflict']} came again with other values; the first stayed"
+
+
+class Watched:
+    """A service that somebody looks at; to whoever runs it, it is the service."""
+
+    def __init__(self, service: Serves, watch: Watch):
+        self.service, self.watch = service, watch
+
+    def unpublished(self) -> list[Output]:
+        """As the service says."""
+        return self.service.unpublished()
+
+    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+        """As the service does, and remember what is worth a look."""
+        with self.watch.lock:
+            outputs = self.service.take(payloads)
+            self.watch.note(outputs, self.service.last)
+        return outputs
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """As the service does."""
+        self.service.published(outputs)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """As the service does."""
+        with self.watch.lock:
+            return self.service.finish(ended)
+
+
+def _newest(found: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
+    """What is kept of a plant, which is the newest now; the oldest goes."""
+    if plant not in found:
+        found[plant] = make()
+        if len(found) > PLANTS:
+            found.popitem(last=False)
+    found.move_to_end(plant)
+    return found[plant]
+
+
+def _band(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Means, and deviations where the filter claims any."""
+    rows = told["covariance"]
+    claimed = None if rows is None else [_root(row[i]) for i, row in enumerate(rows)]
+    return {"mean": told["mean"], "deviation": claimed, "claim": told["claim"]}
+
+
+def _root(variance: float | None) -> float | None:
+    return None if variance is None else math.sqrt(max(variance, 0.0))
+
+
+def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
+    """Tallies of several plants, by node."""
+    found: dict[str, dict[str, int]] = {}
+    for plant in plants:
+        for node, link in plant.links.items():
+            tally = found.setdefault(node, dict.fromkeys((*VERDICTS, "lost"), 0))
+            for name in tally:
+                tally[name] += getattr(link, name)
+    return found
+
+
+def _told(node: str, filter_: str, one: Surprise) -> dict[str, Any]:
+    low, high = one.band()
+    numbers = {"ratio": one.ratio, "low": low, "high": high, "numbers": one.numbers}
+    return {"node": node, "filter": filter_, "claim": one.claim, **numbers, "doubt": one.doubt() is not None}

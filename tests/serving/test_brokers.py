@@ -1,0 +1,274 @@
+"""Messages through real brokers: in order, acknowledged after the commit, and again if they were not."""
+
+import asyncio
+import logging
+import shutil
+import subprocess
+from collections.abc import Awaitable, Callable, Iterator
+
+import pytest
+
+pytest.importorskip("nats")
+pytest.importorskip("paho")
+import nats
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from heliograph.examples.live.server import Server
+from heliograph.serving.address import Address, address
+from heliograph.serving.mqtt import Mqtt
+from heliograph.serving.nats import Nats
+from heliograph.serving.output import Output
+from heliograph.serving.partition import Part, part_of, word
+from heliograph.serving.transport import TakenOverError, Transport
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    one = Server(tmp_path_factory.mktemp("server"))
+    one.start()
+    yield one
+    one.kill()
+
+
+def at(server: Server, kind: str, topic: str) -> Address:
+    return address(f"{kind}://127.0.0.1:{getattr(server, kind)}/{topic}", {})
+
+
+async def received(transport: Transport, count: int, acknowledge: bool = True) -> list[bytes]:
+    """At least so many messages."""
+    found: list[bytes] = []
+    while len(found) < count:
+        batch = await asyncio.wait_for(transport.receive(), 20)
+        assert batch is not None
+        found += batch.payloads
+        if acknowledge:
+            await batch.acknowledge()
+    return found
+
+
+async def silent(transport: Transport, seconds: float = 0.3) -> bool:
+    try:
+        await asyncio.wait_for(transport.receive(), seconds)
+    except TimeoutError:
+        return True
+    return False
+
+
+async def sent(where: Address, bodies: list[bytes], plant: str = "a") -> None:
+    client = await nats.connect(f"nats://{where.host}:{where.port}")
+    stream = client.jetstream(timeout=60)
+    await asyncio.gather(*[await stream.publish_async(f"{where.topic}.in.{word(plant)}", body) for body in bodies])
+    await client.close()
+
+
+def published(where: Address, bodies: list[bytes], below: str = "a") -> None:
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.connect(where.host, where.port)
+    client.loop_start()
+    for one in [client.publish(f"{where.topic}/in/{below}", body, 1) for body in bodies]:
+        one.wait_for_publish(10)
+    client.disconnect()
+    client.loop_stop()
+
+
+def numbered(start: int, stop: int) -> list[bytes]:
+    return [str(i).encode() for i in range(start, stop)]
+
+
+async def made(where: Address, part: Part = Part()) -> Nats:  # noqa: B008
+    """A reader that has made its stream."""
+    reader = Nats(where, part)
+    assert await silent(reader)
+    return reader
+
+
+def test_the_url_is_told_without_what_is_secret():
+    found = address("mqtts://me:p%40ss@example.org/site/one", {})
+    assert (found.kind, found.host, found.port, found.topic) == ("mqtt", "example.org", 8883, "site/one")
+    assert (found.user, found.password) == ("me", "p@ss") and found.secure
+    assert "p@ss" not in f"{found!r}{found}" and "me:" not in f"{found!r}{found}"
+    environment = {"HELIOGRAPH_BROKER_USER": "you", "HELIOGRAPH_BROKER_PASSWORD": "word"}
+    assert address("nats://me:old@example.org", environment).password == "word"
+    assert address("nats://example.org", {}).topic == "heliograph"
+
+
+@pytest.mark.parametrize(
+    "url", ["http://a:s3cret@b", "mqtt://", "nats://me:s3cret@h:x", "nats://h/a.b", "mqtt://h/a+b"]
+)
+def test_another_url_is_refused_in_one_line_without_the_password(url: str):
+    with pytest.raises(ValueError, match=r"^broker") as error:
+        address(url, {})
+    assert "s3cret" not in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
+    async def work() -> None:
+        where = at(server, "nats", "again")
+        first = await made(where)
+        await sent(where, numbered(0, 1500))
+        done = await received(first, 1)
+        held = await received(first, 1, acknowledge=False)
+        assert done + held == numbered(0, len(done + held)) and len(done) < 1500
+        second = Nats(where)  # as after kill -9: the first never says that it went
+        await sent(where, numbered(1500, 1600))
+        assert await received(second, 1600 - len(done)) == numbered(len(done), 1600)
+        assert await silent(second)
+        with pytest.raises(TakenOverError, match="one reader"):
+            first._reader = None
+            await asyncio.wait_for(first.receive(), 10)
+        await asyncio.gather(first.close(), second.close())
+
+    asyncio.run(work())
+
+
+def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, caplog):
+    async def work() -> None:
+        where = address(f"nats://me:s3cret@127.0.0.1:{server.nats}/site", {})
+        reader = await made(where)
+        await sent(where, numbered(0, 100))
+        before = await received(reader, 100)
+        server.kill()
+        waiting = asyncio.ensure_future(received(reader, 100))
+        await asyncio.sleep(0.3)
+        server.start()
+        await sent(where, numbered(100, 200))
+        assert before + await waiting == numbered(0, 200)
+        await reader.close()
+
+    server = Server(tmp_path)
+    server.start()
+    try:
+        with caplog.at_level(logging.DEBUG):
+            asyncio.run(work())
+    finally:
+        server.kill()
+    assert "trying again" in caplog.text and "s3cret" not in caplog.text
+
+
+def test_the_server_cuts_plants_into_parts_as_we_do(server: Server):
+    async def work() -> None:
+        where, parts = at(server, "nats", "shared"), 3
+        readers = [await made(where, Part(i, parts)) for i in range(parts)]
+        plants = ["", "mower", "Ω.1", *(f"plant {i}" for i in range(20))]
+        for plant in plants:
+            await sent(where, [plant.encode()], plant)
+        for i, reader in enumerate(readers):
+            mine = [plant for plant in plants if part_of(plant, parts) == i]
+            assert mine and [body.decode() for body in await received(reader, len(mine))] == mine
+        other = Nats(where, Part(0, 4))
+        with pytest.raises(ValueError, match="one of 4 parts"):
+            await other.receive()
+        await asyncio.gather(*[reader.close() for reader in [*readers, other]])
+
+    asyncio.run(work())
+
+
+def test_a_session_keeps_what_was_not_acknowledged(server: Server):
+    async def work() -> None:
+        where = at(server, "mqtt", "session")
+        first = Mqtt(where)
+        await asyncio.sleep(0.3)  # the session is there once it was connected
+        await asyncio.to_thread(published, where, numbered(0, 100))
+        assert await received(first, 100) == numbered(0, 100)
+        await asyncio.to_thread(published, where, numbered(100, 200))
+        assert await received(first, 100, acknowledge=False) == numbered(100, 200)
+        await first.close()
+        await asyncio.to_thread(published, where, numbered(200, 300))
+        second = Mqtt(where)
+        found = set[
+            bytes
+        ]()  # this server sends what is new first, the rest after a second, and again on a busy machine
+        while len(found) < 200:
+            found |= set(await received(second, 1))
+        assert found == set(numbered(100, 300))
+        await second.close()
+
+    asyncio.run(work())
+
+
+def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
+    async def work() -> None:
+        where = at(server, "mqtt", "parted")
+        readers = [Mqtt(where, Part(i, 2)) for i in range(2)]
+        await asyncio.sleep(0.5)
+        for plant in ("a", "b", "c", "d"):
+            below = f"{part_of(plant, 2)}/{word(plant)}"
+            await asyncio.to_thread(published, where, [plant.encode()], below)
+        for i, reader in enumerate(readers):
+            mine = [plant for plant in "abcd" if part_of(plant, 2) == i]
+            assert mine and [body.decode() for body in await received(reader, len(mine))] == mine
+        await asyncio.gather(*[reader.close() for reader in readers])
+
+    asyncio.run(work())
+
+
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate")
+@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho leaves sockets to the collector
+def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog):
+    make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
+    certificate, key = tmp_path / "certificate.pem", tmp_path / "key.pem"
+    what = ["-subj", "/CN=here", "-addext", "subjectAltName=IP:127.0.0.1", "-keyout", key, "-out", certificate]
+    subprocess.run(["openssl", "req", "-x509", "-newkey", "rsa:2048", "-nodes", *what], check=True, capture_output=True)
+    tls = f'tls {{ cert_file: "{certificate}", key_file: "{key}" }}\n'
+    server = Server(tmp_path)
+    text = server.file.read_text().replace("mqtt {", f"mqtt {{ {tls}")
+    server.file.write_text(f'{text}{tls}authorization {{ user: me, password: "s3cret word" }}\n')
+    server.start()
+    scheme = "nats+tls" if kind == "nats" else "mqtts"
+    monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+    where = f"{scheme}://127.0.0.1:{getattr(server, kind)}/safe"
+    outputs = [Output(i, "", "final", str(i).encode()) for i in range(3)]
+
+    async def told(url: str, environment: dict[str, str]) -> bool:
+        transport = make(address(url, environment))
+        try:
+            await asyncio.wait_for(transport.publish(outputs), 3)
+        except TimeoutError:
+            return False
+        finally:
+            await transport.close()
+        return True
+
+    who = {"HELIOGRAPH_BROKER_USER": "me", "HELIOGRAPH_BROKER_PASSWORD": "s3cret word"}
+    try:
+        with caplog.at_level(logging.DEBUG):
+            assert asyncio.run(told(where, who))
+            assert asyncio.run(told(where.replace("://", "://me:s3cret%20word@"), {}))
+            assert not asyncio.run(told(where, who | {"HELIOGRAPH_BROKER_PASSWORD": "s3cret"}))
+            monkeypatch.delenv("SSL_CERT_FILE")  # nobody vouches for it now
+            assert not asyncio.run(told(where, who))
+    finally:
+        server.kill()
+    assert "trying again" in caplog.text and "s3cret" not in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: str):
+    make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
+    outputs = [Output(i, "a.b", "final", str(i).encode()) for i in range(300)]
+
+    async def heard(work: Callable[[], Awaitable[None]]) -> list[bytes]:
+        """What both kinds of clients find, since a topic is a subject."""
+        client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
+        subscription = await client.subscribe(f"out{kind}.out.*.a%2Eb")
+        await client.flush()
+        await work()
+        found = [(await subscription.next_msg(5)).data for _ in range(len(outputs) + 1)]
+        await client.close()
+        return found
+
+    async def work() -> None:
+        transport = make(at(server, kind, f"out{kind}"))
+        if isinstance(transport, Nats):
+            assert await silent(transport)
+        found = await heard(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
+        assert found == [b"now", *[one.body for one in outputs]]
+        if isinstance(transport, Nats):
+            await transport.publish(outputs)  # told again, as after a restart
+            info = await transport._client.jetstream().stream_info("outnats-out")
+            assert info.state.messages == len(outputs)
+        await transport.close()
+
+    asyncio.run(work())

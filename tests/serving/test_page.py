@@ -1,0 +1,161 @@
+"""The page and its metrics: what is shown, to whom, and that nothing which comes from outside becomes markup."""
+
+import asyncio
+import json
+import re
+import shutil
+import urllib.request
+from collections.abc import Awaitable, Callable
+from urllib.error import HTTPError
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+pytest.importorskip("uvicorn")
+from heliograph.serving.page import Door, door, shown
+from heliograph.serving.surprise import DOUBT, MEMORY, Surprise
+from heliograph.serving.watch import Watch
+from tests.serving.watched import Scripted
+
+TOKEN = "a token of enough letters"
+
+
+def looked(
+    look: Callable[[str], Awaitable[None]], service: Scripted, rows: int = 300, token: str | None = None
+) -> Watch:
+    """Look at a page of a service that has taken so many rows."""
+    watch = Watch(["<i>x</i>", "v"])
+    watch.over(service).take([str(i).encode() for i in range(rows)])
+
+    async def work() -> None:
+        async with shown(watch, Door("127.0.0.1", 0, token)) as port:
+            await look(f"http://127.0.0.1:{port}")
+
+    asyncio.run(work())
+    return watch
+
+
+async def got(url: str, **headers: str) -> tuple[int, str, dict[str, str]]:
+    def ask() -> tuple[int, str, dict[str, str]]:
+        try:
+            with urllib.request.urlopen(urllib.request.Request(url, headers=headers), timeout=10) as answer:
+                return answer.status, answer.read().decode(), dict(answer.headers)
+        except HTTPError as error:
+            return error.code, error.read().decode(), dict(error.headers)
+
+    return await asyncio.to_thread(ask)
+
+
+async def first_event(url: str) -> dict[str, object]:
+    def ask() -> dict[str, object]:
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            line = answer.readline()
+            return json.loads(line.removeprefix(b"data: "))
+
+    return await asyncio.to_thread(ask)
+
+
+def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
+    rng = np.random.default_rng(0)
+    inside = []
+    for _ in range(300):
+        one = Surprise("exact")
+        for squared, heard in zip(rng.chisquare(2, 600), [2] * 600, strict=True):
+            one.add(squared, heard)
+        low, high = one.band()
+        inside.append(low <= one.ratio <= high)
+    assert np.mean(inside) > 1 - 10 * DOUBT  # 300 tries of probability 0.001: more than 2 failures once in 4,000
+    fresh = Surprise("exact", mean=10.0, variance=20.0)  # ten numbers, all of weight 1: chi-squared itself
+    assert np.allclose(fresh.band(), chi2.ppf([DOUBT / 2, 1 - DOUBT / 2], 10) / 10, rtol=1e-12)
+    for scale, claim, doubted in [
+        (2.0, "exact", True),
+        (0.5, "exact", True),
+        (0.5, "upper", False),
+        (1.0, "exact", False),
+    ]:
+        one = Surprise(claim)
+        for squared in scale * rng.chisquare(2, 3 * MEMORY):
+            one.add(squared, 2)
+        assert (one.doubt() is not None) == doubted
+
+
+def test_a_door_that_others_reach_needs_a_token():
+    assert door("8000", {}) == Door("127.0.0.1", 8000, None) and door("[::1]:80", {}).token is None
+    assert door("0.0.0.0:8000", {"HELIOGRAPH_PAGE_TOKEN": TOKEN}) == Door("0.0.0.0", 8000, TOKEN)
+    for place in ("0.0.0.0:8000", "[::]:8000", "example.org:80"):
+        with pytest.raises(ValueError, match="a token of 16 characters"):
+            door(place, {"HELIOGRAPH_PAGE_TOKEN": "short"})
+    for place in ("http://a", "a:b", "", "70000"):
+        with pytest.raises(ValueError, match="a port, or address:port"):
+            door(place, {})
+
+
+def test_the_page_shows_what_was_told_and_brings_all_it_needs():
+    async def look(url: str) -> None:
+        _, text, headers = await got(url)
+        assert "default-src 'none'" in headers["content-security-policy"]
+        outside = re.findall(r'(?:src|href)="([^"]*)"', text)
+        assert sorted(outside) == ["page.css", "page.js"] and "http" not in (await got(f"{url}/page.css"))[1]
+        found = re.search(r'id="first">(.*?)</script>', text)
+        assert found is not None and "<" not in found[1]  # a name does not end the element
+        view = json.loads(found[1])
+        assert view == await first_event(f"{url}/events")
+        assert view["states"][0] == "<i>x</i>" and view["plants"] == ["</script><b>x"] and len(view["points"]) == 600
+        point = view["points"][-1]["estimates"]["<b>node"]["cubature"]
+        assert point["mean"][0] == np.sin(299 / 20) and point["deviation"][1] == pytest.approx(0.1)
+        assert view["links"]["<b>node"]["used"] == 300 and view["tests"][0]["doubt"]
+        assert "times what its covariance says" in view["warnings"][0]
+
+    looked(look, Scripted(3.0, "</script><b>x"))
+
+
+def test_metrics_are_those_of_the_service():
+    async def look(url: str) -> None:
+        text = (await got(f"{url}/metrics"))[1]
+        found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+        assert found['heliograph_messages_total{node="<b>node",verdict="used"}'] == "300.0"
+        label = '{filter="cubature",node="<b>node"}'
+        low, ratio, high = (float(found[f"heliograph_nis{name}{label}"]) for name in ("_low", "", "_high"))
+        assert 0.7 < low < ratio < high < 1.4
+        assert found["heliograph_commit_seconds_count"] == "1.0" and found["heliograph_plants"] == "1.0"
+
+    looked(look, Scripted())
+
+
+def test_only_who_has_the_token_gets_in():
+    async def look(url: str) -> None:
+        for path in ("/", "/events", "/metrics", "/page.js", "/?token=wrong", "/?token=%C3%A9"):
+            status, text, _ = await got(f"{url}{path}")
+            assert status == 401 and TOKEN not in text
+        status, text, _ = await got(f"{url}/metrics", Authorization=f"Bearer {TOKEN}")
+        assert status == 200 and "heliograph_plants" in text
+        status, text, _ = await got(url, Cookie="heliograph=" + TOKEN.replace(" ", "%20"))
+        assert status == 401  # a cookie is what the page itself set
+        opener = urllib.request.build_opener(urllib.request.HTTPCookieProcessor())
+        opened = await asyncio.to_thread(opener.open, f"{url}/?token={TOKEN.replace(' ', '+')}", None, 10)
+        assert opened.status == 200 and "token" not in opened.url
+
+    looked(look, Scripted(), token=TOKEN)
+
+
+def test_a_page_of_elsewhere_that_takes_our_name_does_not_get_in():
+    async def look(url: str) -> None:
+        assert (await got(f"{url}/metrics", Host="evil.example"))[0] == 400
+        assert (await got(f"{url}/metrics", Host="localhost:80"))[0] == 200
+
+    looked(look, Scripted())
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser here")
+def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside():
+    async def look(url: str) -> None:
+        arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--timeout=4000", "--dump-dom", url]
+        browser = await asyncio.create_subprocess_exec("chromium", *arguments, stdout=-1, stderr=-3)
+        text = (await browser.communicate())[0].decode()
+        body = text[text.index("<main>") : text.index("</main>")]
+        assert body.count("<svg") == 2 and 'class="area"' in body
+        assert "&lt;b&gt;node" in body and "&lt;i&gt;x" in body and "<b>node" not in body and "<i>" not in body
+        assert ">doubtful</td>" in body and "400" in body
+
+    looked(look, Scripted(3.0, "<img src=x onerror=alert(1)>"), rows=400)

@@ -1,0 +1,55 @@
+"""A service that says what a test wants it to: so that the page can be looked at without a filter."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from pydantic_core import to_json
+
+from heliograph.serving.output import Output
+from heliograph.serving.plant import Link
+
+
+@dataclass
+class OnePlant:
+    links: dict[str, Link] = field(default_factory=dict)
+
+
+@dataclass
+class Last:
+    took: float = 0.002
+    committed: float = 0.001
+
+
+@dataclass
+class Scripted:
+    """Says that each message, a number, was a row of `plant` with this innovation in units of its claim."""
+
+    scale: float = 1.0
+    plant: str = "mower"
+    plants: dict[str, OnePlant] = field(default_factory=dict)
+    malformed: int = 0
+    last: Last = field(default_factory=Last)
+
+    def unpublished(self) -> list[Output]:
+        return []
+
+    def published(self, outputs: Sequence[Output]) -> None: ...
+
+    def finish(self, ended: bool) -> list[Output]:
+        return []
+
+    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+        link = self.plants.setdefault(self.plant, OnePlant()).links.setdefault("<b>node", Link())
+        found = []
+        for payload in payloads:
+            i = int(payload)
+            link.used += 1
+            nis = self.scale * float(np.random.default_rng(i).chisquare(2))
+            covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
+            told = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
+            told |= {"claim": "nominal", "nis": nis, "heard": 2}
+            body = {"id": i, "plant": self.plant, "time": i / 10, "estimates": {"<b>node": {"cubature": told}}}
+            found.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
+            found.append(Output(None, self.plant, "provisional", to_json(body | {"kind": "provisional"})))
+        return found
