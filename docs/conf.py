@@ -12,12 +12,11 @@ import reference  # noqa: E402  (found in the folder above)
 project = "heliograph"
 author = "The heliograph authors"
 release = version = version_of("heliograph")
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_design", "sphinx_gallery.gen_gallery"]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
 exclude_patterns = ["gallery", "_site", "_made/gallery/GALLERY_HEADER.rst"]
 templates_path: list[str] = []
 
 # Pages: plain markdown that reads well without this site too; a heading is an anchor.
-myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 3
 suppress_warnings = ["config.cache"]  # the gallery's order is a function
 

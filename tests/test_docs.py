@@ -39,6 +39,18 @@ def test_the_gallery_is_one():
     assert len(GALLERY) >= 12
 
 
+def test_every_page_stands_in_the_contents():
+    """The site's build would say so too; here it is said at once: a new page is a line in one of the toctrees."""
+    listed = {
+        re.sub(r".*<(.*)>", r"\1", line)
+        for page in PAGES
+        for block in re.findall(r"```\{toctree\}\n(.*?)```", page.read_text(), re.DOTALL)
+        for line in block.splitlines()
+    }
+    missing = sorted({page.stem for page in PAGES} - listed - {"index"})
+    assert not missing, f"docs: no toctree has {missing}; docs/guide.md is the place for most"
+
+
 def test_speeds_are_those_that_were_measured():
     """Each comparison has its row: ours and the other's nanoseconds, and their ratio, as in benchmarks/results.json."""
     measured = json.loads((ROOT / "benchmarks" / "results.json").read_text())

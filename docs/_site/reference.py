@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
 
+from docutils import nodes
+
 import heliograph
 
 SPECIAL = re.compile(r"([\\*|_])")
@@ -185,7 +187,8 @@ def _of_function(function: object) -> tuple[str, str]:
     arguments = [*node.args.posonlyargs, *node.args.args]
     if arguments and arguments[0].arg in ("self", "cls"):
         node.args.args = node.args.args[1:]
-    return f"({ast.unparse(node.args)})", ast.unparse(node.returns) if node.returns else ""
+    result = ast.unparse(node.returns).strip("'") if node.returns else ""
+    return f"({ast.unparse(node.args)})", result
 
 
 def _of_fields(item: type) -> tuple[str, str]:
@@ -209,8 +212,22 @@ def _argument(parameter: inspect.Parameter, kind: str | None) -> str:
     return f"{text} = {parameter.default!r}" if plain else f"{text} = ..."
 
 
+def link_names(app, doctree, page):
+    """Make a link of every public name in the pages' code type: `hg.ROOM.NAME`, or a NAME that is no plain word."""
+    objects = app.env.get_domain("py").objects
+    for node in [n for n in doctree.findall(nodes.literal) if not isinstance(n.parent, nodes.reference)]:
+        text = node.astext().split("(")[0]
+        name = text.rsplit(".", 1)[-1]
+        known = objects.get(PLACES.get(name, ""))
+        plain = not text.startswith("hg.") and name.islower() and "_" not in name
+        if known and not plain and known.docname != page and re.fullmatch(r"[\w.]+", text):
+            address = f"{app.builder.get_relative_uri(page, known.docname)}#{known.node_id}"
+            node.replace_self(nodes.reference("", "", node.deepcopy(), internal=True, refuri=address))
+
+
 def connect(app: object) -> None:
-    """Let autodoc use these signatures and docstrings."""
+    """Let autodoc use these signatures and docstrings, and pages link to them."""
+    app.connect("doctree-resolved", link_names)
     app.connect("autodoc-process-signature", _on_signature)
     app.connect("autodoc-process-docstring", _on_docstring)
 
