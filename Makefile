@@ -9,7 +9,7 @@ INSTALL := -m pip install --quiet --quiet --disable-pip-version-check
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 CREATED := .venv/.python$(VERSION)
 
-.PHONY: help demo test bench soak constraints clean
+.PHONY: help demo test docs bench soak constraints clean
 .NOTPARALLEL:
 
 help:  ## Show this list
@@ -24,6 +24,12 @@ test: .venv/.test  ## Lint, check types and run the tests
 	$(BIN)/mypy --strict src
 	$(BIN)/pytest -n 2 --dist loadfile
 
+docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
+	@rm -rf out/docs docs/_made
+	$(BIN)/python -m sphinx -W --keep-going --quiet docs out/docs
+	$(BIN)/pytest --quiet docs/_site
+	@echo "Open out/docs/index.html"
+
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
 	@$(BIN)/python benchmarks/run.py
 
@@ -32,7 +38,7 @@ soak: .venv/.test  ## Kill a service fifty times; try ten thousand random networ
 	@$(BIN)/python benchmarks/soak.py
 
 clean:  ## Remove the environment and everything made by the other targets
-	rm -rf .venv out build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	rm -rf .venv out docs/_made build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
 	find src tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 $(CREATED):
@@ -52,18 +58,23 @@ $(CREATED):
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
 	@touch .venv/.demo $@
 
+.venv/.docs: .venv/.test
+	@echo "Installing what builds the documentation into .venv ..."
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,docs]'
+	@touch $@
+
 # The newest of everything on the oldest and on a newer Python. jax, numpy, scipy and zarr have left 3.11 behind,
 # so 3.11 has versions of its own and every later Python shares the others.
 constraints:  ## Pin the newest versions in constraints.txt (needs Python 3.11 and 3.13)
 	@set -e; work=$$(mktemp -d); trap 'rm -rf "$$work"' EXIT; export LC_ALL=C; \
 	for python in $(PYTHONS); do \
 	  "$$python" -m venv "$$work/venv" --clear; \
-	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all]'; \
+	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs]'; \
 	  "$$work/venv/bin/python" -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[^ ]+$$' \
 	    | sort > "$$work/$$(echo "$$python" | tr / _).txt"; \
 	done; \
 	set -- $(subst /,_,$(PYTHONS)); old="$$work/$$1.txt"; new="$$work/$$2.txt"; \
-	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all] resolves to.'; \
+	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs] resolves to.'; \
 	  { comm -12 "$$old" "$$new"; \
 	    comm -23 "$$old" "$$new" | sed 's/$$/; python_version < "3.12"/'; \
 	    comm -13 "$$old" "$$new" | sed 's/$$/; python_version >= "3.12"/'; } | sort -f; } > constraints.txt

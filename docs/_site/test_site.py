@@ -1,0 +1,92 @@
+"""The built site (`make docs` runs this after building): links lead somewhere, pages need nothing from outside.
+
+HELIOGRAPH_PICTURES=FOLDER keeps each page as a picture at both widths.
+"""
+
+import os
+from collections.abc import Iterator
+from functools import cache
+from html.parser import HTMLParser
+from pathlib import Path
+from urllib.parse import unquote, urldefrag
+
+import pytest
+from chromium import Browser, program
+
+SITE = Path(__file__).parents[2] / "out" / "docs"
+PAGES = sorted(path.relative_to(SITE).as_posix() for path in SITE.rglob("*.html") if "_static" not in path.parts)
+QUESTIONS = ["which_filter.html", "theory.html", "extend.html", "errata.html", "comparisons.html"]  # of a newcomer
+LOADED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src"}
+NOT_LOADED = {"canonical", "index", "search", "next", "prev", "author", "copyright"}
+
+
+class Links(HTMLParser):
+    """Where a page leads, what it loads, and the places in it that can be led to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.leads: set[str] = set()
+        self.loads: set[str] = set()
+        self.places: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        found = dict(attributes)
+        self.places |= {name for key in ("id", "name") if (name := found.get(key))}
+        if tag == "a" and found.get("href"):
+            self.leads.add(found["href"])
+        if tag in LOADED and found.get(LOADED[tag]) and found.get("rel") not in NOT_LOADED:
+            self.loads.add(found[LOADED[tag]])
+
+
+@cache
+def links(page: str) -> Links:
+    return Links((SITE / page).read_text())
+
+
+def outside(address: str) -> bool:
+    return address.startswith(("http:", "https:", "//"))
+
+
+def test_the_site_is_there():
+    assert {"index.html", *QUESTIONS} <= set(PAGES), "build the site first: make docs"
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_somewhere(page):
+    found = links(page)
+    assert not [address for address in found.loads if outside(address)]
+    for address in {a for a in found.leads | found.loads if not outside(a) and not a.startswith(("mailto:", "data:"))}:
+        where, place = urldefrag(unquote(address))
+        target = ((SITE / page).parent / where.partition("?")[0]).resolve() if where else SITE / page
+        assert target.exists(), address
+        if place and target.suffix == ".html":
+            assert place in links(target.relative_to(SITE).as_posix()).places, address
+
+
+@pytest.mark.parametrize("page", QUESTIONS)
+def test_an_answer_is_two_clicks_from_the_start(page):
+    one = {urldefrag(a)[0] for a in links("index.html").leads if not outside(a)} & set(PAGES)
+    two = {urldefrag(a)[0] for first in one if "/" not in first for a in links(first).leads}
+    assert page in one | two
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if program() is None:
+        pytest.skip("no Chromium here")
+    with Browser() as found:
+        yield found
+
+
+@pytest.mark.parametrize("width", [1200, 420])
+@pytest.mark.parametrize("page", PAGES)
+def test_a_page_loads_without_a_complaint(browser, page, width):
+    """From disk, without a server: nothing asked for elsewhere, nothing wrong, and no scrolling sideways."""
+    seen = browser.open((SITE / page).as_uri(), width)
+    if pictures := os.environ.get("HELIOGRAPH_PICTURES"):
+        Path(pictures).mkdir(parents=True, exist_ok=True)
+        browser.picture(Path(pictures) / f"{page.replace('/', '-')}-{width}.png")
+    assert [a for a in seen.requests if not a.startswith(("file:", "data:", "blob:"))] == []
+    assert seen.errors == []
+    assert seen.width <= width
