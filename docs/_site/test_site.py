@@ -3,6 +3,7 @@
 HELIOGRAPH_PICTURES=FOLDER keeps each page as a picture at both widths.
 """
 
+import inspect
 import os
 from collections.abc import Iterator
 from functools import cache
@@ -12,6 +13,8 @@ from urllib.parse import unquote, urldefrag
 
 import pytest
 from chromium import Browser, program
+
+import heliograph
 
 SITE = Path(__file__).parents[2] / "out" / "docs"
 PAGES = sorted(path.relative_to(SITE).as_posix() for path in SITE.rglob("*.html") if "_static" not in path.parts)
@@ -50,6 +53,20 @@ def outside(address: str) -> bool:
 
 def test_the_site_is_there():
     assert {"index.html", *QUESTIONS} <= set(PAGES), "build the site first: make docs"
+
+
+def test_the_reference_has_every_public_name():
+    anchors = set().union(*(links(page).places for page in PAGES if page.startswith("_made/api/")))
+    public = {f"heliograph.{name}" for name in heliograph.__all__}
+    public |= {
+        f"heliograph.{room}.{name}"
+        for room in heliograph.__all__
+        if inspect.ismodule(getattr(heliograph, room)) and room != "testing"
+        for name in getattr(heliograph, room).__all__
+    }
+    rooms = {f"heliograph.{n}" for n in heliograph.__all__ if inspect.ismodule(getattr(heliograph, n))}
+    assert len(public) > 150
+    assert sorted(public - rooms - anchors) == []
 
 
 @pytest.mark.parametrize("page", PAGES)
