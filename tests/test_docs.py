@@ -28,6 +28,7 @@ def test_examples_run(page, tmp_path, monkeypatch):
 def test_the_gallery_runs(example):
     """Each example draws one picture."""
     matplotlib.use("Agg")
+    plt.close("all")
     try:
         runpy.run_path(str(example))
         assert len(plt.get_fignums()) == 1

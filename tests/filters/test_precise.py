@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 
+import jax
 import numpy as np
 import pytest
 
@@ -51,8 +52,6 @@ def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
 
 def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
     """Beside a precise one or alone, a run's bits are the same."""
-    import jax
-
     plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
 
     def variance(noise):
@@ -64,3 +63,17 @@ def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
         apart = jax.jit(jax.vmap(variance))(np.array([[[1.0]], [[1.0]]]))
     np.testing.assert_array_equal(together[1], apart[1])
     assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
+
+
+def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
+    """The gradient of a sum over runs is each run's gradient, to rounding."""
+    item = hg.linear_filter(hg.LinearPlant(A, 0.01, [0.0, 0.0], 1.0), hg.LinearSensor(C, 0.1), hg.perfect(1))
+
+    def moved(z):
+        return item.correct(item.predict(item.init()), z)[0].mean.sum()
+
+    z = np.array([[1.0], [2.0]])
+    with jax.enable_x64(True):
+        together = jax.jit(jax.grad(lambda z: jax.vmap(moved)(z).sum()))(z)
+        each = jax.jit(jax.vmap(jax.grad(moved)))(z)
+    np.testing.assert_allclose(together, each, rtol=1e-14)

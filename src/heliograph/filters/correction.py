@@ -3,6 +3,7 @@
 Notation as in `update`: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n what arrives.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -15,6 +16,7 @@ from heliograph.numerics.check import array, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
     PRECISE,
+    Pick,
     congruence,
     diagonal,
     rounding,
@@ -25,6 +27,8 @@ from heliograph.numerics.small_matrix import (
     times,
     trace,
     transpose,
+    where_any,
+    where_each,
     with_rounding,
 )
 from heliograph.numerics.types import Array
@@ -190,19 +194,28 @@ def _difference(prior: jax.Array, cross: jax.Array, solved: jax.Array) -> jax.Ar
 _bound = runs_last(_difference)
 
 
-@runs_last
 def covariance_after(
     prior: jax.Array, cross: jax.Array, omega: jax.Array, solved: jax.Array, output: jax.Array, noise: jax.Array
 ) -> jax.Array:
     """P+ of the gain solved' = C' Omega^-1, in the form that keeps its digits (`gain_and_covariance`)."""
+    return _covariance_after(prior, cross, omega, solved, output, noise)
+
+
+def _covariance(
+    pick: Pick,
+    prior: jax.Array,
+    cross: jax.Array,
+    omega: jax.Array,
+    solved: jax.Array,
+    output: jax.Array,
+    noise: jax.Array,
+) -> jax.Array:
     own = [noise[i, i] < rounding(PRECISE, prior, 1000) * omega[i, i] for i in range(len(omega))]
-    precise = jnp.any(jnp.stack(own), axis=0)
+    return pick(
+        jnp.any(jnp.stack(own), axis=0),
+        lambda: sum_of_squares(prior, transpose(solved), output, noise),
+        lambda: _difference(prior, cross, solved),
+    )
 
-    def short() -> jax.Array:
-        return _difference(prior, cross, solved)
 
-    def some_squares() -> jax.Array:
-        return jnp.where(precise, sum_of_squares(prior, transpose(solved), output, noise), short())
-
-    chosen: jax.Array = jax.lax.cond(jnp.any(precise), some_squares, short)
-    return chosen
+_covariance_after = runs_last(partial(_covariance, where_any), partial(_covariance, where_each))

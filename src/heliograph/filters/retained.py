@@ -5,6 +5,7 @@ A sweep starts at the last step with `end`, passes each step with `back`, and re
 """
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.small_matrix import (
+    Pick,
     congruence,
     inner,
     runs_last,
@@ -22,6 +24,8 @@ from heliograph.numerics.small_matrix import (
     times,
     times_vector,
     transpose,
+    where_any,
+    where_each,
     with_rounding,
 )
 from heliograph.numerics.small_matrix import solve as small_solve
@@ -289,22 +293,21 @@ def _less(p: jax.Array, factor: jax.Array, middle: jax.Array) -> jax.Array:
     return symmetric(with_rounding(p, len(p)) - congruence(factor, middle))
 
 
-@runs_last
-def _left(p: jax.Array, matrix: jax.Array, transition: jax.Array, process: jax.Array, later: jax.Array) -> jax.Array:
+def _left_by(
+    pick: Pick, p: jax.Array, matrix: jax.Array, transition: jax.Array, process: jax.Array, later: jax.Array
+) -> jax.Array:
     half = times(p, matrix)
     own = [p[i, i] - inner(half[i : i + 1], p[i : i + 1]) < SHARP * p[i, i] for i in range(len(p))]
-    lost = jnp.any(jnp.stack(own), axis=0)
 
-    def short() -> jax.Array:
-        return symmetric(with_rounding(p, len(p)) - times(half, p))
-
-    def some_squares() -> jax.Array:
+    def squares() -> jax.Array:
         moved = times(transition, p)
         back = transpose(small_solve(times(moved, transpose(transition)) + process, moved))
-        return jnp.where(lost, sum_of_squares(p, back, transition, process + later), short())
+        return sum_of_squares(p, back, transition, process + later)
 
-    chosen: jax.Array = jax.lax.cond(jnp.any(lost), some_squares, short)
-    return chosen
+    return pick(jnp.any(jnp.stack(own), axis=0), squares, lambda: symmetric(with_rounding(p, len(p)) - times(half, p)))
+
+
+_left = runs_last(partial(_left_by, where_any), partial(_left_by, where_each))
 
 
 @runs_last

@@ -29,8 +29,13 @@ R = TypeVar("R")
 A = TypeVar("A", jax.Array, np.ndarray)
 
 
-def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
-    """Have vmap put its axis last in every argument and result of a kernel; derivatives are those of its arithmetic."""
+def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None) -> Callable[P, R]:
+    """Have vmap put its axis last in every argument and result of a kernel; derivatives are those of its arithmetic.
+
+    Or of other arithmetic for the same: that of a kernel which branches on all runs at once, `where_any`, cannot be
+    mapped over runs.
+    """
+    source = kernel if differentiable_as is None else differentiable_as
     traced = jax.jit(kernel)  # once per shapes, however many filters use it
     batched = custom_vmap(lambda *args: jax.lax.platform_dependent(*args, cpu=_alone(traced), default=traced))
 
@@ -41,7 +46,7 @@ def runs_last(kernel: Callable[P, R]) -> Callable[P, R]:
         return results, jax.tree.map(lambda _: True, results)
 
     differentiable = jax.custom_jvp(batched)
-    differentiable.defjvp(lambda primals, tangents: jax.jvp(kernel, primals, tangents))
+    differentiable.defjvp(lambda primals, tangents: jax.jvp(source, primals, tangents))
     return wraps(kernel)(differentiable)
 
 
@@ -61,6 +66,20 @@ def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
         )
 
     return call
+
+
+Pick = Callable[[jax.Array, Callable[[], jax.Array], Callable[[], jax.Array]], jax.Array]
+
+
+def where_any(needed: jax.Array, costly: Callable[[], jax.Array], cheap: Callable[[], jax.Array]) -> jax.Array:
+    """`costly` for runs that need it and `cheap` for the others; `costly` is computed only where any run needs it."""
+    result: jax.Array = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
+    return result
+
+
+def where_each(needed: jax.Array, costly: Callable[[], jax.Array], cheap: Callable[[], jax.Array]) -> jax.Array:
+    """The same by computing both."""
+    return jnp.where(needed, costly(), cheap())
 
 
 def _to_last(x: Array, is_batched: bool) -> jax.Array:
