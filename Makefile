@@ -27,7 +27,7 @@ test: .venv/.test  ## Lint, check types and run the tests
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
 	@rm -rf out/docs docs/_made
 	$(BIN)/python -m sphinx -W --keep-going --quiet docs out/docs
-	$(BIN)/pytest --quiet docs/_site
+	$(BIN)/python -m pytest --quiet docs/_site
 	@echo "Open out/docs/index.html"
 
 bench: .venv/.test  ## Time everything, beside its peers, into benchmarks/results.json
