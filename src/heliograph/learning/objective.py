@@ -26,7 +26,7 @@ from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.small_matrix import solve
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.second_moments import has_random_gain, second_order
+from heliograph.random_affine.second_moments import has_known_gain, has_random_gain, second_order
 from heliograph.simulation.network import Network
 
 Form = Literal["linear", "conditional"]
@@ -143,7 +143,7 @@ def forms_of(network: Network) -> list[Form]:
         if one.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or not has_random_gain(one, second_order(one)):
+    if not plain or has_known_gain(one) or not has_random_gain(one, second_order(one)):
         return ["linear"]
     return ["linear", "conditional"]
 
