@@ -39,6 +39,7 @@ ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
     "links_with_memory",
 )  # fmt: skip
+BESIDE = ("learning",)  # like those alone, but they ask peers of their own
 
 
 class Program(NamedTuple):
@@ -225,7 +226,7 @@ def main() -> None:
     for name, item in COMPARISONS.items():
         comparisons[name] = compare(item, rates, with_peers)
         show_comparison(comparisons[name])
-    for name in ALONE:
+    for name in (*ALONE, *(BESIDE if with_peers else ())):
         others[name] = alone(name, chosen.old)
         show_alone(name, others[name])
     found = {

@@ -11,6 +11,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "build" / "peers"
 REQUIREMENTS = {
     "cuthbert": ("cuthbert==0.1.1",),
     "filterpy": ("filterpy==2.0.0",),
+    "kalman-py": ("kalman-py[jax]==0.1.1",),
     "pykalman": ("pykalman==0.11.2",),
     "statsmodels": ("statsmodels==0.15.0",),
 }

@@ -139,7 +139,7 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
     quiet = jnp.zeros(item.received)
 
     def body(state: Any, row: tuple[jax.Array, jax.Array]) -> tuple[Any, tuple[Plan, jax.Array]]:
-        one, prior, after = _followed(item, state, quiet, row[1], row[0])
+        one, prior, after = followed(item, state, quiet, row[1], row[0])
         return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
 
     start = item.init()
@@ -159,7 +159,7 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
     )
 
 
-def _followed(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, Any, Any]:
+def followed(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, Any, Any]:
     """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     none = jnp.zeros_like(state.mean)
 
@@ -191,7 +191,7 @@ def linear_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k:
     if isinstance(item, PlannedFilter):
         found: Plan = at(item.steps, k)
         return found
-    one, _, _ = _followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    one, _, _ = followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
     return one._replace(
         gain=jnp.where(present, one.gain, 0.0),

@@ -3,7 +3,7 @@
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-from scipy import stats
+from scipy import fft, stats
 
 from heliograph.numerics.types import Float
 
@@ -32,8 +32,7 @@ def cosines(scores: Scores) -> LongRun:
     for s in scores:
         steps = len(s)
         count = max(int(0.4 * steps ** (2 / 3)), 1)
-        angles = np.pi * np.outer(np.arange(1, count + 1), np.arange(steps) + 0.5) / steps
-        g = np.sqrt(2 / steps) * np.cos(angles) @ s
+        g = np.sqrt(1 / (2 * steps)) * fft.dct(s, axis=0)[1 : count + 1]
         parts.append(steps / count * g.T @ g)
         weights.append((steps, count))
     total = sum(steps for steps, _ in weights)

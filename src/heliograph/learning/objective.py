@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,18 +14,19 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
-from heliograph.filters.linear import linear_filter
+from heliograph.filters.linear import LinearFilter, linear_filter
+from heliograph.learning import settling
 from heliograph.learning.joint import joint_world
 from heliograph.learning.parameters import Description
 from heliograph.model.fading import without_memory
-from heliograph.model.over_time import first
+from heliograph.model.over_time import OverTime, first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.small_matrix import solve
 from heliograph.numerics.types import Array, Float, PyTree
-from heliograph.random_affine.second_moments import has_random_gain, second_order
+from heliograph.random_affine.second_moments import has_known_gain, has_random_gain, second_order
 from heliograph.simulation.network import Network
 
 Form = Literal["linear", "conditional"]
@@ -39,6 +41,11 @@ class Data(NamedTuple):
     measurements: Float[np.ndarray, "recordings steps received"]
     inputs: Float[np.ndarray, "recordings steps inputs"]
     lengths: tuple[int, ...]
+
+    @property
+    def plain(self) -> bool:
+        """Whether everything arrived, and nothing was put in."""
+        return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
 class Found(NamedTuple):
@@ -74,11 +81,16 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The filter of one form, from numbers on the line. Equal ones share a compiled program: see `_identity`."""
+    """The filter of one form, from numbers on the line. Equal ones share a compiled program: see `_identity`.
+
+    settles: it is a `LinearFilter` of which nothing varies over time. random: so are gains.
+    """
 
     description: Description
     form: Form
     identity: Hashable
+    settles: bool
+    random: bool
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Objective) and self.identity == other.identity
@@ -117,8 +129,9 @@ def objectives(network: Description) -> list[Objective]:
         ValueError: a network whose likelihood no filter here knows.
     """
     built = network.start
-    identity = _identity(network, built)
-    return [Objective(network, form, (form, identity)) for form in forms_of(built)]
+    identity, forms = _identity(network, built), forms_of(built)
+    settles, random = _settles(built), len(forms) > 1
+    return [Objective(network, form, (form, identity), settles and form == "linear", random) for form in forms]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -130,9 +143,16 @@ def forms_of(network: Network) -> list[Form]:
         if one.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or not has_random_gain(one, second_order(one)):
+    if not plain or has_known_gain(one) or not has_random_gain(one, second_order(one)):
         return ["linear"]
     return ["linear", "conditional"]
+
+
+def _settles(network: Network) -> bool:
+    """Whether the linear filter is one that neither remembers nor waits, and nothing varies over time."""
+    world = joint_world(network)
+    one = first(world[2])
+    return not one.remembers and not one.past and not any(isinstance(part, OverTime) for part in world)
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
@@ -144,21 +164,43 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
 
 
 def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Found:
-    """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program."""
-    parts = []
+    """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
+
+    Where gains settle, one at a time: there is enough to do side by side within a recording.
+    """
+    every: dict[int, Found] = {}
     with jax.enable_x64(True):
-        for begin in range(0, len(x), lanes):
-            some = x[begin : begin + lanes]
-            full = np.concatenate([some, np.repeat(some[-1:], lanes - len(some), axis=0)])
+        for i, point in enumerate(x if objective.settles and data.plain else ()):
+            found, settled = to_numpy(_settling(objective, point, data.measurements))
+            if settled:
+                every[i] = found
+        left = [i for i in range(len(x)) if i not in every]
+        for begin in range(0, len(left), lanes):
+            places = left[begin : begin + lanes]
+            full = x[places + places[-1:] * (lanes - len(places))]
             found = to_numpy(_many(objective, full, data.measurements, data.inputs))
-            parts.append(jax.tree.map(lambda leaf: leaf[: len(some)], found))  # noqa: B023
-    return Found(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+            every |= {i: Found(*(leaf[lane] for leaf in found)) for lane, i in enumerate(places)}
+    return Found(*(np.stack(each) for each in zip(*(every[i] for i in range(len(x))), strict=True)))
 
 
 @large_program
 def _many(objective: Objective, x: Array, z: Array, u: Array) -> Found:
     one: Found = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
     return one
+
+
+@large_program
+def _settling(objective: Objective, x: Array, z: Array) -> tuple[Found, jax.Array]:
+    def numbers(x: Array) -> PyTree:
+        return eqx.filter(objective.filter(x), eqx.is_inexact_array)
+
+    item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
+    slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
+    assert isinstance(item, LinearFilter)  # the objective settles
+    heard, derivatives, settled = settling.innovations(item, slopes, z, objective.random)
+    scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
+    found = Found(*scored(heard.value, heard.covariance, derivatives.value, derivatives.covariance, jnp.asarray(z)))
+    return found._replace(halves=jnp.sum(found.halves, axis=0)), settled
 
 
 def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Found:

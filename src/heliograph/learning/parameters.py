@@ -4,13 +4,15 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import block_diag
 
-from heliograph.learning.transforms import from_line, size, slope, to_line
+from heliograph.learning.transforms import from_line, size, slope, to_line, unlink, unlink_slope
 from heliograph.numerics.check import array, fail, function, instance, shown, shown_error
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
 from heliograph.numerics.readable import readable
@@ -96,6 +98,23 @@ class Parameter:
         """Those entries as a vector."""
         return value[np.tril_indices(len(value))] if self.domain.kind == "covariance" else value.reshape(-1)
 
+    def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
+        """The entries at a point of the line."""
+        if self.domain.kind == "interval":
+            return np.asarray(unlink(self.domain, x))
+        with jax.enable_x64(True):
+            return np.asarray(self._read_at(jnp.asarray(x)))
+
+    def derivatives(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, "entries size"]:
+        """Their derivatives."""
+        if self.domain.kind == "interval":
+            return np.diag(unlink_slope(self.domain, x))
+        with jax.enable_x64(True):
+            return np.asarray(jax.jacfwd(self._read_at)(jnp.asarray(x)))
+
+    def _read_at(self, x: Array) -> Array:
+        return self.read(from_line(self.domain, self.start.shape, x))
+
     @property
     def entry_domains(self) -> tuple[Domain, ...]:
         """Where each entry may lie."""
@@ -164,20 +183,17 @@ class Parameters:
         with jax.enable_x64(True):
             return {name: plain_number(value) for name, value in self.values(jnp.asarray(x)).items()}
 
-    def flat(self, x: Array) -> Array:
-        """The entries of the table at a point of the line."""
-        values = self.values(x)
-        return jnp.concatenate([one.read(values[one.name]) for one in self.every])
-
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Values of the entries."""
-        with jax.enable_x64(True):
-            return np.asarray(self.flat(jnp.asarray(x)))
+        return np.concatenate([one.values(own) for one, own in self._parts(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
         """Derivatives of the entries."""
-        with jax.enable_x64(True):
-            return np.asarray(jax.jacfwd(self.flat)(jnp.asarray(x)))
+        return np.asarray(block_diag(*(one.derivatives(own) for one, own in self._parts(x))))
+
+    def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
+        ends = np.cumsum([one.size for one in self.every])
+        return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
         """Derivatives of the entries, each on the scale where its interval is symmetric."""
@@ -275,7 +291,7 @@ class Description:
                 got = f"one that is read: {shown_error(error)}"
                 raise fail("network to be learned", expected, got) from error
 
-    @property
+    @cached_property
     def start(self) -> Network:
         """The network at its starts."""
         return self.at({one.name: plain_number(one.start) for one in self.parameters.every})

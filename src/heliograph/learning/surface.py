@@ -1,7 +1,7 @@
 """The likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -28,10 +28,11 @@ class StoppedError(Exception):
 
 @dataclass(frozen=True)
 class Surface:
-    """One objective over all recordings."""
+    """One objective over all recordings; the points asked for last are kept, for they are often asked for again."""
 
     objective: Objective
     data: Data
+    _last: list[tuple[np.ndarray, Found]] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def lanes(self) -> int:
@@ -42,7 +43,9 @@ class Surface:
 
     def found(self, x: Float[np.ndarray, "points p"]) -> Found:
         """All that is known at points."""
-        return at_points(self.objective, np.asarray(x), self.data, self.lanes)
+        if not (self._last and np.array_equal(self._last[0][0], x)):
+            self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
+        return self._last[0][1]
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
         """Likelihood, gradient and information at points."""

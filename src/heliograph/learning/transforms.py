@@ -70,6 +70,15 @@ def unlink(domain: Domain, value: Any) -> Any:
     return domain.high - np.exp(value) if np.isfinite(domain.high) else value
 
 
+def unlink_slope(domain: Domain, value: Any) -> Any:
+    """d unlink / d value."""
+    if np.isfinite(domain.low) and np.isfinite(domain.high):
+        return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
+    if np.isfinite(domain.low):
+        return np.exp(value)
+    return -np.exp(value) if np.isfinite(domain.high) else np.ones_like(value)
+
+
 def slope(domain: Domain, value: Any) -> Any:
     """d link / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
