@@ -40,12 +40,13 @@ class Service:
     """A network's filters, for any number of plants, fed with messages in whatever order they come.
 
     It knows no transport: `take` uses a batch and gives what is to be told of it, after the commit. One call at a time.
+    `malformed` and `known` count messages that could not be read, and duplicates and late ones.
     """
 
     def __init__(self, fleet: Fleet, store: Keeps):
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
-        self.malformed, self.last = 0, Taken(0, 0, 0.0, 0.0)
+        self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0)
         self._teller = Teller(fleet.lanes)
         self._told: int | None = None  # up to where, since the last commit
 
@@ -88,7 +89,7 @@ class Service:
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
         """Use messages and commit; what is to be told, and how long the commit took."""
-        touched, used, entries, malformed = dict[str, Plant](), set[str](), list[Entry](), 0
+        touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
         for message, payload in zip(messages, payloads, strict=True):
             try:
                 if isinstance(message, str):
@@ -103,6 +104,7 @@ class Service:
             if verdict == "used":
                 used.add(message.plant)
             else:
+                known += verdict in ("duplicate", "late")
                 entries.append(_refusal(message, verdict))
         settled = self.fleet.settle(touched.values())
         entries += self._finals(settled)
@@ -112,6 +114,7 @@ class Service:
         outputs = self._commit(touched, entries, malformed)
         committed = perf_counter() - begun
         self.malformed += malformed
+        self.known += known
         return outputs + provisional, committed
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
