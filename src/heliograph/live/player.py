@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.clock import time_input, uneven
+from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
 from heliograph.live.mould import cast
 from heliograph.live.tape import Ears, Tape, replay
@@ -53,6 +54,15 @@ class Player:
             ValueError: no filter that can be smoothed.
         """
         return Sweeper(self.network, self.dt)
+
+    @cached_property
+    def identity(self) -> Identity:
+        """What the network and its program are to a timeline that was saved."""
+        two = np.zeros(2, dtype=np.int32)
+        with jax.enable_x64(True):
+            tape = self.blank(2, 0.0)
+            lowered = self.replay.lower(self.numbers, tape, np.asarray(tape.rows[0]), two, np.zeros(3, dtype=np.int32))
+        return network_identity(self.network, lowered.as_text(), {})
 
     def blank(self, slots: int, time: float) -> Tape:
         """A tape of nothing, with the filters before the first step in slot 0, at `time`."""

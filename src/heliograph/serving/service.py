@@ -28,12 +28,16 @@ WHY: dict[Verdict, str] = {
 
 
 class Taken(NamedTuple):
-    """What the last batch was: numbers of messages and outputs, and the seconds that it took in all and to commit."""
+    """What the last batch was: numbers of messages and outputs, and the seconds that it took in all and to commit.
+
+    `lag`: how long ago the oldest of its messages was measured, where they carry dates; else what it took.
+    """
 
     messages: int
     outputs: int
     took: float
     committed: float
+    lag: float
 
 
 class Service:
@@ -46,7 +50,7 @@ class Service:
     def __init__(self, fleet: Fleet, store: Keeps):
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
-        self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0)
+        self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller = Teller(fleet.lanes)
         self._told: int | None = None  # up to where, since the last commit
 
@@ -68,7 +72,10 @@ class Service:
                 break
             except ConflictError:
                 self._load({message.plant for message in messages if isinstance(message, Message)})
-        self.last = Taken(len(payloads), len(outputs), perf_counter() - begun, committed)
+        took = perf_counter() - begun
+        dates = [each.time for each in messages if isinstance(each, Message) and isinstance(each.time, datetime)]
+        lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
+        self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
 
     def unpublished(self) -> list[Output]:
@@ -159,7 +166,7 @@ class Service:
         if inputs is not None:
             self.fleet.take(plant, inputs)
         verdict = self.fleet.take(plant, event)
-        plant.link(message.node).count(verdict, message.sequence)
+        plant.link(message.node).count(verdict, message.sequence, at)
         return plant, verdict
 
     def _origin(self, message: Message) -> datetime | None:
