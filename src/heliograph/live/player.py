@@ -1,6 +1,7 @@
 """What the timelines of one network share: compiled programs, and the numbers of the filters where these find them."""
 
 from functools import cached_property
+from typing import Any
 from weakref import WeakValueDictionary
 
 import jax
@@ -59,9 +60,10 @@ class Player:
     def identity(self) -> Identity:
         """What the network and its program are to a timeline that was saved."""
         two = np.zeros(2, dtype=np.int32)
+        program: Any = self.replay  # the compiler's functions have no type that says so
         with jax.enable_x64(True):
             tape = self.blank(2, 0.0)
-            lowered = self.replay.lower(self.numbers, tape, np.asarray(tape.rows[0]), two, np.zeros(3, dtype=np.int32))
+            lowered = program.lower(self.numbers, tape, np.asarray(tape.rows[0]), two, np.zeros(3, dtype=np.int32))
         return network_identity(self.network, lowered.as_text(), {})
 
     def blank(self, slots: int, time: float) -> Tape:
