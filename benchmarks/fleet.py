@@ -1,7 +1,8 @@
 """A fleet of plants of the README's network behind one process and behind two, from JSON lines held in memory.
 
-Run: python benchmarks/fleet.py. Microseconds of a step, which here is a message; least over ROUNDS. Where the state is
-kept, every batch is committed to a disk. With two processes, each has half of the plants and a store of its own.
+Run: python benchmarks/fleet.py. Microseconds of a step, which here is a message; least over ROUNDS: of processors, all
+threads together, and by the clock on the wall. Where the state is kept, every batch is committed to a disk. With two
+processes, each has half of the plants and a store of its own.
 """
 
 import json
@@ -12,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from timeline import readme_network
@@ -26,7 +27,15 @@ from heliograph.serving.service import Service
 from heliograph.serving.store import Store
 
 PLANTS, EACH, BATCH, SPACING, WINDOW, ROUNDS = 1000, 60, 8192, 0.5, 5.0, 3
-LIMIT = 20  # 50,000 steps a second, on two cores
+LIMIT = 20.0  # 50,000 steps a second, on two processors
+
+
+class Taken(NamedTuple):
+    """Seconds of processors, and by the clock on the wall; of these to commit."""
+
+    processors: float
+    wall: float
+    committed: float
 
 
 def lines(plants: int) -> list[bytes]:
@@ -40,8 +49,8 @@ def lines(plants: int) -> list[bytes]:
     return found
 
 
-def rounds(plants: int, stored: bool) -> tuple[float, float]:
-    """Least seconds of all messages, and those of it that committing took."""
+def rounds(plants: int, stored: bool) -> Taken:
+    """Least seconds of all messages, of each kind."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         lanes = Lanes(readme_network())
@@ -52,18 +61,18 @@ def rounds(plants: int, stored: bool) -> tuple[float, float]:
         with tempfile.TemporaryDirectory(dir=Path(__file__).parent) as folder:  # on a disk, not in memory
             fleet = Fleet(lanes, Options(WINDOW))
             service = Service(fleet, Store(f"{folder}/fleet.db", identity(fleet)) if stored else Nowhere())
-            begun, committed = time.perf_counter(), 0.0
+            begun, worked, committed = time.perf_counter(), time.process_time(), 0.0
             for begin in range(0, len(sent), BATCH):
                 service.take(sent[begin : begin + BATCH])
                 committed += service.last.committed
-            found.append((time.perf_counter() - begun, committed))
+            found.append(Taken(time.process_time() - worked, time.perf_counter() - begun, committed))
             service.store.close()
-    return min(found)
+    return Taken(*map(min, zip(*found, strict=True)))
 
 
 def half(_: int) -> float:
     """One of two processes."""
-    return rounds(PLANTS // 2, True)[0]
+    return rounds(PLANTS // 2, True).wall
 
 
 def least(function: Callable[[], object]) -> float:
@@ -79,18 +88,20 @@ def least(function: Callable[[], object]) -> float:
 def measure() -> dict[str, Any]:
     """A step in microseconds, and where its time goes."""
     count = PLANTS * EACH
-    memory, (stored, committed) = rounds(PLANTS, False)[0], rounds(PLANTS, True)
+    memory, stored = rounds(PLANTS, False), rounds(PLANTS, True)
     sent = lines(PLANTS)
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
         both = max(pool.map(half, range(2)))
     values = {
-        "one process, nothing kept": memory / count * 1e6,
-        "one process": stored / count * 1e6,
-        "of it committing": committed / count * 1e6,
+        "processors, nothing kept": memory.processors / count * 1e6,
+        "processors": stored.processors / count * 1e6,
+        "one process, nothing kept": memory.wall / count * 1e6,
+        "one process": stored.wall / count * 1e6,
+        "of it committing": stored.committed / count * 1e6,
         "of it reading JSON": least(lambda: [read_message(line) for line in sent]),
         "two processes": both / count * 1e6,
     }
-    return {"unit": "us", "values": values, "at_most": {"two processes": LIMIT}}
+    return {"unit": "us", "values": values, "at_most": {"processors": 2 * LIMIT, "two processes": LIMIT}}
 
 
 def main() -> None:

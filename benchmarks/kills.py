@@ -104,7 +104,7 @@ def killed(count: int, seed: int, folder: Path) -> dict[str, Any]:
         writer = Thread(target=running.write, args=(sent,))
         writer.start()
         if kill < count:
-            while not running.told:  # before the first answer there is nothing to lose
+            while not running.told and running.process.poll() is None:  # before the first answer nothing can be lost
                 sleep(PAUSE)
             sleep(chance.uniform(0, PAUSE * len(sent) / PART))
             running.process.send_signal(signal.SIGKILL)

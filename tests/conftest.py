@@ -48,6 +48,11 @@ def pytest_collection_finish():
 def forget_compiled_programs():
     """A module's programs are hardly ever another's; kept, they and what the compiler left would be gigabytes."""
     yield
+    forget()
+
+
+def forget():
+    """Let go of all compiled programs."""
     if "jax" in sys.modules:
         sys.modules["jax"].clear_caches()
         gc.collect()

@@ -9,11 +9,16 @@ import pytest
 pytest.importorskip("gtsam")
 pytest.importorskip("nats")
 pytest.importorskip("sqlalchemy")
+import nats
+from nats.js.errors import NoStreamResponseError
+
 from heliograph.examples.live.compute import Outcome
-from heliograph.examples.live.killed import killed, left_alone
+from heliograph.examples.live.killed import TOPIC, _reads, _send, _told, killed, left_alone
 from heliograph.examples.live.mower import read_drive
 from heliograph.examples.live.server import Server
 from heliograph.examples.live.speed import PLANTS, many
+from heliograph.serving.address import address
+from heliograph.serving.nats import Nats
 
 
 def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
@@ -32,6 +37,32 @@ def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
     assert told == sorted(told)
     outcome = Outcome(400, 0, 1, 0, alone, alone[1:], {"a": (5, 4), "b": (5, 7)}, 0, *[None] * 4, {}, {})  # type: ignore[arg-type]
     assert not outcome.identical and outcome.lost == 1 and outcome.counted_twice == 2
+
+
+def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
+    """A service makes the stream of what it tells before that of what it reads: a message in between would be lost."""
+
+    async def work(server: Server) -> None:
+        transport = Nats(address(f"nats://127.0.0.1:{server.nats}/{TOPIC}", {}))
+        client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
+        await transport._open()
+        assert await _told(client, 0) and not await _reads(client)
+        with pytest.raises(ExceptionGroup) as error:
+            async with asyncio.timeout(5), asyncio.TaskGroup() as group:
+                group.create_task(_send(client, [b"{}"]))
+                await asyncio.sleep(30)
+        assert error.group_contains(NoStreamResponseError)
+        await transport._reading()
+        assert await _reads(client)
+        await _send(client, [b"{}"])
+        await asyncio.gather(transport.close(), client.close())
+
+    server = Server(tmp_path)
+    server.start()
+    try:
+        asyncio.run(work(server))
+    finally:
+        server.kill()
 
 
 def test_many_mowers_send_what_one_did():

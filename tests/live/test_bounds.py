@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import heliograph
 import heliograph as hg
 
 SENSOR = hg.LinearSensor([[1.0]], 0.1)
@@ -80,7 +81,7 @@ REFUSED = [
 ]
 
 
-def test_what_is_no_event_is_told_in_one_line_and_changes_nothing(network):
+def test_what_is_no_event_is_told_in_one_line_and_changes_nothing(network, monkeypatch):
     timeline = hg.Timeline(network, 5.0)
     timeline.push("a", 0, 1.0, 1.0)
     before = timeline.save()
@@ -88,11 +89,21 @@ def test_what_is_no_event_is_told_in_one_line_and_changes_nothing(network):
         with pytest.raises(ValueError, match=message):
             timeline.push(*event)
     assert timeline.save() == before
-    with pytest.raises(ValueError, match=r"snapshot: expected what Timeline\.save returned, got b'x'"):
+    with pytest.raises(ValueError, match=r"snapshot: expected what save returned, got b'x'"):
         hg.Timeline.restore(network, b"x")
-    other = hg.Network(network.plant, {"b": network.nodes["a"]})
-    with pytest.raises(ValueError, match="snapshot: expected one of this network, got one of nodes"):
-        hg.Timeline.restore(other, before)
+    node = network.nodes["a"]
+    quieter = hg.Node(hg.LinearSensor([[1.0]], 0.05), node.channel, node.filters)
+    for other, what in (
+        (hg.Network(network.plant, {"b": node}), r"nodes: b .*nodes: a "),
+        (hg.Network(network.plant, {"a": quieter}), "numbers of node 'a'"),
+        (network.in_single_precision(), "precision: single.*precision: double"),
+    ):
+        with pytest.raises(ValueError, match=f"snapshot: expected the state of what is here .*{what}"):
+            hg.Timeline.restore(other, before)
+    monkeypatch.setattr(heliograph, "__version__", "0.0.1")
+    same = hg.Network(network.plant, {"a": node})
+    with pytest.raises(ValueError, match=r"what is here \(heliograph: 0.0.1\)"):
+        hg.Timeline.restore(same, before)
 
 
 def test_in_steps_times_are_steps():

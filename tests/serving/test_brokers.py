@@ -11,6 +11,7 @@ import pytest
 pytest.importorskip("nats")
 pytest.importorskip("paho")
 import nats
+import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
@@ -79,7 +80,7 @@ def numbered(start: int, stop: int) -> list[bytes]:
 async def made(where: Address, part: Part = Part()) -> Nats:  # noqa: B008
     """A reader that has made its stream."""
     reader = Nats(where, part)
-    assert await silent(reader)
+    await asyncio.wait_for(reader._reading(), 20)
     return reader
 
 
@@ -100,6 +101,49 @@ def test_another_url_is_refused_in_one_line_without_the_password(url: str):
     with pytest.raises(ValueError, match=r"^broker") as error:
         address(url, {})
     assert "s3cret" not in str(error.value) and "\n" not in str(error.value)
+
+
+class Deaf:
+    """A client of NATS that is cancelled while it flushes what it sends, or stalls: it goes on, or raises its own."""
+
+    def __init__(self, error: Exception | None):
+        self.error, self.heard = error, 0
+
+    async def fetch(self, *_: object, **__: object) -> list[bytes]:
+        try:
+            await asyncio.sleep(5)
+        except asyncio.CancelledError:
+            self.heard += 1
+            if self.heard > 1:  # so that the test ends where it fails
+                raise
+        if self.error is not None:
+            raise self.error
+        return []
+
+    publish_async = fetch
+
+
+@pytest.mark.parametrize("error", [None, nats.errors.ConnectionClosedError(), nats.js.errors.TooManyStalledMsgsError()])
+def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, monkeypatch):
+    """Else it would stand still for as long as nothing comes."""
+
+    async def work() -> None:
+        transport = Nats(address("nats://127.0.0.1:1/away", {}))
+        deaf = Deaf(error)
+        monkeypatch.setattr(transport, "_reader", deaf)
+        monkeypatch.setattr(transport, "_connected", lambda: True)
+        monkeypatch.setattr(transport, "_open", lambda: asyncio.sleep(0, deaf))
+        waits = [transport.receive] if error is None else [transport.receive, lambda: transport.publish(one)]
+        for wait in waits:
+            transport._reader = deaf
+            task = asyncio.ensure_future(wait())
+            await asyncio.sleep(0.01)
+            task.cancel()
+            done, _ = await asyncio.wait({task}, timeout=1)
+            assert done and task.cancelled()
+
+    one = [Output(1, "", "final", b"{}")]
+    asyncio.run(work())
 
 
 def test_what_was_not_acknowledged_comes_again_in_order(server: Server):

@@ -119,6 +119,7 @@ def test_metrics_are_those_of_the_service():
         low, ratio, high = (float(found[f"heliograph_nis{name}{label}"]) for name in ("_low", "", "_high"))
         assert 0.7 < low < ratio < high < 1.4
         assert found["heliograph_commit_seconds_count"] == "1.0" and found["heliograph_plants"] == "1.0"
+        assert found["heliograph_lag_seconds_sum"] == "40.0"
 
     looked(look, Scripted())
 

@@ -2,14 +2,18 @@
 
 import json
 import warnings
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
 from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.output import AnyOutput
+from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
@@ -148,6 +152,40 @@ def test_no_plant_begins_with_a_wrong_clock():
     assert len(finals(told, "p")) == 1 and service.plants["p"].links["a"].used == 1
     _, told = served(moving(), lines([right, right | {"time": 500.0, "sequence": 2, "arrival": 500.0}]), 1, leap=60.0)
     assert [one["reason"] for one in told if one["kind"] == "refused"] == ["future"]
+
+
+@given(st.randoms(use_true_random=False), st.floats(0, 0.6))
+def test_lost_is_what_never_came_in_whatever_order_the_rest_did(chance, loss):
+    """Between the first and the last that were heard; then the node is started again, and counts from 0."""
+    link, lost = Link(), 0
+    for boot in range(2):
+        heard = [k for k in range(1, 20) if chance.random() > loss]
+        chance.shuffle(heard)
+        if boot and link.newest > 0:
+            heard.insert(0, 0)
+        for k in heard:
+            link.count("used", k, float(100 * boot + k))
+        lost += max(heard) - min(heard) + 1 - len(heard) if heard and (link.first in heard) else 0
+    assert link.lost == lost
+
+
+def test_a_wrong_clock_or_a_copy_loses_nothing():
+    link = Link()
+    for verdict, sequence, time in [
+        ("used", 0, 0.0), ("future", 1, 1e9), ("used", 2, 2.0), ("duplicate", 0, 0.0), ("used", 4, 4.0),
+        ("conflict", 0, 0.0), ("late", 3, 3.0),
+    ]:  # fmt: skip
+        link.count(verdict, sequence, time)
+    assert link.lost == 1  # what is late may have been counted when it first came, so it fills nothing
+
+
+def test_lag_is_by_the_clock_on_the_wall_where_messages_carry_dates():
+    service = Service(fleet(moving()), Nowhere())
+    time = datetime.now(UTC) - timedelta(seconds=1000)
+    service.take(lines([{"plant": "dated", "node": "a", "sequence": 0, "time": time.isoformat(), "values": [1.0]}]))
+    assert 1000 < service.last.lag < 1600  # of a busy machine
+    service.take(lines([{"plant": "counted", "node": "a", "sequence": 0, "time": 1.0, "values": [1.0]}]))
+    assert service.last.lag == service.last.took
 
 
 def test_memory_is_bounded_by_the_window():

@@ -19,6 +19,7 @@ class OnePlant:
 class Last:
     took: float = 0.002
     committed: float = 0.001
+    lag: float = 40.0
 
 
 @dataclass

@@ -15,7 +15,12 @@ def serve(
     window: Annotated[float, Parameter(help="How late a message may be, in seconds or steps.")] = 10.0,
     ahead: Annotated[float, Parameter(help="How much later than its arrival a message's time may be.")] = 0.0,
     leap: Annotated[float | None, Parameter(help="How much later than all before it; any, unless given.")] = None,
-    store: Annotated[str | None, Parameter(help="File or PostgreSQL URL that keeps the state.")] = (None),
+    store: Annotated[
+        str | None,
+        Parameter(
+            help="File or PostgreSQL URL that keeps the state: NETWORK.db here, unless given; none keeps nothing."
+        ),
+    ] = None,
     process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
     from_snapshot: Annotated[Path | None, place("Store of which to begin from the plants.")] = None,
     broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
@@ -40,7 +45,7 @@ def serve(
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import Wanted, run
+    from heliograph.serving.running import Wanted, run, store_of
 
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
@@ -49,4 +54,5 @@ def serve(
         raise fail("serve", "a network, such as my_network.py", "none")
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    asyncio.run(run(Wanted(load_network(network), options, store, process, from_snapshot, where, parts, page)))
+    kept = store_of(network, store, parts)
+    asyncio.run(run(Wanted(load_network(network), options, kept, process, from_snapshot, where, parts, page)))

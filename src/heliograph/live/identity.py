@@ -9,6 +9,7 @@ import numpy as np
 import heliograph
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.network import Network
 
 Identity = dict[str, str]
 DIGITS = 16
@@ -17,6 +18,28 @@ DIGITS = 16
 def versions() -> Identity:
     """Of what computes."""
     return {"heliograph": heliograph.__version__, "jax": jax.__version__}
+
+
+def network_identity(network: Network, program: str, options: Mapping[str, object]) -> Identity:
+    """Versions, precision, options, names and sizes; of each part of the network its numbers; and of what is computed.
+
+    What is computed is read off the compiler's input, `program`: a function of the plant counts by what it does.
+    """
+    parts: dict[str, PyTree] = {f"node {name!r}": node for name, node in network.nodes.items()}
+    parts |= {f"fusion {name!r}": item for name, item in network.fused.items()}
+    filters = [f"{node}/{name}" for node, claims in network.claims().items() for name in claims]
+    return {
+        **versions(),
+        "precision": "single" if network.single else "double",
+        "states": ", ".join(network.states),
+        "inputs": ", ".join(network.inputs),
+        "nodes": ", ".join(f"{name} ({node.received} heard)" for name, node in network.nodes.items()),
+        "filters": ", ".join(filters),
+        **{f"option {name}": f"{value!r}" for name, value in options.items()},
+        "numbers of the plant": short_name(network.plant),
+        **{f"numbers of {name}": short_name(part) for name, part in parts.items()},
+        "what is computed": short_name(program),
+    }
 
 
 def check_same(what: str, mine: Mapping[str, str], other: Mapping[str, str]) -> None:

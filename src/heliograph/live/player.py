@@ -1,6 +1,7 @@
 """What the timelines of one network share: compiled programs, and the numbers of the filters where these find them."""
 
 from functools import cached_property
+from typing import Any
 from weakref import WeakValueDictionary
 
 import jax
@@ -8,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.clock import time_input, uneven
+from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
 from heliograph.live.mould import cast
 from heliograph.live.tape import Ears, Tape, replay
@@ -53,6 +55,16 @@ class Player:
             ValueError: no filter that can be smoothed.
         """
         return Sweeper(self.network, self.dt)
+
+    @cached_property
+    def identity(self) -> Identity:
+        """What the network and its program are to a timeline that was saved."""
+        two = np.zeros(2, dtype=np.int32)
+        program: Any = self.replay  # the compiler's functions have no type that says so
+        with jax.enable_x64(True):
+            tape = self.blank(2, 0.0)
+            lowered = program.lower(self.numbers, tape, np.asarray(tape.rows[0]), two, np.zeros(3, dtype=np.int32))
+        return network_identity(self.network, lowered.as_text(), {})
 
     def blank(self, slots: int, time: float) -> Tape:
         """A tape of nothing, with the filters before the first step in slot 0, at `time`."""

@@ -87,7 +87,10 @@ class Rows:
     def fill(self, row: HeldRow, event: Known) -> None:
         """Take what an event has into its row; NaN is nothing."""
         there = row.numbers[self.places[event.place]]
-        np.copyto(there, event.values, where=~np.isnan(event.values))
+        if row.events:
+            np.copyto(there, event.values, where=~np.isnan(event.values))
+        else:  # nothing is there yet
+            there[:] = event.values
         row.events[event.name] = event.values
 
     def settle(self, watermark: float) -> tuple[int, int]:

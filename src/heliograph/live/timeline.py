@@ -1,6 +1,5 @@
 """Events in any order: each gets a verdict and its place in time; estimates are those of all that was accepted."""
 
-import json
 import warnings
 from collections.abc import Mapping
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
+from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
@@ -182,7 +182,7 @@ class Timeline:
         slots = [row.slot for row in self._rows.held]
         held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._tape))}
         final = {f"final.{i}": leaf for i, leaf in enumerate(told)}
-        head = {"now": self.now, "forced": self.forced, "counts": self.counts, "sizes": self._sizes, "dt": self._dt}
+        head = {"now": self.now, "forced": self.forced, "counts": self.counts, "of": self._player.identity}
         head |= {"options": [self.window, self.ahead, self.capacity]}
         return packed(head, {**row_arrays(self._rows.held), **held, **final, "final.time": time})
 
@@ -191,18 +191,16 @@ class Timeline:
         """The timeline that was saved, of the same network.
 
         Raises:
-            ValueError: bytes that `save` did not return, or that belong to a network of other nodes or filters.
+            ValueError: bytes that `save` did not return; the state of another network, version or precision.
         """
         head, arrays = unpacked(data)
+        check_same("snapshot", player(network).identity, head.get("of", {}))
         window, ahead, capacity = head["options"]
         with warnings.catch_warnings():  # it was told when the timeline was made
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
         leaves, structure = jax.tree.flatten(new._tape)
-        saved = [arrays.get(f"tape.{i}", np.zeros(0)) for i in range(len(leaves))]
-        fits = all(old.shape[1:] == leaf.shape[1:] for old, leaf in zip(saved, leaves, strict=True))
-        if json.loads(json.dumps([new._sizes, new._dt])) != [head["sizes"], head["dt"]] or not fits:
-            raise fail("snapshot", "one of this network", f"one of nodes {list(head['sizes'])}, or of other filters")
+        saved = [arrays[f"tape.{i}"] for i in range(len(leaves))]
         new._resume(head, arrays, jax.tree.unflatten(structure, saved))
         return new
 

@@ -49,5 +49,12 @@ class Keeps(Protocol):
     def untold(self) -> list[Output]:
         """What this process committed and may not have told."""
 
+    @property
+    def name(self) -> str:
+        """What to call it, without a password."""
+
+    def count(self) -> int:
+        """How many plants are kept."""
+
     def close(self) -> None:
         """Let go of what it holds."""

@@ -26,7 +26,7 @@ from heliograph.numerics.check import fail
 from heliograph.serving.address import Address
 from heliograph.serving.output import Output
 from heliograph.serving.partition import WHOLE, Part, word
-from heliograph.serving.retry import Retry
+from heliograph.serving.retry import Retry, still_wanted
 from heliograph.serving.transport import Batch, TakenOverError
 
 MOST = 1000  # messages of a batch
@@ -59,6 +59,7 @@ class Nats:
 
     async def receive(self) -> Batch | None:
         while True:
+            still_wanted()
             reader = await self._persist(self._reading)
             try:
                 messages = await reader.fetch(MOST, WAIT)
@@ -90,7 +91,7 @@ class Nats:
     async def close(self) -> None:
         if self._client.is_connected:
             with contextlib.suppress(*AWAY):
-                await self._client.close()
+                await asyncio.wait_for(self._client.close(), WAIT)
 
     async def _tell(self, outputs: Sequence[Output]) -> None:
         """Provisional estimates as they pass; what has a number stays, once, if it is told again soon."""

@@ -9,7 +9,7 @@ from heliograph.serving.output import Output
 class Nowhere:
     """Numbers what is told, and keeps nothing."""
 
-    keeps = False
+    keeps, name = False, "memory"
 
     def __init__(self) -> None:
         self._number = 0
@@ -29,6 +29,10 @@ class Nowhere:
     def untold(self) -> list[Output]:
         """Nothing was kept."""
         return []
+
+    def count(self) -> int:
+        """Nothing is kept."""
+        return 0
 
     def close(self) -> None:
         """Nothing to let go of."""

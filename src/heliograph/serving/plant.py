@@ -6,14 +6,18 @@ from datetime import datetime
 from heliograph.live.event import Verdict
 from heliograph.live.rows import HeldRow, Rows
 
-REBOOT = 1000  # a number that falls by more, or to 0, begins anew: the node was started again
-
 
 @dataclass
 class Link:
-    """What came from a node: numbers of messages by verdict, and `lost`, the gaps in its counts."""
+    """What came from a node: numbers of messages by verdict, and `lost`, the gaps in its counts that nothing filled.
 
+    Counts run from `first` to `newest`, which was measured at `at`. A smaller number of a later time begins anew: the
+    node was started again. A larger one of an earlier time is from before that.
+    """
+
+    first: int = -1
     newest: int = -1
+    at: float = 0.0
     lost: int = 0
     used: int = 0
     duplicate: int = 0
@@ -21,19 +25,26 @@ class Link:
     late: int = 0
     future: int = 0
 
-    def count(self, verdict: Verdict, sequence: int) -> None:
-        """Count one message."""
+    def count(self, verdict: Verdict, sequence: int, time: float) -> None:
+        """Count one message. What is late or from the future came, whatever became of it."""
         setattr(self, verdict, getattr(self, verdict) + 1)
         if verdict in ("duplicate", "conflict"):
             return
-        if self.newest < 0 or sequence == 0 or sequence < self.newest - REBOOT:
-            self.newest = sequence
+        if verdict == "future":  # its clock is wrong: it says nothing of the order
+            time = self.at
+        if self.newest < 0 or (sequence < self.newest and time > self.at):
+            self.first, self.newest, self.at = sequence, sequence, time
         elif sequence > self.newest:
-            self.lost += sequence - self.newest - 1
-            self.newest = sequence
-        elif verdict == "used":
+            if time >= self.at:
+                self.lost += sequence - self.newest - 1
+                self.newest, self.at = sequence, time
+        elif verdict != "used":
+            return  # it may have been counted when it first came
+        elif sequence < self.first:
+            self.lost += self.first - sequence - 1
+            self.first = sequence
+        elif sequence < self.newest:
             self.lost -= self.lost > 0  # it had only been overtaken
-        # what is late may have been counted when it first came
 
 
 @dataclass

@@ -24,6 +24,8 @@ from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
 from heliograph.simulation.network import Network
 
+NOTHING = "none"  # the store that keeps nothing
+
 
 @dataclass(frozen=True)
 class Wanted:
@@ -52,6 +54,19 @@ class Wanted:
             check_count("--parts", self.parts)
             if self.store is None or self.broker is None:
                 raise fail("--parts", "a store and a broker that all processes share", "not both")
+
+
+def store_of(network: str, given: str | None, parts: int | None) -> str | None:
+    """The place that keeps the state, as it was given; else a file here that is called as the network is.
+
+    None keeps nothing. Processes that share parts must all be told where.
+    """
+    if given is not None or parts is not None:
+        return None if given == NOTHING else given
+    place, _, name = network.rpartition(":")
+    file, name = (place, f"-{name}") if name.isidentifier() and place else (network, "")
+    stem = Path(file).stem if file.endswith(".py") else file.rpartition(".")[2]
+    return f"{stem}{name}.db"
 
 
 async def run(wanted: Wanted) -> None:
@@ -89,12 +104,16 @@ async def _alone(wanted: Wanted, lanes: Lanes, look: Look) -> None:
     stop = asyncio.Event()
     fleet = Fleet(lanes, wanted.options)
     kept = _kept(wanted, fleet)
+    resumed, service = kept.count() > 0, Service(fleet, kept)
     try:
         with signals(stop):
             transport = Pipe() if wanted.broker is None else connected(wanted.broker)
-            await serve_until(stop, look(Service(fleet, kept)), transport)
+            await serve_until(stop, look(service), transport)
     finally:
         kept.close()
+    if resumed and service.known:
+        anew = f"to begin anew, delete {kept.name} or name another --store"
+        _say(f"{service.known} messages were known already or came after what was final; {anew}")
 
 
 def _kept(wanted: Wanted, fleet: Fleet) -> Keeps:
@@ -107,7 +126,12 @@ def _kept(wanted: Wanted, fleet: Fleet) -> Keeps:
     kept = Store(wanted.store, mine, wanted.process)
     if wanted.snapshot is not None:
         kept.begin_from(str(wanted.snapshot), mine)
+    _say(f"the state is kept in {kept.name}, plants so far: {kept.count()} (--store {NOTHING} keeps nothing)")
     return kept
+
+
+def _say(what: str) -> None:
+    print(f"heliograph: {what}", file=sys.stderr)
 
 
 async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:

@@ -28,24 +28,29 @@ WHY: dict[Verdict, str] = {
 
 
 class Taken(NamedTuple):
-    """What the last batch was: numbers of messages and outputs, and the seconds that it took in all and to commit."""
+    """What the last batch was: numbers of messages and outputs, and the seconds that it took in all and to commit.
+
+    `lag`: how long ago the oldest of its messages was measured, where they carry dates; else what it took.
+    """
 
     messages: int
     outputs: int
     took: float
     committed: float
+    lag: float
 
 
 class Service:
     """A network's filters, for any number of plants, fed with messages in whatever order they come.
 
     It knows no transport: `take` uses a batch and gives what is to be told of it, after the commit. One call at a time.
+    `malformed` and `known` count messages that could not be read, and duplicates and late ones.
     """
 
     def __init__(self, fleet: Fleet, store: Keeps):
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
-        self.malformed, self.last = 0, Taken(0, 0, 0.0, 0.0)
+        self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller = Teller(fleet.lanes)
         self._told: int | None = None  # up to where, since the last commit
 
@@ -67,7 +72,10 @@ class Service:
                 break
             except ConflictError:
                 self._load({message.plant for message in messages if isinstance(message, Message)})
-        self.last = Taken(len(payloads), len(outputs), perf_counter() - begun, committed)
+        took = perf_counter() - begun
+        dates = [each.time for each in messages if isinstance(each, Message) and isinstance(each.time, datetime)]
+        lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
+        self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
 
     def unpublished(self) -> list[Output]:
@@ -88,7 +96,7 @@ class Service:
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
         """Use messages and commit; what is to be told, and how long the commit took."""
-        touched, used, entries, malformed = dict[str, Plant](), set[str](), list[Entry](), 0
+        touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
         for message, payload in zip(messages, payloads, strict=True):
             try:
                 if isinstance(message, str):
@@ -103,6 +111,7 @@ class Service:
             if verdict == "used":
                 used.add(message.plant)
             else:
+                known += verdict in ("duplicate", "late")
                 entries.append(_refusal(message, verdict))
         settled = self.fleet.settle(touched.values())
         entries += self._finals(settled)
@@ -112,6 +121,7 @@ class Service:
         outputs = self._commit(touched, entries, malformed)
         committed = perf_counter() - begun
         self.malformed += malformed
+        self.known += known
         return outputs + provisional, committed
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
@@ -156,7 +166,7 @@ class Service:
         if inputs is not None:
             self.fleet.take(plant, inputs)
         verdict = self.fleet.take(plant, event)
-        plant.link(message.node).count(verdict, message.sequence)
+        plant.link(message.node).count(verdict, message.sequence, at)
         return plant, verdict
 
     def _origin(self, message: Message) -> datetime | None:

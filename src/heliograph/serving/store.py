@@ -62,9 +62,9 @@ class Store:
         except DBAPIError as error:
             self.close()
             raise fail(f"store {self.name}", "a database that can be written", str(error.orig)) from None
-        except InputError:
+        except InputError as error:
             self.close()
-            raise
+            raise InputError(f"{error}; to begin anew, name another") from None
 
     def _whose(self, mine: Identity) -> Identity:
         """What the store is of: of this network, if it is new."""
@@ -78,8 +78,12 @@ class Store:
 
     @property
     def name(self) -> str:
-        """What to call it where others read: without its password."""
-        return self.url.render_as_string(hide_password=True)
+        """What to call it where others read: a file, or a URL without its password."""
+        return (
+            self.url.database or ""
+            if self._engine.dialect.name == "sqlite"
+            else self.url.render_as_string(hide_password=True)
+        )
 
     def load(self, names: Iterable[str]) -> dict[str, Kept]:
         """The plants of these names that are kept."""
@@ -155,6 +159,11 @@ class Store:
             for part in there.execute(select(PLANTS)).mappings().partitions(AT_ONCE):
                 here.execute(PLANTS.insert(), [dict(row) for row in part])
         other.close()
+
+    def count(self) -> int:
+        """How many plants are kept."""
+        with self._engine.connect() as connection:
+            return int(connection.execute(select(func.count()).select_from(PLANTS)).scalar_one())
 
     def close(self) -> None:
         """Let go of the database."""

@@ -19,6 +19,7 @@ PLANTS = 200  # plants whose estimates are remembered, those that were heard las
 POINTS = 800  # estimates remembered of each, final ones and those that are not yet
 LISTED = 1000  # plants that can be chosen from
 WARNINGS = 50
+LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0, 86400.0)  # s, edges of the histogram
 
 
 class Link(Protocol):
@@ -50,6 +51,10 @@ class Taken(Protocol):
     @property
     def committed(self) -> float:
         """Seconds of it, to commit."""
+
+    @property
+    def lag(self) -> float:
+        """Seconds since the oldest message was measured, where that is known; else as many as it took."""
 
 
 class Serves(Takes, Protocol):
@@ -92,6 +97,8 @@ class Watch:
         self._count = 0
         self.registry = CollectorRegistry()
         self.took = Histogram("heliograph_batch_seconds", "From messages to what is told.", registry=self.registry)
+        what = "From when the oldest message of a batch was measured, where it has a date, to what is told."
+        self.lag = Histogram("heliograph_lag_seconds", what, buckets=LAGS, registry=self.registry)
         self.committed = Histogram("heliograph_commit_seconds", "Of it, to commit.", registry=self.registry)
 
     def over(self, service: Serves) -> "Watched":
@@ -103,6 +110,7 @@ class Watch:
         """Remember what is worth a look."""
         self.took.observe(last.took)
         self.committed.observe(last.committed)
+        self.lag.observe(last.lag)
         for output in outputs:
             if output.kind != "refused":
                 told = from_json(output.body)

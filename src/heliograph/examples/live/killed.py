@@ -77,15 +77,15 @@ async def killed(
     client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
     try:
         run.start()
-        await run.until(partial(_told, client, 0))
+        await run.until(partial(_reads, client))
         for kill in range(kills):
             advance(f"killing it, {kill + 1} of {kills}")
             part = slice(len(lines) * kill // (kills + 1), len(lines) * (kill + 1) // (kills + 1))
-            sending = asyncio.ensure_future(_send(client, lines[part]))
-            await run.until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
-            await asyncio.sleep(generator.uniform(0, SOON))
-            run.kill()
-            await sending
+            async with asyncio.TaskGroup() as group:  # if sending fails nothing more is waited for
+                group.create_task(_send(client, lines[part]))
+                await run.until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
+                await asyncio.sleep(generator.uniform(0, SOON))
+                run.kill()
             run.start()
         advance("what is left")
         await _send(client, lines[len(lines) * kills // (kills + 1) :])
@@ -141,6 +141,14 @@ async def _send(client: Client, lines: Sequence[bytes]) -> None:
         await stream.publish(f"{TOPIC}.in.{PLANT}", line)
         if i % TOGETHER == 0:
             await asyncio.sleep(0)
+
+
+async def _reads(client: Client) -> bool:
+    """Whether a service reads the stream of messages: before that there is none to send to."""
+    try:
+        return bool(await client.jetstream(timeout=60).consumers_info(TOPIC))
+    except NotFoundError:
+        return False
 
 
 async def _told(client: Client, count: int) -> bool:
