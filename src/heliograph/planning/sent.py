@@ -17,8 +17,8 @@ from heliograph.numerics.check import array, check_count, check_horizon, check_s
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.planning.channel_power import sent_powers
 from heliograph.planning.state_power import growth, of_sensor, seconds_over, steady_second
-from heliograph.planning.transmitters import sent_powers
 from heliograph.relays.design import expected_maps, given_design
 from heliograph.simulation.network import OWN, Network
 from heliograph.simulation.node import Node
