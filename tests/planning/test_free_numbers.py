@@ -211,9 +211,19 @@ def test_numbers_marked_where_they_stand_are_free():
         (None, "free: expected the arguments of the function"),
         ({"amplification": (1.0, 0.0, 2.0), "b": (1.0, 0.0, 2.0)}, "free: expected .*unexpected keyword argument 'b'"),
         ({"amplification": (3.0, 0.0, 1.0)}, "free number 'amplification': expected a start between its ends"),
+        (
+            {"amplification": (1.0, "low", 2.0)},
+            r"end of 'amplification': expected a number, or numbers of shape \(\), got 'low'",
+        ),
+        ({"amplification": ([1.0, 1.0], [0.1] * 3, 2.0)}, r"end of 'amplification': .* of shape \(2,\), got"),
         ({"amplification": 3.0}, r"free number 'amplification': expected a list of \(start, low, high\)"),
     ],
 )
 def test_bad_numbers_are_named(free, message):
     with pytest.raises(ValueError, match=message):
         hg.design(one_hop, free=free, budget=1)
+
+
+def test_a_function_that_jax_cannot_follow_is_named():
+    with pytest.raises(ValueError, match=r"network of free numbers: expected operations of jax\.numpy .*got Concret"):
+        hg.design(lambda a: one_hop(float(a)), free={"a": (1.0, 0.1, 2.0)}, budget=1, starts=1)

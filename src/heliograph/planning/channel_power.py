@@ -15,11 +15,14 @@ from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.planning.transmitters import BEGINNING, Place, is_silent, names_of, transmits, unknown
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.modes import joint_modes
 from heliograph.random_affine.second_moments import second_moment_tensor
+
+STAYS = 1e-12  # change of a law in a step that counts as none
 
 Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
 
@@ -35,6 +38,13 @@ def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) ->
     joint = joint_modes(channel, order=2)
     law = joint.initial @ library(joint.transition).linalg.matrix_power(joint.transition, step)
     return by_mode(channel, second, law)
+
+
+def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
+    """The same in the long run, whatever modes it began with."""
+    joint = joint_modes(channel, order=2)
+    stays = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=STAYS)
+    return by_mode(channel, second, joint.initial if stays else stationary(joint.transition))
 
 
 def by_mode(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:

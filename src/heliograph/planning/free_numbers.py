@@ -78,7 +78,7 @@ def as_numbers(free: object) -> Numbers:
         if len(parts) != 3:
             raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
         start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
-        low, high = (np.broadcast_to(np.asarray(end, dtype=float), start.shape) for end in parts[1:])
+        low, high = (_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
         found[name] = Number(start, low, high)
@@ -87,6 +87,17 @@ def as_numbers(free: object) -> Numbers:
     if not found:
         raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
     return Numbers(found)
+
+
+def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
+    """A least or largest value, which may be infinite, of the start's shape."""
+    try:
+        value = np.broadcast_to(np.asarray(end, dtype=float), shape)
+    except (TypeError, ValueError):
+        raise fail(f"end of {name!r}", f"a number, or numbers of shape {shape}", repr(end)) from None
+    if np.any(np.isnan(value)):
+        raise fail(f"end of {name!r}", "numbers", "nan")
+    return value
 
 
 def check_arguments(build: Build, free: object) -> None:

@@ -31,6 +31,8 @@ def design_numbers(
     check_arguments(build, free)
     problem = Problem(*(marked(build) if free is None else (build, as_numbers(free))), error)
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
+    if least == 0:
+        raise fail("wanted error", "a number above zero", "0")
     problem.at(problem.numbers.start)  # what cannot be is refused before any descent
     limits = limits_of(_allowed(problem, budget), least, (error.steps, len(problem.names)))
     best = _best(problem, limits, starts, seed)

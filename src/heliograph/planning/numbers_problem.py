@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.over_time import first
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.types import Array, Float
 from heliograph.planning.criterion import Error
@@ -22,6 +22,8 @@ from heliograph.planning.modes_told import Measured, Settled, settled, touched
 from heliograph.planning.state_power import check_stable
 from heliograph.planning.weighing import Weighing, weighing
 from heliograph.simulation.network import Network
+
+UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 
 
 class Slopes(NamedTuple):
@@ -79,7 +81,12 @@ class Problem:
     def _measure(self, x: Array) -> Measured:
         values = self.numbers.named(jnp.asarray(x))
         young = values.pop(YOUNG) if self.young else None
-        return measured(self.build(**values), self.asked, young)
+        try:
+            network = self.build(**values)
+        except UNTRACEABLE as error:
+            expected = "operations of jax.numpy on its numbers, and no choice by their values"
+            raise fail("network of free numbers", expected, type(error).__name__) from None
+        return measured(network, self.asked, young)
 
     def _differentiate(self, x: Array, fixed: Settled) -> Slopes:
         m, pull = jax.vjp(self._measure, jnp.asarray(x))
