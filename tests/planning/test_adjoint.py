@@ -64,9 +64,8 @@ def test_gradients_by_powers_are_those_of_differences(error):
     paths, powers = paths_of(two_hops(), error)
     count = len(paths.names)
     free = np.arange(count) % 3 != 0
-    objective = of_hops(paths, error, np.diag([1.0, 0.5, 2.0]), free, powers)._replace(
-        sharpness=8 if error.worst else None
-    )
+    objective = of_hops(paths, error, np.diag([1.0, 0.5, 2.0]), free, powers)
+    objective = objective._replace(weighing=objective.weighing._replace(sharpness=8 if error.worst else None))
     x = np.random.default_rng(2).uniform(0.3, 2.0, (error.steps, int(free.sum())))
     gradient = objective.value_and_gradient(x)[1]
     h = 1e-3

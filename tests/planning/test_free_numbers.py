@@ -7,7 +7,8 @@ import pytest
 import heliograph as hg
 from heliograph.planning import Budget
 from heliograph.planning.criterion import Error
-from heliograph.planning.free_numbers import Problem, as_numbers
+from heliograph.planning.free_numbers import as_numbers
+from heliograph.planning.numbers_problem import Problem
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
@@ -55,38 +56,47 @@ CASES = {
 }
 
 
-@pytest.fixture(scope="module", params=CASES)
-def problem(request):
-    build, free = CASES[request.param]
-    return request.param, Problem(build, as_numbers(free), Error({"x0": 1.0, "x1": 0.5}).matrix)
-
-
-def test_gradients_are_those_of_differences(problem):
-    _, one = problem
-    x, relative = one.numbers.start, 2e-3
-    slopes = one.at(x)[2]
+def check_gradients(one, relative=2e-3):
+    x = one.numbers.start
+    slopes = one.at(x).slopes
     for i in range(len(x)):
         h = relative * x[i]
         ends = [one.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
-        errors = [np.sum(one.weight * end[1].parts.sum(axis=0)) for end in ends]
-        for each, slope in ((errors, slopes.error[i]), ([end[0].powers for end in ends], slopes.powers[:, i])):
+        for each, slope in (
+            ([p.error for p in ends], slopes.error[i]),
+            ([p.powers for p in ends], slopes.powers[..., i]),
+        ):
             low, near, far, high = each
             differences = (8 * (far - near) - (high - low)) / (12 * h)
             np.testing.assert_allclose(slope, differences, rtol=1e-8, atol=1e-9)  # fourth order: h^4 and rounding / h
 
 
+@pytest.fixture(scope="module", params=CASES)
+def problem(request):
+    build, free = CASES[request.param]
+    return request.param, Problem(build, as_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
+
+
+def test_gradients_are_those_of_differences(problem):
+    check_gradients(problem[1])
+
+
+def first_step(measured):
+    return type(measured)(*(None if part is None else part[0] for part in measured))
+
+
 def test_the_error_is_that_of_the_recursion(problem):
     name, one = problem
-    found = one.covariance(one.numbers.start)
+    found = one.at(one.numbers.start).covariances[0]
     network = one.network(one.numbers.start)
     if name == "shared gain":
         node = network.nodes["node"]
         best = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((200, 0)))
         np.testing.assert_allclose(found, best.covariances[-1], rtol=1e-10)
-        powers = one.powers(one.numbers.start)
-        np.testing.assert_allclose(powers, list(hg.power(network).mean.values()), rtol=1e-12)
+        powers = one.at(one.numbers.start).powers
+        np.testing.assert_allclose(powers[0], list(hg.power(network).mean.values()), rtol=1e-12)
         return
-    m = one.at(one.numbers.start)[0]
+    m = first_step(one.at(one.numbers.start).measured)
     parts = m.law[:, None, None] * np.eye(2)
     for _ in range(400):  # the recursion of X_j, as it is written
         after = np.zeros_like(parts)
@@ -99,9 +109,9 @@ def test_the_error_is_that_of_the_recursion(problem):
 
 
 def test_told_losses_are_bounded_by_what_drawn_losses_leave():
-    found = Problem(told_losses, as_numbers(CASES["told losses"][1]), Error().matrix)
-    bound = np.trace(found.covariance(found.numbers.start))
-    m = found.at(found.numbers.start)[0]
+    found = Problem(told_losses, as_numbers(CASES["told losses"][1]), Error())
+    bound = found.at(found.numbers.start).error
+    m = first_step(found.at(found.numbers.start).measured)
     draws, p, total = np.random.default_rng(0), np.eye(2), []
     for _ in range(20_000):  # the filter that knows which losses there were
         j = draws.choice(2, p=m.law)
@@ -117,8 +127,8 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     found = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
     node = found.network.nodes["node"]
-    one = Problem(uncertain, as_numbers({"amplification": (1.2, 1.2, 1.2)}), Error().matrix)
-    k = one.at(np.append(1.2, found.numbers["young"]))[1].gains[0]
+    one = Problem(uncertain, as_numbers({"amplification": (1.2, 1.2, 1.2)}), Error())
+    k = one.at(np.append(1.2, found.numbers["young"])).settled.gains[0, 0]
     a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
     for p in (0.2, 0.3, 0.4):
         values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])
@@ -201,9 +211,19 @@ def test_numbers_marked_where_they_stand_are_free():
         (None, "free: expected the arguments of the function"),
         ({"amplification": (1.0, 0.0, 2.0), "b": (1.0, 0.0, 2.0)}, "free: expected .*unexpected keyword argument 'b'"),
         ({"amplification": (3.0, 0.0, 1.0)}, "free number 'amplification': expected a start between its ends"),
+        (
+            {"amplification": (1.0, "low", 2.0)},
+            r"end of 'amplification': expected a number, or numbers of shape \(\), got 'low'",
+        ),
+        ({"amplification": ([1.0, 1.0], [0.1] * 3, 2.0)}, r"end of 'amplification': .* of shape \(2,\), got"),
         ({"amplification": 3.0}, r"free number 'amplification': expected a list of \(start, low, high\)"),
     ],
 )
 def test_bad_numbers_are_named(free, message):
     with pytest.raises(ValueError, match=message):
         hg.design(one_hop, free=free, budget=1)
+
+
+def test_a_function_that_jax_cannot_follow_is_named():
+    with pytest.raises(ValueError, match=r"network of free numbers: expected operations of jax\.numpy .*got Concret"):
+        hg.design(lambda a: one_hop(float(a)), free={"a": (1.0, 0.1, 2.0)}, budget=1, starts=1)

@@ -121,3 +121,16 @@ def test_powers_given_are_powers_sent():
         list(hg.power(asked.network).mean.values()), [p[0] for p in asked.powers.values()], atol=1e-12
     )
     assert hg.power(one_hop()).total > 0
+
+
+def test_the_steady_power_does_not_depend_on_the_modes_at_the_beginning():
+    """A relay behind a chain that begins in its good mode hears half of its time .2 of the signal."""
+    chain = hg.random_affine.MarkovChain([[0.5, 0.5], [0.5, 0.5]], initial=[1.0, 0.0])
+    modes = hg.random_affine.Modes(chain, [hg.hop(1.0, 0.3), hg.hop(0.2, 0.3)])
+    found = network(hg.amplify_and_forward([modes, hg.hop(1.0, 0.1)]))
+    assert hg.power(found).mean["node.hop2"] == pytest.approx(0.3 + 1.5 * (1 + 0.2**2) / 2, rel=1e-12)
+    varying = network(hg.model.over_time([hg.hop(1.0, 0.1, amplification=a) for a in (1.0, 2.0)]))
+    with pytest.raises(ValueError, match=r"steady power: expected a network that does not vary \(give a horizon\)"):
+        hg.power(varying)
+    first = hg.power(found, horizon=1).mean["node.hop2"]
+    assert first == pytest.approx(0.3 + (1 + 4 * 0.81 + 0.5), rel=1e-12)  # begins so, with a mean of 2

@@ -18,7 +18,8 @@ class Certificate(NamedTuple):
 
     convex: whether every local minimum is the least. value: what was found, the error or the power. bound: no
     allocation has less, whatever was searched. stationarity: the part of the error by which a linear model still sees
-    it fall within the budget; zero if and only if the conditions of Karush, Kuhn and Tucker hold. starts: descents.
+    it fall within the budget; zero if and only if the conditions of Karush, Kuhn and Tucker hold (of free numbers: over
+    a step of the size of their range, or of their start where they have none). starts: descents.
     unit: "error" or "power".
     """
 

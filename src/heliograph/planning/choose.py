@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, minimize
 
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants, adjoint, covariances
@@ -84,7 +84,8 @@ def listening(paths: Paths, powers: ArrayLike, error: Error | None, states: tupl
     Raises:
         ValueError: paths over several steps, the worst direction.
     """
-    error = Error() if error is None else error
+    instance("paths", paths, Paths, "Paths (independent_paths, paths_of)")
+    error = Error() if error is None else instance("error", error, Error, "an Error")
     steps, hops = paths.kappa.shape
     if steps != 1 or paths.plants.start is not None or error.steps != 1 or error.horizon is not None:
         raise fail("paths to choose from", "steady ones", f"{steps} steps")
@@ -94,6 +95,8 @@ def listening(paths: Paths, powers: ArrayLike, error: Error | None, states: tupl
         p = np.broadcast_to(np.asarray(powers, dtype=np.float64), (1, hops))
     except ValueError:
         raise fail("powers", f"one number or one for each of {hops} hops", f"shape {np.shape(powers)}") from None
+    if not np.all(np.isfinite(p) & (p >= 0)):
+        raise fail("powers", "finite numbers of at least zero", powers)
     n = paths.rows.shape[-1]
     rows, each = paths.rows[0], heard(paths, p).information[0]
     matrix = error.matrix(tuple(f"x{i}" for i in range(n)) if states is None else states)

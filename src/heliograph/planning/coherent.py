@@ -16,7 +16,8 @@ from heliograph.h_infinity.solver import run_solver, solvers
 from heliograph.numerics.check import array, covariance, fail, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.independent import at_least, steady_moment
+from heliograph.planning.independent import at_least
+from heliograph.planning.lyapunov import steady_moment
 
 Sensors = Float[np.ndarray, "M"]
 

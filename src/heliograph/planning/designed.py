@@ -12,12 +12,12 @@ from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.types import Float
 from heliograph.planning.criterion import Error
+from heliograph.planning.reallocation import allocated
+from heliograph.planning.repeated import repeated
 from heliograph.planning.state_power import of_sensor, seconds_over, steady_second
-from heliograph.planning.transmitters import allocated
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
-COVERED = 100  # steps for which a design with a period is written down
 BEST = "best"
 T = TypeVar("T")
 
@@ -36,8 +36,6 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         }
         for k, second in enumerate(seconds)
     ]
-    if error.horizon is None and error.period > 1:
-        each = [each[k % error.period] for k in range(-(-COVERED // error.period) * error.period)]
     channels = {name: _over_time([one[name] for one in each]) for name in nodes}
     plant = network.plant
     own = {
@@ -45,13 +43,18 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         for name, node in nodes.items()
     }
     if len(own) == 1:
-        return Network(plant, own)
+        return _for_ever(Network(plant, own), error)
     sensors = {name: node.sensor for name, node in nodes.items()}
     varying = [sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)]
     steps = min(varying) if varying else 1
     joint = _over_time([_joined({name: at(sensor, k) for name, sensor in sensors.items()}) for k in range(steps)])
     whole = _over_time([parallel(list(one.values())) for one in each])
-    return Network(plant, own, {BEST: linear_filter(plant, joint, whole)})
+    return _for_ever(Network(plant, own, {BEST: linear_filter(plant, joint, whole)}), error)
+
+
+def _for_ever(network: Network, error: Error) -> Network:
+    """What repeats with the error's period, over as many steps as a run may have."""
+    return repeated(network) if error.period > 1 else network
 
 
 def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:

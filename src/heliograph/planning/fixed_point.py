@@ -36,7 +36,7 @@ def water_filling(
     Raises:
         ValueError: paths of several hops, the worst direction (`semidefinite_powers` takes it), a budget without limit.
     """
-    if error is not None and error.worst:
+    if isinstance(error, Error) and error.worst:
         raise fail("error of water filling", "a trace", "the worst direction, which semidefinite_powers takes")
     return fill(one_hop(paths, budget, error, states))[2]
 
@@ -142,7 +142,7 @@ def least_power(
         ValueError: an error that no power reaches, with the one that unlimited power leaves; paths of several hops; the
             worst direction (`semidefinite_least_power` takes it).
     """
-    if error is not None and error.worst:
+    if isinstance(error, Error) and error.worst:
         raise fail("error of least power", "a trace", "the worst direction, which semidefinite_least_power takes")
     return cheapest(swapped(paths, budget, error, states), float(scalar("wanted error", wanted, 0.0)))
 

@@ -1,30 +1,20 @@
-"""Any numbers of a network chosen for its steady error: amplifications, weights, places, whatever it is a function of.
-
-The network is a function of them. Its gradient is the adjoint's at fixed gains (`modes_told`), pulled back by JAX
-through the moments of channels and through the powers; a sequential quadratic programme does the rest.
-"""
+"""The free numbers of a network that is a function of them: starts, ends, and one vector of them all."""
 
 from collections.abc import Callable
+from inspect import signature
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import Bounds, NonlinearConstraint, minimize, nnls
 
-from heliograph.numerics.check import array, fail, instance, items, table
-from heliograph.numerics.float64 import compiled
+from heliograph.learning.parameters import describe
+from heliograph.numerics.check import array, fail, items, table
 from heliograph.numerics.types import Array, Float
-from heliograph.planning.measuring import means_are_known, measured, transmitters_of
-from heliograph.planning.modes_told import Measured, Settled, settled, touched
 from heliograph.simulation.network import Network
 
 Build = Callable[..., Network]
 Vector = Float[np.ndarray, "x"]
 
-ITERATIONS, FINE = 300, 1e-13
-AT = 1e-7  # relative: how near a limit is one that is reached
-YOUNG = "young"  # the scalar in the bound of an uncertain mean gain
+YOUNG = "young"  # the scalars in the bound of an uncertain mean gain
 
 
 class Number(NamedTuple):
@@ -35,7 +25,10 @@ class Number(NamedTuple):
     high: np.ndarray
 
 
-SCALAR = Number(np.array(0.1), np.array(1e-6), np.array(1e3))
+def scalars_of_young(steps: int) -> Number:
+    """One scalar for each step, or one of the steady bound."""
+    shape = () if steps == 1 else (steps,)
+    return Number(*(np.full(shape, value) for value in (0.1, 1e-6, 1e3)))
 
 
 class Numbers(NamedTuple):
@@ -85,7 +78,7 @@ def as_numbers(free: object) -> Numbers:
         if len(parts) != 3:
             raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
         start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
-        low, high = (np.broadcast_to(np.asarray(end, dtype=float), start.shape) for end in parts[1:])
+        low, high = (_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
         found[name] = Number(start, low, high)
@@ -96,103 +89,37 @@ def as_numbers(free: object) -> Numbers:
     return Numbers(found)
 
 
-class Slopes(NamedTuple):
-    """Derivatives of the error, and of each transmitter's power."""
-
-    error: Float[Array, "x"]
-    powers: Float[Array, "hops x"]
-
-
-class Problem:
-    """Error and powers of a network by the numbers that it is a function of, each point computed once."""
-
-    def __init__(self, build: Build, numbers: Numbers, weight_of: Callable[[tuple[str, ...]], np.ndarray]):
-        self.build, self.numbers, self.young = build, numbers, False
-        network = self.network(numbers.start)
-        if not means_are_known(network):
-            self.young, self.numbers = True, Numbers(numbers.each | {YOUNG: SCALAR})
-        self.names, self.weight = transmitters_of(network), weight_of(network.states)
-        self._measured = compiled(self._measure)
-        self._slopes = compiled(self._differentiate)
-        self._last: tuple[bytes, Measured, Settled, Slopes] | None = None
-
-    def network(self, x: Vector) -> Network:
-        """The network at these numbers."""
-        named = self.numbers.named(x).items()
-        values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
-        with jax.enable_x64(True):
-            return instance("network of free numbers", self.build(**values), Network, "a Network")
-
-    def _measure(self, x: Array) -> Measured:
-        values = self.numbers.named(jnp.asarray(x))
-        young = values.pop(YOUNG) if self.young else jnp.zeros(())
-        return measured(self.build(**values), young)
-
-    def _differentiate(self, x: Array, fixed: Settled) -> Slopes:
-        error = jax.grad(lambda free: touched(self._measure(free), fixed))(jnp.asarray(x))
-        return Slopes(error, jax.jacrev(lambda free: self._measure(free).powers)(jnp.asarray(x)))
-
-    def at(self, x: Vector) -> tuple[Measured, Settled, Slopes]:
-        """Everything at a point."""
-        if self._last is None or self._last[0] != x.tobytes():
-            known = Measured(*(np.asarray(part) for part in self._measured(np.asarray(x))))
-            fixed = settled(known, self.weight)
-            slopes = Slopes(*(np.asarray(part) for part in self._slopes(np.asarray(x), fixed)))
-            self._last = x.tobytes(), known, fixed, slopes
-        return self._last[1:]
-
-    def covariance(self, x: Vector) -> Float[np.ndarray, "n n"]:
-        """The error's covariance."""
-        return np.asarray(self.at(x)[1].parts.sum(axis=0))
-
-    def error(self, x: Vector) -> float:
-        """<W, P>."""
-        return float(np.sum(self.weight * self.covariance(x)))
-
-    def powers(self, x: Vector) -> Float[np.ndarray, "hops"]:
-        """What each transmitter sends."""
-        return np.asarray(self.at(x)[0].powers)
+def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
+    """A least or largest value, which may be infinite, of the start's shape."""
+    try:
+        value = np.broadcast_to(np.asarray(end, dtype=float), shape)
+    except (TypeError, ValueError):
+        raise fail(f"end of {name!r}", f"a number, or numbers of shape {shape}", repr(end)) from None
+    if np.any(np.isnan(value)):
+        raise fail(f"end of {name!r}", "numbers", "nan")
+    return value
 
 
-class Ended(NamedTuple):
-    """Where a descent ended, what it made small, and how far Lagrange's conditions are from holding, relatively."""
+def check_arguments(build: Build, free: object) -> None:
+    """Raise ValueError unless the function takes the free numbers by name, or without any no arguments."""
+    names = list(table("free", free, "(start, low, high)")) if free is not None else []
+    try:
+        signature(build).bind(**dict.fromkeys(names))
+    except TypeError as error:
+        raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
 
-    x: Vector
-    value: float
-    residual: float
 
+def marked(build: Build) -> tuple[Build, Numbers]:
+    """A function without arguments as one of the numbers that `hg.free` marks in it, each anywhere it may be."""
+    description = describe(build)
+    found = {}
+    for one in description.parameters.every:
+        if one.domain.kind != "interval":
+            raise fail(f"free number {one.name!r}", "one between two limits", f"a {one.domain.kind}")
+        ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
+        found[one.name] = Number(np.asarray(one.start), *ends)
 
-def descend_numbers(
-    problem: Problem, start: Vector, rows: Float[np.ndarray, "limits hops"], most: Vector, wanted: float | None
-) -> Ended:
-    """The least error with rows @ powers <= most, or the least total power with an error no larger than wanted."""
-    low, high = problem.numbers.ends
-    unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(start)), 1e-12)
-    scale = problem.error(start) if wanted is None else max(float(problem.powers(start).sum()), 1e-12)
+    def built(**values: Any) -> Network:
+        return description.at(values)
 
-    def value(z: np.ndarray) -> tuple[float, np.ndarray]:
-        m, _, slopes = problem.at(z * unit)
-        if wanted is None:
-            return problem.error(z * unit) / scale, slopes.error * unit / scale
-        return float(m.powers.sum()) / scale, slopes.powers.sum(axis=0) * unit / scale
-
-    def room(z: np.ndarray) -> np.ndarray:
-        left = 1 - rows @ problem.powers(z * unit) / most
-        return left if wanted is None else np.append(left, 1 - problem.error(z * unit) / wanted)
-
-    def slope(z: np.ndarray) -> np.ndarray:
-        slopes = problem.at(z * unit)[2]
-        own = -(rows @ slopes.powers) / most[:, None] * unit
-        return own if wanted is None else np.vstack([own, -slopes.error * unit / wanted])
-
-    constraints = [NonlinearConstraint(room, 0.0, np.inf, slope)] if len(rows) or wanted is not None else []
-    result = minimize(value, start / unit, jac=True, method="SLSQP", bounds=Bounds(low / unit, high / unit),
-                      constraints=constraints, options={"ftol": FINE, "maxiter": ITERATIONS})  # fmt: skip
-    z = np.clip(result.x, low / unit, high / unit)
-    if np.any(room(z) < -AT):
-        return Ended(z * unit, np.inf, np.inf)
-    now, gradient = value(z)
-    sides, x = np.eye(len(z)), z * unit
-    normals = [*slope(z)[room(z) < AT], *sides[x <= low + AT * unit], *-sides[x >= high - AT * unit]]
-    left = nnls(np.array(normals).T, gradient)[1] if normals else float(np.linalg.norm(gradient))
-    return Ended(z * unit, now * scale, left / max(float(np.linalg.norm(gradient)), 1e-12))
+    return built, Numbers(found)

@@ -8,10 +8,8 @@ from heliograph.numerics.check import array, covariance, fail, names
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants
 from heliograph.planning.criterion import Error
+from heliograph.planning.lyapunov import steady_moment
 from heliograph.planning.paths import Paths
-
-DOUBLINGS = 60
-EPS = float(np.finfo(np.float64).eps)
 
 
 def independent_paths(
@@ -65,25 +63,6 @@ def independent_paths(
         alpha=np.tile(costs.ravel(), (steps, 1)),
         names=names("names of transmitters", names_, len(c) * hops, "sender"),
     )
-
-
-def steady_moment(transition: Float[np.ndarray, "n n"], process: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """E[x x'] in the long run.
-
-    Raises:
-        ValueError: a plant that is not stable.
-    """
-    radius = float(np.max(np.abs(np.linalg.eigvals(transition))))
-    if radius >= 1:
-        expected = "a stable plant, since what its sensors send grows without limit (a horizon bounds it)"
-        raise fail("steady powers", expected, f"an eigenvalue of size {radius:.6g}")
-    total, power = process, transition
-    for _ in range(DOUBLINGS):  # sum_k A^k Q A'^k, twice as many terms each time: in any units of the states
-        more = power @ total @ power.T
-        total, power = total + more, power @ power
-        if np.all(np.abs(more) <= EPS * np.abs(total)):
-            break
-    return np.asarray((total + total.T) / 2)
 
 
 def moments(

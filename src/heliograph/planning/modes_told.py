@@ -1,14 +1,16 @@
-"""Steady error where the receiver is told of modes: a coupled Riccati equation by policy iteration, and its adjoint.
+"""Errors where the receiver is told of modes: coupled Riccati recursions, by policy iteration if steady, and adjoints.
 
-With T[i, j] = P(next j | now i), pi its law, X_i = E[e e' 1{i}] and a gain K_j of each mode,
-  X_j = (I - K_j H_j) Y_j (I - K_j H_j)' + pi_j K_j N_j K_j',  Y_j = sum_i T_ij A X_i A' + pi_j Q,
-and the error is sum X_j. Given the gains this is linear; gains that are best given Y do not change the error to first
-order. So with L_i = W + sum_l T_il F_l' L_l F_l, F_l = (I - K_l H_l) A, the gradient of <W, error> is that of
-  sum_j <L_j, right side_j>  at fixed X, K, L.
+With T_k[i, j] = P(j at step k | i before), pi_k the law, X_k,i = E[e e' 1{i}] and a gain K_k,j of each step and mode,
+  X_k,j = (I - K H) Y (I - K H)' + pi_k,j K N K',  Y_k,j = sum_i T_k,ij A X_k-1,i A' + pi_k,j Q,
+and P_k = sum_j X_k,j. Given the gains this is linear; gains that are best given Y do not change the error to first
+order. So with W_k the error's derivative by P_k and L_k,i = W_k + sum_l T_k+1,il F' L_k+1,l F, F = (I - K_k+1,l H) A,
+the error's gradient is that of
+  sum_k,j <L_k,j, right side_k,j>  at fixed X, K, L.
 One mode is the Riccati equation; modes that do not remember are losses that are told. The gains depend on the mode
 alone: filters that also remember which modes were before do no worse, so with modes the error is an upper bound.
 """
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -17,74 +19,129 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
+from heliograph.planning.weighing import Weighing
 
 PLAIN, POLICIES = 400, 40  # iterations: of the recursion until its gains stabilise, of gains after that
 NEAR = 1e-4  # relative change of the recursion from which gains are improved
 SETTLED = 1e-14
 
+Parts = Float[np.ndarray, "time M n n"]
+
 
 class Measured(NamedTuple):
-    """A, Q, the chain T with its law pi, and by mode H and N of z = H x + n; powers of the transmitters, in order."""
+    """Of each step A, Q, the chain T into it, the law pi, by mode H and N of z = H x + n, and the transmitters' powers.
 
-    transition: Any  # (n, n), NumPy's or JAX's as what it is made of
-    process: Any  # (n, n)
-    chain: Any  # (M, M)
-    law: Any  # (M,)
-    output: Any  # (M, m, n)
-    noise: Any  # (M, m, m)
-    powers: Any  # (hops,)
+    start: the covariance before the first step; None where the steps repeat for ever.
+    """
+
+    transition: Any  # (time, n, n), NumPy's or JAX's as what it is made of
+    process: Any  # (time, n, n)
+    chain: Any  # (time, M, M)
+    law: Any  # (time, M)
+    output: Any  # (time, M, m, n)
+    noise: Any  # (time, M, m, m)
+    powers: Any  # (time, hops)
+    start: Any  # (n, n)
 
 
 class Settled(NamedTuple):
-    """X, K and L of each mode."""
+    """X, K and L of each step and mode."""
 
-    parts: Float[np.ndarray, "M n n"]
-    gains: Float[np.ndarray, "M n m"]
-    ahead: Float[np.ndarray, "M n n"]
+    parts: Parts
+    gains: Float[np.ndarray, "time M n m"]
+    ahead: Parts
 
 
-def settled(m: Measured, weight: Float[np.ndarray, "n n"]) -> Settled:
-    """The fixed point and its adjoint.
+def settled(m: Measured, weighing: Weighing) -> Settled:
+    """The covariances with the best gains, and their adjoint.
 
     Raises:
-        ValueError: an error that grows without limit.
+        ValueError: an error that grows without limit, readings without any noise.
     """
-    n = len(m.transition)
-    parts = m.law[:, None, None] * m.process
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):
+            parts, gains, loops = _around(m) if m.start is None else _along(m)
+    except np.linalg.LinAlgError:
+        raise fail("network of a design", "readings with noise", "an innovation covariance that is singular") from None
+    if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
+        expected = "one that settles (what is heard tells too little of an unstable plant)"
+        raise fail("steady error", expected, "one that grows")
+    weights = weighing.smooth(parts.sum(axis=1))[1]
+    return Settled(parts, gains, _ahead(m, loops, weights))
+
+
+def _along(m: Measured) -> tuple[Parts, np.ndarray, np.ndarray]:
+    """From the start on: X, best gains and F of each step."""
+    parts, gains = _cycle(m, _begin(m))
+    return parts, gains, _loops(m, gains)
+
+
+def _around(m: Measured) -> tuple[Parts, np.ndarray, np.ndarray]:
+    """The same for steps that repeat for ever."""
+    n, modes = m.process.shape[-1], m.law.shape[1]
+    last = m.law[-1, :, None, None] * m.process[-1]
     for _ in range(PLAIN):
-        gains, after = _best(m, parts)
-        change = np.abs(after - parts).max()
-        parts = after
-        if not change > NEAR * np.abs(parts).max():
+        parts, gains = _cycle(m, last)
+        change = np.abs(parts[-1] - last).max()
+        last = parts[-1]
+        if not change > NEAR * np.abs(last).max():
             break
     for _ in range(POLICIES):
-        close = np.eye(n) - gains @ m.output
-        loops = close @ m.transition
-        whole = np.eye(len(m.law) * n * n) - _operator(m.chain, loops)
-        source = close @ m.process @ close.swapaxes(1, 2) + gains @ m.noise @ gains.swapaxes(1, 2)
-        solved = np.linalg.solve(whole, (m.law[:, None, None] * source).ravel()).reshape(parts.shape)
-        change = np.abs(solved - parts).max()
-        parts = (solved + solved.swapaxes(1, 2)) / 2
-        if change <= SETTLED * np.abs(parts).max():
+        loops, before = _loops(m, gains), parts
+        source = _source(m, gains)
+        operators = [_operator(chain, loop) for chain, loop in zip(m.chain, loops, strict=True)]
+        given = reduce(lambda so_far, item: item[0] @ so_far + item[1].ravel(),
+                       zip(operators, source, strict=True), np.zeros(modes * n * n))  # fmt: skip
+        whole = np.eye(modes * n * n) - reduce(lambda so_far, one: one @ so_far, operators)
+        x, found = np.linalg.solve(whole, given), []
+        for operator, own in zip(operators, source, strict=True):
+            x = operator @ x + own.ravel()
+            found.append(x.reshape(modes, n, n))
+        parts = (np.array(found) + np.swapaxes(found, -1, -2)) / 2
+        if np.abs(parts - before).max() <= SETTLED * np.abs(parts).max():
             break
-        gains = _best(m, parts)[0]
-    if not np.all(np.isfinite(parts)) or np.linalg.eigvalsh(parts).min() < -NEAR * np.abs(parts).max():
-        raise fail(
-            "steady error", "one that settles (what is heard tells too little of an unstable plant)", "one that grows"
-        )
-    ahead = np.linalg.solve(whole.T, np.tile(weight, (len(m.law), 1, 1)).ravel()).reshape(parts.shape)
-    return Settled(parts, gains, (ahead + ahead.swapaxes(1, 2)) / 2)
+        gains = np.array([_best(m, k, parts[k - 1])[0] for k in range(len(parts))])
+    return parts, gains, loops
 
 
-def _best(m: Measured, parts: Float[np.ndarray, "M n n"]) -> tuple[np.ndarray, np.ndarray]:
-    """Best gains and X after one step."""
-    moved = m.transition @ parts @ m.transition.T
-    before = np.einsum("ij,iab->jab", m.chain, moved) + m.law[:, None, None] * m.process
-    cross = m.output @ before
-    total = cross @ m.output.swapaxes(1, 2) + m.law[:, None, None] * m.noise
+def _begin(m: Measured) -> Float[np.ndarray, "M n n"]:
+    """X before the first step, over which the chain forgets."""
+    modes = m.law.shape[1]
+    begin: np.ndarray = m.start[None] * (np.ones((modes, 1, 1)) / modes)
+    return begin
+
+
+def _cycle(m: Measured, parts: Float[np.ndarray, "M n n"]) -> tuple[Parts, np.ndarray]:
+    """X and the best gains of each step, from X before the first."""
+    found, gains = [], []
+    for k in range(len(m.law)):
+        gain, parts = _best(m, k, parts)
+        found.append(parts)
+        gains.append(gain)
+    return np.array(found), np.array(gains)
+
+
+def _best(m: Measured, k: int, parts: Float[np.ndarray, "M n n"]) -> tuple[np.ndarray, np.ndarray]:
+    """Best gains of a step and X after it."""
+    moved, law = m.transition[k] @ parts @ m.transition[k].T, m.law[k][:, None, None]
+    before = np.einsum("ij,iab->jab", m.chain[k], moved) + law * m.process[k]
+    cross = m.output[k] @ before
+    total = cross @ m.output[k].swapaxes(1, 2) + np.where(law > 0, law * m.noise[k], np.eye(m.noise.shape[-1]))
     gains = np.linalg.solve(total, cross).swapaxes(1, 2)
     after = before - gains @ cross
     return gains, (after + after.swapaxes(1, 2)) / 2
+
+
+def _loops(m: Measured, gains: np.ndarray) -> Parts:
+    """F = (I - K H) A."""
+    return np.asarray((np.eye(gains.shape[2]) - gains @ m.output) @ m.transition[:, None])
+
+
+def _source(m: Measured, gains: np.ndarray) -> Parts:
+    """What each step adds to X: of the plant's noise and of what is heard."""
+    close = np.eye(gains.shape[2]) - gains @ m.output
+    added = close @ m.process[:, None] @ close.swapaxes(2, 3) + gains @ m.noise @ gains.swapaxes(2, 3)
+    return np.asarray(m.law[:, :, None, None] * added)
 
 
 def _operator(chain: np.ndarray, loops: Float[np.ndarray, "M n n"]) -> Float[np.ndarray, "Mnn Mnn"]:
@@ -94,11 +151,32 @@ def _operator(chain: np.ndarray, loops: Float[np.ndarray, "M n n"]) -> Float[np.
     return np.asarray(np.einsum("ij,jab->jaib", chain, double).reshape(modes * n * n, modes * n * n))
 
 
+def _ahead(m: Measured, loops: Parts, weights: Float[np.ndarray, "time n n"]) -> Parts:
+    """L of each step: backwards from zero behind the last, or from what it is around a period."""
+    steps, modes, n = len(loops), *loops.shape[1:3]
+    back = [_operator(chain, loop).T for chain, loop in zip(m.chain, loops, strict=True)]
+    own = [np.tile(one, (modes, 1, 1)).ravel() for one in weights]
+
+    def cycle(after: np.ndarray) -> list[np.ndarray]:
+        found = [after]  # what the first step of the next cycle asks of the last one
+        for k in range(steps - 1, -1, -1):
+            found.append(back[k] @ (own[k] + found[-1]))
+        return found
+
+    after = np.zeros(modes * n * n)
+    if m.start is None:
+        around = reduce(lambda so_far, one: so_far @ one, back)
+        after = np.linalg.solve(np.eye(len(after)) - around, cycle(after)[-1])
+    ahead = np.array([w + f for w, f in zip(own, cycle(after)[:-1][::-1], strict=True)]).reshape(steps, modes, n, n)
+    return np.asarray(ahead + ahead.swapaxes(2, 3)) / 2
+
+
 def touched(m: Measured, at: Settled) -> jax.Array:
-    """sum_j <L_j, right side_j>: what has the error's gradient where X, K and L are held."""
+    """sum_k,j <L, right side>: what has the error's gradient where X, K and L are held."""
     parts, gains, ahead = (jnp.asarray(part) for part in at)
+    earlier = jnp.roll(parts, 1, axis=0) if m.start is None else jnp.concatenate([_begin(m)[None], parts[:-1]])
     close = jnp.eye(parts.shape[-1]) - gains @ m.output
-    moved = m.transition @ parts @ m.transition.T
-    before = jnp.einsum("ij,iab->jab", m.chain, moved) + m.law[:, None, None] * m.process
-    noise = m.law[:, None, None] * (gains @ m.noise @ gains.swapaxes(1, 2))
-    return jnp.sum(ahead * (close @ before @ close.swapaxes(1, 2) + noise))
+    moved = m.transition[:, None] @ earlier @ m.transition[:, None].swapaxes(2, 3)
+    law = m.law[:, :, None, None]
+    before = jnp.einsum("kij,kiab->kjab", m.chain, moved) + law * m.process[:, None]
+    return jnp.sum(ahead * (close @ before @ close.swapaxes(2, 3) + law * (gains @ m.noise @ gains.swapaxes(2, 3))))

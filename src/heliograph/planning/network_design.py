@@ -57,9 +57,10 @@ def design(
 
     Numbers of any kind are free where `network` is a function of them that returns a network, and `free` says
     {name: (start, low, high)}: amplifications, weights, places; or of a function without arguments in which `hg.free`
-    marks them. Channels may then share gains, tell of their modes or
-    losses, or have uncertain probabilities: the error is an upper bound then, with "young" among the numbers found, the
-    scalar in it. The error is steady.
+    marks them. Channels may then share gains, tell of their modes or losses, or have uncertain probabilities: the error
+    is an upper bound then, with "young" among the numbers found, the scalar in it (one for each step). Where powers are
+    to differ from step to step, an array is free, and the function makes a channel of each entry
+    (`hg.model.over_time`).
 
     Of a `RelayNetwork` the gains are free with which its relays filter what they hear; they decide what each relay
     sends, and the budget is what all relays together may send in each slot.
@@ -84,21 +85,26 @@ def design(
         raise fail("design", "a budget of power or a wanted error", "neither")
     if isinstance(free, Mapping):
         raise fail("free", "names of transmitters (numbers are free of a function that returns a network)", shown(free))
-    paths, present = paths_of(network, error)
-    task = _task(network, paths, present, error, free, budget, check_count("starts", starts), check_seed("seed", seed))
+    task = _task(network, error, free, budget, check_count("starts", starts), check_seed("seed", seed))
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
     found, certificate = _best(task) if least is None else _least(task, least)
+    return _designed(network, error, task, found, certificate)
+
+
+def _designed(
+    network: Network, error: Error, task: _Task, found: Float[np.ndarray, "time free"], certificate: Certificate
+) -> NetworkDesign:
     whole = task.held.copy()
     whole[:, task.free] = found
-    every = of_hops(paths, error, task.objective.weight[0], np.ones(len(paths.names), dtype=bool), whole)
+    names = task.paths.names
+    every = of_hops(task.paths, error, task.objective.weighing.weight[0], np.ones(len(names), dtype=bool), whole)
     gradient = every.value_and_gradient(whole)[1]
-    by_mean = gradient.sum(axis=0)
     return NetworkDesign(
-        powers=dict(zip(paths.names, whole.T, strict=True)),
+        powers=dict(zip(names, whole.T, strict=True)),
         error=task.objective.exact(found),
-        present=every.exact(present),
+        present=every.exact(task.held),
         covariance=task.objective.covariances(found),
-        sensitivity=dict(zip(paths.names, by_mean.tolist(), strict=True)),
+        sensitivity=dict(zip(names, gradient.sum(axis=0).tolist(), strict=True)),
         price=float(np.max(-gradient[:, task.free] * len(gradient), initial=0.0)),
         certificate=certificate,
         given=network,
@@ -109,14 +115,13 @@ def design(
 
 def _task(
     network: Network,
-    paths: Paths,
-    present: Float[np.ndarray, "time hop"],
     error: Error,
     free: Sequence[str] | None,
     budget: Budget | ArrayLike | None,
     starts: int,
     seed: int,
 ) -> _Task:
+    paths, present = paths_of(network, error)
     names = (
         paths.names if free is None else tuple(items("free", free if not isinstance(free, str) else [free], "names"))
     )

@@ -1,19 +1,17 @@
 """Designs of networks that are functions of free numbers."""
 
-from inspect import signature
-from typing import Any
-
 import numpy as np
 
-from heliograph.learning.parameters import describe
-from heliograph.numerics.check import fail, scalar, table
-from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.budget import Budget, allowed, as_budget
+from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.types import ArrayLike
+from heliograph.planning.budget import Allowed, Budget, allowed, as_budget
 from heliograph.planning.certificate import Certificate
 from heliograph.planning.criterion import Error
-from heliograph.planning.free_numbers import Build, Ended, Number, Numbers, Problem, as_numbers, descend_numbers
+from heliograph.planning.free_numbers import Build, as_numbers, check_arguments, marked
+from heliograph.planning.numbers_descent import Ended, Limits, descend_numbers, limits_of
+from heliograph.planning.numbers_problem import Problem
 from heliograph.planning.outcome import NetworkDesign
-from heliograph.simulation.network import Network
+from heliograph.planning.repeated import repeated
 
 
 def design_numbers(
@@ -28,84 +26,65 @@ def design_numbers(
     """`design` of a network that is a function of free numbers: the best of several descents, a budget if there is one.
 
     Raises:
-        ValueError: an error that is not the steady one, numbers that are none, no start from which a budget or a wanted
-            error is met.
+        ValueError: no start from which a budget or a wanted error is met, a network that does not fit the error.
     """
-    if error.steps > 1 or error.horizon is not None or error.worst:
-        raise fail("error of a network of free numbers", "a steady weighted trace", "another")
-    _check_arguments(build, free)
-    problem = Problem(*(_marked(build) if free is None else (build, as_numbers(free))), error.matrix)
-    rows, most = _limits(problem, budget)
+    check_arguments(build, free)
+    problem = Problem(*(marked(build) if free is None else (build, as_numbers(free))), error)
     least = None if wanted is None else float(scalar("wanted error", wanted, 0.0))
+    if least == 0:
+        raise fail("wanted error", "a number above zero", "0")
+    problem.at(problem.numbers.start)  # what cannot be is refused before any descent
+    limits = limits_of(_allowed(problem, budget), least, (error.steps, len(problem.names)))
+    best = _best(problem, limits, starts, seed)
+    if not np.isfinite(best.value):
+        raise _unmet(problem, limits, starts, seed)
+    return _designed(problem, best, starts, least is not None)
+
+
+def _best(problem: Problem, limits: Limits, starts: int, seed: int) -> Ended:
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
-    best = min((descend_numbers(problem, x, rows, most, least) for x in begin), key=lambda one: one.value)
-    if not np.isfinite(best.value):
-        raise _unmet(problem, budget, wanted)
-    return _designed(problem, best, error, starts, least is not None)
+    return min((descend_numbers(problem, x, limits) for x in begin), key=lambda one: one.value)
 
 
-def _check_arguments(build: Build, free: object) -> None:
-    """Raise ValueError unless the function takes the free numbers by name, or without any no arguments."""
-    names = list(table("free", free, "(start, low, high)")) if free is not None else []
-    try:
-        signature(build).bind(**dict.fromkeys(names))
-    except TypeError as error:
-        raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
-
-
-def _marked(build: Build) -> tuple[Build, Numbers]:
-    """A function without arguments as one of the numbers that `hg.free` marks in it, each anywhere it may be."""
-    description = describe(build)
-    found = {}
-    for one in description.parameters.every:
-        if one.domain.kind != "interval":
-            raise fail(f"free number {one.name!r}", "one between two limits", f"a {one.domain.kind}")
-        ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
-        found[one.name] = Number(np.asarray(one.start), *ends)
-
-    def built(**values: Any) -> Network:
-        return description.at(values)
-
-    return built, Numbers(found)
-
-
-def _limits(
-    problem: Problem, budget: Budget | ArrayLike | None
-) -> tuple[Float[np.ndarray, "limits hops"], Float[np.ndarray, "limits"]]:
-    """Finite limits as rows of the powers; one step, so that a peak is a limit of the mean."""
-    hops = len(problem.names)
+def _allowed(problem: Problem, budget: Budget | ArrayLike | None) -> Allowed | None:
     if budget is None:
-        return np.zeros((0, hops)), np.zeros(0)
-    room = allowed(as_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((1, hops)))
-    most = np.append(np.minimum(room.each, room.peak[0]), room.total)
-    rows = np.concatenate([np.eye(hops), np.ones((1, hops))])
-    kept = np.isfinite(most)
-    if np.any(most[kept] <= 0):
+        return None
+    hops = len(problem.names)
+    room = allowed(as_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((problem.asked.steps, hops)))
+    if min(np.min(room.peak), np.min(room.each), room.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
-    return rows[kept], most[kept]
+    return room
 
 
-def _unmet(problem: Problem, budget: object, wanted: object) -> ValueError:
-    start = problem.numbers.start
-    found = f"from its start it sends {problem.powers(start).sum():.6g}"
-    if wanted is None:
-        return fail("budget", "one that is met from some start", f"none that is ({found})")
-    return fail("wanted error", "one that some start reaches", f"{wanted} ({found}, error {problem.error(start):.6g})")
+def _unmet(problem: Problem, limits: Limits, starts: int, seed: int) -> ValueError:
+    """What is least where the limits cannot be met: the error within them, or the power that is sent in any case."""
+    if limits.wanted is not None:
+        found = _best(problem, limits._replace(wanted=None), starts, seed)
+        if np.isfinite(found.value):
+            least = f"at least {found.value:.6g}, the least found from {starts} starts"
+            return fail("wanted error", least, f"{limits.wanted:.6g}")
+    unlimited = Limits(limits.rows[:0], limits.most[:0], np.inf)
+    power = _best(problem, unlimited, starts, seed).value
+    found_power = f"a total power of {power:.6g} is the least found"
+    return fail("budget", f"one that is met from some of {starts} starts ({found_power})", "none that is")
 
 
-def _designed(problem: Problem, best: Ended, error: Error, starts: int, by_power: bool) -> NetworkDesign:
-    powers = problem.powers(best.x)
-    unit = "power" if by_power else "error"
+def _designed(problem: Problem, best: Ended, starts: int, by_power: bool) -> NetworkDesign:
+    now = problem.at(best.x)
+    network = problem.network(best.x)
+    before = problem.at(problem.numbers.start)
+    error = problem.weighing.exact(now.covariances)
+    value, unit = (best.value, "power") if by_power else (error, "error")
     return NetworkDesign(
-        powers={name: np.array([power]) for name, power in zip(problem.names, powers, strict=True)},
-        error=problem.error(best.x),
-        present=problem.error(problem.numbers.start),
-        covariance=problem.covariance(best.x)[None],
-        sensitivity=dict(zip(problem.names, [float("nan")] * len(powers), strict=True)),
-        price=float("nan"),
-        certificate=Certificate(False, best.value, float("-inf"), best.residual, starts, unit),
-        given=problem.network(best.x),
-        asked=error,
+        powers=dict(zip(problem.names, now.powers.T, strict=True)),
+        error=error,
+        present=problem.weighing.exact(before.covariances),
+        covariance=now.covariances,
+        sensitivity=dict(zip(problem.names, (-best.worth.sum(axis=0)).tolist(), strict=True)),
+        price=float(np.max(best.worth, initial=0.0) * problem.asked.steps),
+        certificate=Certificate(False, value, float("-inf"), best.residual, starts, unit),
+        given=repeated(network) if problem.asked.period > 1 else network,
+        asked=problem.asked,
         numbers=problem.numbers.named(best.x),
     )

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.adjoint import covariances
 from heliograph.planning.budget import Allowed, allowed, as_budget
@@ -52,7 +52,8 @@ def one_hop(paths: Paths, budget: object, error: Error | None, states: tuple[str
     Raises:
         ValueError: paths of several hops, an error over other steps than the paths.
     """
-    error = Error() if error is None else error
+    instance("paths", paths, Paths, "Paths (independent_paths, paths_of)")
+    error = Error() if error is None else instance("error", error, Error, "an Error")
     steps, hops = paths.kappa.shape
     if hops != paths.rows.shape[1]:
         raise fail("paths of a convex design", "one hop each", f"{hops} hops of {paths.rows.shape[1]} paths")

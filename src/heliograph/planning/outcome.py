@@ -17,7 +17,8 @@ class NetworkDesign(eqx.Module):
 
     powers: of every transmitter, {name: (steps,)}, steps of the error's period or horizon (one if steady). error: what
     they give; present: what the network gives as it is; covariance: P after each step. sensitivity: the error's
-    derivative by the mean power of each transmitter; price: the error that one more watt of the budget takes away.
+    derivative by the mean power of each transmitter; price: the error that one more watt of the budget takes away. Of
+    free numbers both come from Lagrange's multipliers: zero where no limit of power holds the error up.
     given, asked: the network and the error that the design is of. numbers: the free numbers of a network that is a
     function of them.
     """
@@ -37,7 +38,8 @@ class NetworkDesign(eqx.Module):
     def network(self) -> Network:
         """The design as a network that runs: every node with the filter "best", and "best" of all that they receive.
 
-        Where it is a function of free numbers, what this returns for them.
+        Where it is a function of free numbers, what this returns for them. A period is gone through again and again,
+        for about 100 steps.
         """
         return self.given if self.numbers else designed_network(self.given, self.powers, self.asked)
 

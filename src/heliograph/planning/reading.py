@@ -10,10 +10,11 @@ from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Float
 from heliograph.planning.adjoint import Plants
+from heliograph.planning.channel_power import sent_powers
 from heliograph.planning.criterion import Error
 from heliograph.planning.paths import Paths
 from heliograph.planning.state_power import check_constant_noise, of_sensor, seconds_over, steady_second
-from heliograph.planning.transmitters import sent_powers, transmits
+from heliograph.planning.transmitters import transmits
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack

@@ -15,7 +15,8 @@ from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants, covariances
 from heliograph.planning.criterion import Error
-from heliograph.planning.independent import at_least, independent_paths, steady_moment
+from heliograph.planning.independent import at_least, independent_paths
+from heliograph.planning.lyapunov import steady_moment
 from heliograph.planning.paths import Paths
 from heliograph.planning.relay_line import relay_line
 from heliograph.planning.splits import path_noise

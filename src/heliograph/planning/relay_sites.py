@@ -8,7 +8,7 @@ from math import comb
 import numpy as np
 from scipy.optimize import minimize
 
-from heliograph.numerics.check import array, check_count, fail, scalar
+from heliograph.numerics.check import array, check_count, fail, instance, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.choose import COMPARED, Choice, greedy, swapped
@@ -52,6 +52,7 @@ def relay_map(
     Raises:
         ValueError: no power, an empty grid.
     """
+    instance("scene", scene, RelayScene, "a RelayScene")
     power = float(scalar("total power", total, np.finfo(float).tiny))
     xs, ys = array("x of a map", x, (None,)), array("y of a map", y, (None,))
     if not len(xs) or not len(ys):
@@ -78,6 +79,7 @@ def choose_relays(
     Raises:
         ValueError: no power, more relays than sites.
     """
+    instance("scene", scene, RelayScene, "a RelayScene")
     power = float(scalar("total power", total, np.finfo(float).tiny))
     places = array("sites of relays", sites, (None, 2))
     if check_count("relays to choose", count) > len(places):

@@ -9,8 +9,9 @@ from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, as_budget
 from heliograph.planning.certificate import Certificate
 from heliograph.planning.criterion import Error
-from heliograph.planning.designed import BEST, COVERED
+from heliograph.planning.designed import BEST
 from heliograph.planning.outcome import NetworkDesign
+from heliograph.planning.repeated import COVERED
 from heliograph.planning.state_power import of_sensor, steady_second
 from heliograph.relays.design import given_design, relay_schedules
 from heliograph.relays.periodic import periodic_behind_relays, periodic_given_design, periodic_own_error_design

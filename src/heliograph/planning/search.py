@@ -7,12 +7,11 @@ import numpy as np
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import Allowed
 from heliograph.planning.descent import COARSE, Found, descend, lower_total, polish
-from heliograph.planning.objective import SHARPEST, Objective
+from heliograph.planning.objective import Objective
 
 Mask = Bool[np.ndarray, "time free"]
 Powers = Float[np.ndarray, "time free"]
 
-SHARPER = (16, 128, SHARPEST)
 BISECTIONS = 60  # of a factor between 1e-12 and 1e12, on a logarithmic scale
 ROUNDS = 6
 EXACT = 1e-14  # relative change of the least power that is left
@@ -43,13 +42,10 @@ def supports(path: Int[np.ndarray, "free"], steps: int, starts: int, seed: int) 
 
 def search(objective: Objective, limits: Allowed, starts: list[Powers]) -> Found:
     """The best of the descents from these powers."""
-    if objective.sharpness is None:
-        found = [descend(objective, limits, start, COARSE) for start in starts]
-    else:  # the largest eigenvalue is smoothed less and less
-        found = [Found(start, np.inf) for start in starts]
-        for sharpness in SHARPER:
-            objective = objective._replace(sharpness=sharpness)
-            found = [descend(objective, limits, one.powers, COARSE) for one in found]
+    found = [Found(start, np.inf) for start in starts]
+    for weighing in objective.weighing.sharper():
+        objective = objective._replace(weighing=weighing)
+        found = [descend(objective, limits, one.powers, COARSE) for one in found]
     best = min(found, key=lambda one: one.error)
     return polish(objective, limits, descend(objective, limits, best.powers))
 

@@ -17,8 +17,8 @@ from heliograph.numerics.check import array, check_count, check_horizon, check_s
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.planning.channel_power import sent_powers, steady_powers
 from heliograph.planning.state_power import growth, of_sensor, seconds_over, steady_second
-from heliograph.planning.transmitters import sent_powers
 from heliograph.relays.design import expected_maps, given_design
 from heliograph.simulation.network import OWN, Network
 from heliograph.simulation.node import Node
@@ -89,7 +89,10 @@ def power(
         sent = _of_relays(network, horizon)
         return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, rate)
     worlds = _worlds(network)
-    steps = 1 if horizon is None else check_horizon(horizon, steps_covered((network.plant, worlds)))
+    covered = steps_covered((network.plant, worlds))
+    if horizon is None and covered is not None:
+        raise fail("steady power", "a network that does not vary (give a horizon)", "parts that are OverTime")
+    steps = 1 if horizon is None else check_horizon(horizon, covered)
     u = np.zeros((steps, len(start.inputs))) if inputs is None else array("inputs", inputs, (steps, len(start.inputs)))
     straight = all(is_linear(network.plant, s) and not first(s).circular for s, _ in worlds.values())
     if straight and not start.circular:
@@ -103,13 +106,18 @@ def power(
         y[name], rate = _left(item, u, horizon), float("nan")
     sent, error = {}, {}
     for name, (_, channel) in worlds.items():
-        each = [[sent_powers(at(channel, k), now, k) for k, now in enumerate(batch)] for batch in y[name]]
+        each = [[_at_step(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
         for hop in each[0][0]:
             found = np.array([[now[hop] for now in batch] for batch in each])
             sent[f"{name}.{hop}"] = found.mean(axis=0)
             spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.zeros(steps)
             error[f"{name}.{hop}"] = spread / np.sqrt(len(found))
     return SentPower(sent, error, rate)
+
+
+def _at_step(channel: Channel, k: int, second: np.ndarray, horizon: int | None) -> dict[str, float]:
+    """What is sent at a step, or where there is no horizon in the long run."""
+    return steady_powers(at(channel, k), second) if horizon is None else sent_powers(at(channel, k), second, k)
 
 
 def _worlds(network: Network) -> Worlds:

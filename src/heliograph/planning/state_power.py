@@ -5,13 +5,13 @@ Pi = E (x, 1)(x, 1)' of the state itself, mean included, not of an estimate's er
 
 import jax
 import numpy as np
-from scipy.linalg import solve_discrete_lyapunov
 
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.planning.lyapunov import steady_moment
 from heliograph.random_affine.noise import AbstractNoise
 
 Seconds = Float[np.ndarray, "time n1 n1"]
@@ -19,7 +19,18 @@ Seconds = Float[np.ndarray, "time n1 n1"]
 
 def growth(plant: LinearPlant) -> float:
     """Spectral radius of a plant: above 1 what is sent grows without limit."""
-    return float(np.max(np.abs(np.linalg.eigvals(np.asarray(plant.matrix))), initial=0.0))
+    return _radius(np.asarray(plant.matrix))
+
+
+def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
+    """Raise ValueError where a plant's second moments grow without limit."""
+    if (radius := _radius(transition)) >= 1:
+        expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
+        raise fail("steady power", expected, f"spectral radius {radius:.6g}")
+
+
+def _radius(transition: Float[np.ndarray, "n n"]) -> float:
+    return float(np.max(np.abs(np.linalg.eigvals(transition)), initial=0.0))
 
 
 def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
@@ -41,12 +52,10 @@ def steady_second(plant: AnyPlant) -> Float[np.ndarray, "n1 n1"]:
     start, noise = check_constant_noise(plant)
     if isinstance(plant, OverTime):
         raise fail("steady power", "a plant that does not vary (give a horizon)", "one that is an OverTime")
-    a, radius = np.asarray(start.matrix), growth(start)
-    if radius >= 1:
-        expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
-        raise fail("steady power", expected, f"spectral radius {radius:.6g}")
+    a = np.asarray(start.matrix)
+    check_stable(a)
     mean = np.linalg.solve(np.eye(len(a)) - a, np.asarray(noise.mean))
-    return _joined(mean, solve_discrete_lyapunov(a, np.asarray(noise.covariance)))
+    return _joined(mean, steady_moment(a, np.asarray(noise.covariance)))
 
 
 def seconds_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None) -> Seconds:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 
 from heliograph.numerics.readable import readable
-from heliograph.planning.budget import Budget
+from heliograph.planning.budget import Budget, as_budget
 from heliograph.planning.criterion import Error
 from heliograph.planning.network_design import design
 from heliograph.planning.outcome import NetworkDesign
@@ -17,7 +17,7 @@ class Task:
 
     free: tuple[str, ...] | None = None
     error: Error | None = None
-    budget: Budget | None = None
+    budget: Budget | float | None = None
     wanted: float | None = None
     starts: int = 64
     seed: int = 0
@@ -32,7 +32,8 @@ class Task:
 
     def at(self, total: float) -> "Task":
         """The same with this total power, for the least error."""
-        limits = Budget(total) if self.budget is None else Budget(total, self.budget.each, self.budget.peak)
+        given = None if self.budget is None else as_budget(self.budget)
+        limits = Budget(total) if given is None else Budget(total, given.each, given.peak)
         return replace(self, budget=limits, wanted=None)
 
     def also(self, name: str) -> "Task":
