@@ -17,7 +17,7 @@
   const numeric = name => values[name].every(value => typeof value === "number");
   const chosen = Object.fromEntries(dimensions.map(name =>
     [name, new Set(data.whole.includes(name) ? values[name] : values[name].slice(0, 1))]));
-  let sorted = {name: null, down: false}, views = null, drawing = Promise.resolve();
+  let sorted = {name: null, down: false}, views = null, wanted = 0, drawing = Promise.resolve();
 
   function options(id, names, labels, first) {
     names.forEach((name, i) => at(id).append(new Option(labels[i], name, name === first, name === first)));
@@ -40,7 +40,16 @@
   function boxes() {
     at("values").replaceChildren(...dimensions.filter(name => name !== data.unordered && values[name].length > 1).map(name => {
       const field = make("fieldset");
-      field.append(make("legend", name));
+      const legend = make("legend"), all = make("button", name);
+      all.type = "button";
+      all.title = "all, or the first alone";
+      all.addEventListener("click", () => {
+        chosen[name] = new Set(chosen[name].size < values[name].length ? values[name] : values[name].slice(0, 1));
+        boxes();
+        draw();
+      });
+      legend.append(all);
+      field.append(legend);
       for (const value of values[name]) {
         const label = make("label"), box = make("input");
         box.type = "checkbox";
@@ -97,7 +106,8 @@
         `${count} curve${count === 1 ? "" : "s"} in ${drawn.length} panel${drawn.length === 1 ? "" : "s"}.`) +
       " Bars: two standard errors to both sides. Drag to move, box to zoom, point to read.";
     table(rows);
-    drawing = drawing.then(() => paint(drawn, others)).catch(error => console.error(error));
+    const turn = ++wanted;  // what is no longer wanted when its turn comes is not drawn
+    drawing = drawing.then(() => turn === wanted ? paint(drawn, others) : null).catch(error => console.error(error));
   }
 
   async function paint(parts, others) {
