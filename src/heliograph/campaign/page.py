@@ -34,8 +34,8 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
         f"there. {_failed(failures)}",
         sections=[
             *([_failures(failures)] if failures else []),
-            Section("Results", _pictures(campaign, scores)),
-            Section("All scores", [_table(campaign, scores)]),
+            Section("Results", pictures(campaign, scores)),
+            Section("All scores", [score_table(campaign, scores)]),
             _reading(campaign),
             Section("The campaign", [Code(campaign.text.strip())]),
         ],
@@ -57,7 +57,8 @@ def _failures(failures: Sequence[Entry]) -> Section:
     return Section("What failed", [Points(points), Text([text]), Code(failures[0]["command"])])
 
 
-def _pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
+def pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
+    """Figures of a campaign's scores."""
     caption = f"Bars: two standard errors to both sides. At most {PANELS} panels are drawn; {SUMMARY} has all."
     return [
         Picture(svg(figure), f"{name} of every filter.", caption if i == 0 else "")
@@ -65,7 +66,8 @@ def _pictures(campaign: Campaign, scores: Sequence[Score]) -> list[Block]:
     ]
 
 
-def _table(campaign: Campaign, scores: Sequence[Score]) -> Table:
+def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
+    """The first rows of the table of scores, with what its columns mean."""
     rows = [[str(score.setting), *score_row(campaign, score)] for score in scores[:ROWS]]
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
     caption = (

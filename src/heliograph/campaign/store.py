@@ -9,7 +9,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -200,6 +200,13 @@ def stored_labels(path: Path) -> Labels:
     """The labels that the store was made for."""
     found: Any = zarr.open_group(path, mode="r").attrs["labels"]
     return labels_from(found)
+
+
+def stored_campaign(path: Path) -> Campaign:
+    """The campaign that the store was begun with; its file is said to lie beside the store."""
+    attributes: Any = _attributes(path)
+    stored = read_campaign(attributes["campaign"], attributes["network_source"], path.parent / "campaign.toml")
+    return replace(stored, versions=attributes["versions"])
 
 
 def check_same(path: Path, campaign: Campaign) -> None:

@@ -18,6 +18,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "h5py": "results",
     "pandas": "results",
     "zarr": "sweep",
+    "bokeh": "explore",
     "dask": "cluster",
     "distributed": "cluster",
     "gym_electric_motor": "motor",

@@ -86,10 +86,11 @@ Block = Text | Points | KeyFigures | Table | Picture | Code
 
 @dataclass(frozen=True)
 class Section:
-    """A titled part of the page."""
+    """A titled part of the page; `kind` is the class by which a page's own style finds it."""
 
     title: str
     blocks: Sequence[Block]
+    kind: str = ""
 
 
 @dataclass(frozen=True)
@@ -104,15 +105,20 @@ class Page:
 
     def html(self) -> str:
         """The whole page as HTML that loads nothing from anywhere."""
-        environment = Environment(
-            loader=PackageLoader("heliograph.report", "."),
-            autoescape=True,
-            undefined=StrictUndefined,
-            trim_blocks=True,
-            lstrip_blocks=True,
-        )
-        environment.filters["rich"] = rich
-        return environment.get_template("page.html.j2").render(page=self)
+        return environment().get_template("page.html.j2").render(page=self)
+
+
+def environment() -> Environment:
+    """Where the templates of this room are found; everything that they are given is escaped."""
+    found = Environment(
+        loader=PackageLoader("heliograph.report", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    found.filters["rich"] = rich
+    return found
 
 
 def rich(text: str) -> Markup:

@@ -1,0 +1,67 @@
+"""A page to explore a table in: axes, panels, colours and values to choose, drawn by Bokeh, which the page holds."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+
+from markupsafe import Markup
+
+from heliograph.report.page import Page, environment
+
+LIBRARY = ("bokeh.min.js", "bokeh-api.min.js")  # 1.4 MB without its widgets; Plotly's one file has 4.8 MB
+STATIC = "static"  # sections of this kind are seen in print, and where no script runs
+
+Value = float | str | bool | None
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column that can be drawn, with that of its standard error; `level` is drawn as a line to compare with."""
+
+    name: str
+    label: str
+    error: str
+    level: float | None = None
+
+
+@dataclass(frozen=True)
+class Explored:
+    """A table by columns, and what is drawn of it.
+
+    dimensions: columns that tell the rows apart, in the order in which they are offered; `x`, `panel` and `colour` are
+    those of the first view. whole: the dimensions of which all values are in the first view; of the others, the first.
+    unordered: a dimension whose neighbours have nothing to do with each other: points along it are not connected.
+    """
+
+    columns: Mapping[str, Sequence[Value]]
+    dimensions: Sequence[str]
+    quantities: Sequence[Quantity]
+    x: str
+    panel: str
+    colour: str
+    whole: Sequence[str]
+    unordered: str
+
+
+def explore_html(page: Page, table: Explored) -> str:
+    """The page with a table to explore before its sections, as HTML that loads nothing from anywhere.
+
+    Raises:
+        ModuleNotFoundError: the extra `explore` is not installed.
+    """
+    data = json.dumps(asdict(table), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    return (
+        environment()
+        .get_template("explore.html.j2")
+        .render(
+            page=page,
+            data=Markup(data.replace("<", "\\u003c")),  # no text can end the script
+            library=Markup("\n".join(_library(name) for name in LIBRARY)),
+            program=Markup(files("heliograph.report").joinpath("explore.js").read_text(encoding="utf-8")),
+        )
+    )
+
+
+def _library(name: str) -> str:
+    return files("bokeh").joinpath("server", "static", "js", name).read_text(encoding="utf-8")

@@ -1,0 +1,104 @@
+import json
+import re
+import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from heliograph import cli
+from heliograph.campaign import explore
+from heliograph.campaign.store import stored_campaign
+from heliograph.campaign.summary import SUMMARY, Score, read_summary
+
+pytest.importorskip("bokeh", reason="the extra `explore`")
+HOSTILE = "</script><img src=x onerror=alert(1)> $$x$$"
+
+
+@pytest.fixture(scope="module")
+def campaign(finished):
+    return stored_campaign(finished / "results.zarr")
+
+
+@pytest.fixture(scope="module")
+def scores(finished):
+    return read_summary(finished / SUMMARY)
+
+
+@pytest.fixture(scope="module")
+def hostile(campaign, scores):
+    """The page of two nodes, one of which has markup for a name, and of a number that is none."""
+    there = [score for one in scores for score in (one, replace(one, node=HOSTILE, nees_per_dimension=float("nan")))]
+    return explore.explore_page(campaign, there)
+
+
+def data(html):
+    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)
+    return json.loads(found)
+
+
+def test_the_page_holds_the_scores(finished, scores, tmp_path, capsys):
+    assert cli.main(["explore", str(finished), "--out", str(tmp_path / "new")]) == 0
+    path = tmp_path / "new" / "explore.html"
+    assert str(path) in capsys.readouterr().out
+    table = data(path.read_text())
+    columns = table["columns"]
+    assert columns["gain"] == [0.5, 0.5, 0.7, 0.7, 0.9, 0.9] and columns["noise"] == [0.1, 0.2] * 3
+    assert columns["rmse"] == pytest.approx([score.rmse for score in scores], rel=1e-5)  # six digits are kept
+    assert columns["claim"] == ["nominal"] * 6 and columns["finite_runs"] == [100] * 6
+    assert (table["x"], table["panel"], table["colour"]) == ("gain", "noise", "filter")
+    assert path.stat().st_size < 3e6  # Bokeh's 1.4 MB and the fixed pictures; Plotly alone would be 4.8 MB
+
+
+def test_nothing_is_fetched_and_every_text_is_escaped(hostile):
+    assert HOSTILE not in hostile and "<img src=x" not in hostile
+    table = data(hostile)
+    assert set(table["columns"]["node"]) == {"near", HOSTILE} and table["panel"] == "node"
+    assert table["columns"]["nees_per_dimension"][1] is None  # JSON has no NaN
+    tags = re.findall(r"<(?!/)[a-z][^>]*>", re.sub(r"<script.*?</script>", "", hostile, flags=re.DOTALL))
+    addresses = re.findall(r'\b(?:src|href)="([^"]*)', "".join(tags))
+    assert addresses and all(address.startswith("data:image/svg+xml;base64,") for address in addresses)
+    own = re.sub(r"<script>.*?</script>", "", hostile, count=1, flags=re.DOTALL)  # without Bokeh, which names addresses
+    assert "http" not in own and not re.search(r"<script[^>]+src|@import|url\(", own)
+
+
+def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
+    assert hostile.count('<section class="static">') == 2
+    assert "@media print { #explore { display: none; } }" in hostile and '<section id="explore" hidden>' in hostile
+
+
+def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
+    monkeypatch.setattr(explore, "ROWS", 4)
+    html = explore.explore_page(campaign, scores)
+    assert len(data(html)["columns"]["rmse"]) == 4
+    assert "the first 4 of 6 settings are on this page, 4 of 6 rows" in html
+
+
+def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
+    named = replace(campaign, settings=[{"kind": ["a", 1]}, {"kind": ["b"]}])
+    alike = replace(campaign, settings=[{"kind": "a"}])
+    one = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
+    table = data(explore.explore_page(named, [*one, replace(one[0], setting=1)]))
+    assert table["x"] == "kind" and table["columns"]["kind"] == ['["a", 1]', '["b"]']
+    assert data(explore.explore_page(alike, one))["x"] == "setting"
+
+
+@pytest.mark.parametrize("place", ["nowhere", "empty"])
+def test_a_folder_without_results_is_one_line(place, tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    assert cli.main(["explore", str(tmp_path / place), "--out", str(tmp_path / "out")]) == cli.BAD_INPUT
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1 and "expected results.zarr and summary.csv" in told and "got no results.zarr" in told
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser here")
+def test_a_browser_draws_what_is_chosen(hostile, tmp_path):
+    page = tmp_path / "explore.html"
+    page.write_text(hostile)
+    # A process of its own: this one has threads, and the browser is given its pipes by a fork.
+    script = [sys.executable, str(Path(__file__).with_name("browse.py")), str(page), HOSTILE]
+    told = subprocess.run(script, capture_output=True, text=True, timeout=120)
+    assert told.returncode == 0, told.stderr
