@@ -108,7 +108,8 @@ def test_every_transmitter_sends_its_power() -> None:
     sent = hg.power(network, 12).over_time
     np.testing.assert_allclose(sent["node.hop1"], 1.0, rtol=1e-9)
     np.testing.assert_allclose(sent["node.hop2"], 3.0, rtol=1e-9)
+    same = hg.Node(SENSOR, HOP, {"fed": fed_back_filter(PLANT, SENSOR, HOP)})
     with pytest.raises(ValueError, match="hears back: expected a horizon"):
-        hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": fed}))
+        hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": same}))
     with pytest.raises(ValueError, match="got a sensor that hears back"):
         hg.design(network, error=hg.planning.Error(horizon=12), budget=3.0)
