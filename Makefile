@@ -50,7 +50,7 @@ $(CREATED):
 
 .venv/.demo: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph into .venv (the first time: a minute or two, 1.4 GB) ..."
-	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi]'
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi,live]'
 	@touch $@
 
 .venv/.test: $(CREATED) pyproject.toml constraints.txt
