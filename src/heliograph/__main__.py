@@ -17,6 +17,7 @@ def command() -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: an interpreter that leaves would die of it otherwise
     sys.exit(code)
 
 
