@@ -37,7 +37,7 @@ ROUNDS = 15
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
 ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
-    "links_with_memory", "fleet",
+    "links_with_memory", "fleet", "network_design",
 )  # fmt: skip
 BESIDE = ("learning",)  # like those alone, but they ask peers of their own
 
