@@ -41,5 +41,8 @@ def relaxed(
     np.add.at(each, own, limits.each)
     cap = np.minimum(np.minimum(peak, each * len(held)), limits.total * len(held))
     bound = envelope(whole_paths(paths, free, held), cap)
-    tell = lambda powers: Heard(*bound.told(powers))  # noqa: E731
+
+    def tell(powers: Powers) -> Heard:
+        return Heard(*bound.told(powers))
+
     return objective._replace(path=np.arange(count), tell=tell), limits._replace(peak=peak, each=each)
