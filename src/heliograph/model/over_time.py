@@ -52,17 +52,21 @@ def stack(items: Sequence[T]) -> T:
     Raises:
         ValueError: the objects differ in structure, in array shapes, or in anything that is not an array.
     """
-    if len({structure(item) for item in items}) != 1:
+    flat = [jax.tree.flatten(item) for item in items]
+    if len({_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
-    leaves = zip(*(jax.tree.leaves(item) for item in items), strict=True)
-    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in leaves]
-    result: T = jax.tree.unflatten(jax.tree.structure(items[0]), stacked)
+    each = zip(*(leaves for leaves, _ in flat), strict=True)
+    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in each]
+    result: T = jax.tree.unflatten(flat[0][1], stacked)
     return result
 
 
 def structure(item: Any) -> Hashable:
     """What two model objects share that differ in nothing but the values of their arrays."""
-    leaves, tree = jax.tree.flatten(item)
+    return _structure(*jax.tree.flatten(item))
+
+
+def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 

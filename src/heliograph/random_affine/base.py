@@ -1,6 +1,6 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -203,12 +203,21 @@ def memories(channel: PyTree) -> dict[str, AbstractMemory]:
     Raises:
         ValueError: one name for memories that differ.
     """
+    parts = jax.tree.leaves(channel, is_leaf=_is_modal)
+    return distinct(part.memory for part in parts if _is_modal(part))
+
+
+def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
+    """Memories by what tells them apart, in order of appearance.
+
+    Raises:
+        ValueError: one name for memories that differ.
+    """
     found: dict[str, AbstractMemory] = {}
-    for part in jax.tree.leaves(channel, is_leaf=_is_modal):
-        if _is_modal(part):
-            known = found.setdefault(part.memory.identity, part.memory)
-            if not (known is part.memory or is_traced(known, part.memory) or eqx.tree_equal(known, part.memory)):
-                raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
+    for memory in held:
+        known = found.setdefault(memory.identity, memory)
+        if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
+            raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
     return found
 
 
@@ -226,7 +235,8 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
 
 def anonymous(channel: T) -> T:
     """The map with its memories called 0, 1, ... in order of appearance: maps that share no others then look alike."""
-    return _relabelled(channel, {identity: str(i) for i, identity in enumerate(memories(channel))})
+    held = memories(channel)
+    return _relabelled(channel, {identity: str(i) for i, identity in enumerate(held)}) if held else channel
 
 
 def one_memory(items: Sequence[T]) -> list[T]:

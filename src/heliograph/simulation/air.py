@@ -244,7 +244,7 @@ def air_of(network: Network) -> AbstractAir:
     own = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     memories = memory_places({name: node.channel for name, node in own.items()})
     for names in network.groups:
-        parts = stack([(own[name].sensor, anonymous(own[name].channel)) for name in names])
+        parts = stack([(own[name].sensor, _unnamed(own[name].channel, memories[name])) for name in names])
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])
         told_by = own[names[0]].told_by
@@ -252,3 +252,7 @@ def air_of(network: Network) -> AbstractAir:
         place = None if told_by is None else places[names[0], told_by][:2]
         antennas.append(Antenna(*parts, checksums, held, teller, place))
     return OwnChannels(tuple(antennas))
+
+
+def _unnamed(channel: Channel, places: np.ndarray) -> Channel:
+    return anonymous(channel) if len(places) else channel

@@ -264,7 +264,8 @@ class Network(eqx.Module):
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
-        check_horizon(horizon, steps_covered(self))
+        one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
+        check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
 
 
 def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:

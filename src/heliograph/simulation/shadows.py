@@ -10,7 +10,7 @@ from jaxtyping import PyTree
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at
-from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, memories
+from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories
 from heliograph.random_affine.delay import sent
 from heliograph.simulation.draws import (
     CHANNEL,
@@ -31,15 +31,13 @@ def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
     Raises:
         ValueError: one name for memories that differ.
     """
-    memories(tuple(channels.values()))
+    held = {name: memories(channel) for name, channel in channels.items()}
+    distinct(memory for each in held.values() for memory in each.values())
     found: dict[str, int] = {}
-    for name, channel in channels.items():
-        for i, (identity, memory) in enumerate(memories(channel).items()):
+    for name, each in held.items():
+        for i, (identity, memory) in enumerate(each.items()):
             found.setdefault(identity, checksum(f"memory {i} of {name}" if memory.name is None else identity))
-    return {
-        name: np.array([found[identity] for identity in memories(channel)], dtype=np.uint32)
-        for name, channel in channels.items()
-    }
+    return {name: np.array([found[identity] for identity in each], dtype=np.uint32) for name, each in held.items()}
 
 
 class Late(NamedTuple):
