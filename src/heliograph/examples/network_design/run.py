@@ -7,9 +7,7 @@ from heliograph.examples.demo.recording import find_recording
 from heliograph.examples.demo.run import numbers
 from heliograph.examples.network_design.compute import SEEDS, STAGES, Case, Outcome, compute, path_powers
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "network-design"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -21,16 +19,14 @@ def example(out: Path, seed: int = 0) -> None:
     """
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     find_recording()  # a missing extra is told before the work starts
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, seed), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "network-design", STAGES, partial(compute, seed), results)
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.network_design.page import design_figures, design_page
 
-    return Results(design_figures(outcome), partial(design_page, outcome), summary(outcome), lambda folder: None)
+    return Results(design_figures(outcome), partial(design_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:
