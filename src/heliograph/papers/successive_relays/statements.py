@@ -144,7 +144,8 @@ def _bounds(result: Reproduction) -> list[Statement]:
     least = {name: min(_below_state(result.certificates[name], f) for f in FILTERS) for name in ("paper", "tuned")}
     assert upper.values is not None and alpha.values is not None and state.values is not None
     remote, relay = (_scalar_limit(result, name) for name in ("receiver", "relay_1"))
-    tops = max(scalar[name].values[0] for name in ("Lemma 8, upper", "Lemma 9, upper"))  # type: ignore[index]
+    highest = [scalar[name].values for name in ("Lemma 8, upper", "Lemma 9, upper")]
+    tops = max(values[0] for values in highest if values is not None)
     printed = _printed_scalar()
     return [
         Statement("Xi_i <= mbar_k I and P_k <= mbar_k I", "Theorems 3 and 4, upper", "bounded",
