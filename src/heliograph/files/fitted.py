@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.network_file import load_network
+from heliograph.learning.description import describe
 from heliograph.learning.fitting import Fit
-from heliograph.learning.parameters import describe
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
 

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from heliograph.learning.description import Description, describe
+from heliograph.learning.free_marks import Build
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.maximise import Maximum
 from heliograph.learning.objective import Form, objectives
-from heliograph.learning.parameters import Build, Description, describe
 from heliograph.learning.recordings import gathered
 from heliograph.learning.solution import Row, Solution
 from heliograph.learning.surface import StoppedError, Surface

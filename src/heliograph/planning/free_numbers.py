@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.learning.parameters import describe
+from heliograph.learning.description import describe
 from heliograph.numerics.check import array, fail, items, table
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import Network

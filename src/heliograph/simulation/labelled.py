@@ -13,7 +13,7 @@ from heliograph.numerics.check import fail, instance, table
 if TYPE_CHECKING:  # an extra
     import xarray as xr
 
-    from heliograph.simulation.record import Uplink
+    from heliograph.simulation.uplinks import Uplink
 
 TIME = "time"
 Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
@@ -97,7 +97,7 @@ def uplink_variables(
 
 def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
     """The uplinks in a dataset, by the fusion's name."""
-    from heliograph.simulation.record import Uplink
+    from heliograph.simulation.uplinks import Uplink
 
     if "place" not in dataset:
         return {}

@@ -12,7 +12,7 @@ if TYPE_CHECKING:  # an extra
     from matplotlib.axes import Axes
 
     from heliograph.simulation.record import Record
-    from heliograph.simulation.sums import StatisticsByName
+    from heliograph.simulation.statistics_by_name import StatisticsByName
 
 
 def plot_record(

@@ -19,7 +19,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, apply
 from heliograph.random_affine.second_moments import second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.simulate import run
+from heliograph.simulation.recorded import run
 
 if TYPE_CHECKING:
     from heliograph.examples.demo.learned import Learned
