@@ -1,6 +1,6 @@
 """Time of H-infinity design on the published example: a re-solved recursive inequality, and the whole horizon.
 
-Run: python benchmarks/h_infinity.py. Prints milliseconds; the targets are 8 (median) and 300.
+Run: python benchmarks/h_infinity.py. Prints milliseconds; the limits are 8 (median) and 300.
 """
 
 import time

@@ -1,7 +1,7 @@
 """Time of network design: an error with its gradient, a convex design by both ways, and one of many starts.
 
 Three states; twenty sensors over one hop (fixed point, semidefinite programme) or two (descents from thirty starts).
-Run: python benchmarks/network_design.py. Prints milliseconds; the targets are 1 (error and gradient), 2000 (programme)
+Run: python benchmarks/network_design.py. Prints milliseconds; the limits are 1 (error and gradient), 2000 (programme)
 and 10 000 (starts).
 """
 

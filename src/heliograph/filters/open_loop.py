@@ -2,10 +2,9 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, predicted
+from heliograph.filters.gaussian import Belief, predicted, prior_of
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import moments_retained
@@ -14,9 +13,8 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
 from heliograph.numerics.angle import wrapped
-from heliograph.numerics.check import array, covariance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.types import Array, ArrayLike
 
 
 class OpenLoop(AbstractFilter):
@@ -24,8 +22,8 @@ class OpenLoop(AbstractFilter):
 
     plant: AnyPlant
     transform: AbstractTransform
-    initial_mean: np.ndarray
-    initial_covariance: np.ndarray
+    initial_mean: Array
+    initial_covariance: Array
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -73,13 +71,8 @@ def open_loop_filter(
     Source: the prediction step of any of the filters, alone.
     """
     start = check_plant(plant)
-    n = len(start.states)
-    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    spread = start.initial_covariance
-    if initial_covariance is not None:
-        spread = covariance("filter's initial covariance", initial_covariance, n)
-    own = initial_mean is None and initial_covariance is None
-    claim: Claim = "exact" if isinstance(start, LinearPlant) and own and not start.circular else "nominal"
+    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    claim: Claim = "exact" if isinstance(start, LinearPlant) and not own_prior and not start.circular else "nominal"
     return OpenLoop(
         plant=plant,
         transform=Cubature(),

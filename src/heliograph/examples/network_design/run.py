@@ -31,7 +31,6 @@ def results(outcome: Outcome) -> Results:
 
 def summary(outcome: Outcome) -> dict[str, Json]:
     """Errors, powers and bounds by case."""
-    schedule, bursts = outcome.schedule, outcome.bursts
     return {
         "one_hop": {
             f"{total:g}": {**_case(one), "gap": one.best.certificate.gap} for total, one in outcome.one_hop.items()
@@ -53,21 +52,7 @@ def summary(outcome: Outcome) -> dict[str, Json]:
             "power_saved_percent": outcome.circuit.power_saved_percent,
         },
         "packets": {f"{times:g}": dict(saved) for times, saved in outcome.packets.items()},
-        "schedules": {
-            "by_period": {str(period): error for period, error in schedule.by_period.items()},
-            "steps": [list(step) for step in schedule.steps],
-            "error": schedule.error,
-            "bound": schedule.bound,
-            "greedy": schedule.greedy,
-            "bursts": {
-                "errors": {str(every): error for every, error in bursts.errors.items()},
-                "every": bursts.every, "error": bursts.error, "bound": bursts.bound,
-            },
-            "sensors": {
-                str(count): {"chosen": list(one.chosen), "error": one.error, "bound": one.bound}
-                for count, one in outcome.sensors.items()
-            },
-        },
+        "schedules": _schedules(outcome),
         "sites": {
             f"{rho:g}": {
                 "one_relay": {
@@ -76,6 +61,25 @@ def summary(outcome: Outcome) -> dict[str, Json]:
                 "with_fading": {"relays": len(best.lengths) - 1, "noise": best.noise, "direct": best.direct},
             }
             for rho, (one, best) in outcome.lines.items()
+        },
+    }  # fmt: skip
+
+
+def _schedules(outcome: Outcome) -> dict[str, Json]:
+    schedule, bursts = outcome.schedule, outcome.bursts
+    return {
+        "by_period": {str(period): error for period, error in schedule.by_period.items()},
+        "steps": [list(step) for step in schedule.steps],
+        "error": schedule.error,
+        "bound": schedule.bound,
+        "greedy": schedule.greedy,
+        "bursts": {
+            "errors": {str(every): error for every, error in bursts.errors.items()},
+            "every": bursts.every, "error": bursts.error, "bound": bursts.bound,
+        },
+        "sensors": {
+            str(count): {"chosen": list(one.chosen), "error": one.error, "bound": one.bound}
+            for count, one in outcome.sensors.items()
         },
     }  # fmt: skip
 
