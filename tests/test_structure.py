@@ -15,7 +15,7 @@ SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
     ["numerics"],
-    ["files.durable", "files.holding", "files.quoting", "files.whole_file", "files.table", "files.output_folder"],
+    ["disk"],
     ["random_affine"],
     ["model"],
     [

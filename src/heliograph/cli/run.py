@@ -40,8 +40,8 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.disk.quoting import visible
     from heliograph.files.events import holds_events
-    from heliograph.files.quoting import visible
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
     from heliograph.smoothing.modes import named_smoothing
@@ -116,7 +116,7 @@ def _written(record: "Record", out: Path | None, report: Path | None) -> list[st
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
     """What is written can be written, before the work starts."""
-    from heliograph.files.table import check_output
+    from heliograph.disk.output_file import check_output
     from heliograph.numerics.check import fail
 
     if out is not None:
@@ -124,7 +124,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.files.output_folder import check_replaceable
+        from heliograph.disk.output_folder import check_replaceable
         from heliograph.report.results import NEEDS, SUMMARY
 
         for name in NEEDS:

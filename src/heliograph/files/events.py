@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from heliograph.disk.output_file import FORMATS
 from heliograph.files.recording import TIME_STEP, received_names, write_estimates
-from heliograph.files.table import FORMATS
 from heliograph.live.event import INPUTS, Event
 from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import heliograph
-from heliograph.files.quoting import visible
+from heliograph.disk.quoting import visible
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail, instance, table
 

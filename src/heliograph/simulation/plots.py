@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heliograph.files.quoting import in_figure
+from heliograph.disk.quoting import in_figure
 from heliograph.numerics.check import check_count, fail
 
 if TYPE_CHECKING:  # an extra

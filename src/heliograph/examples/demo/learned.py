@@ -8,8 +8,8 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import Score, score
 from heliograph.examples.demo.recording import PlazaRecording
+from heliograph.examples.demo.scores import Score, score
 from heliograph.learning import Fit, Row
 from heliograph.learning.free_marks import Kind
 from heliograph.report.results import Json

@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import Score, relay, score
+from heliograph.examples.demo.compute import relay
 from heliograph.examples.demo.recording import PlazaRecording
+from heliograph.examples.demo.scores import Score, score
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.model.centred import centred
 from heliograph.model.channel import amplify_and_forward, hop, parallel

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
-from heliograph.files.whole_file import whole_file
+from heliograph.disk.whole_file import whole_file
 
 T = TypeVar("T")
 
