@@ -227,7 +227,7 @@ def check_same(path: Path, campaign: Campaign) -> None:
         )
 
 
-def _attributes(path: Path) -> Mapping[str, Any]:
+def _attributes(path: Path) -> Mapping[str, object]:
     try:
         found = zarr.open_group(path, mode="r").attrs.asdict()
         if not {"versions", "campaign", "network_source", "labels"} <= found.keys():

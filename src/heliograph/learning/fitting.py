@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -115,7 +114,7 @@ class Fit:
 
 def fit(
     network: Build,
-    recording: Any,
+    recording: object,
     inputs: ArrayLike | Sequence[ArrayLike] | None = None,
     starts: int = 6,
     seed: int = 0,

@@ -124,7 +124,7 @@ class Asking:
 class Given:
     """Puts values in their places: by name, and in the order of asking where no name was given."""
 
-    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, Any]):
+    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
         self.values = values
         self.unnamed = iter([one.name for one, own in zip(parameters.every, named, strict=True) if not own])
 

@@ -86,7 +86,7 @@ class Timeline:
         kept = {name: value for name, value in vars(self).items() if name != "_player"}
         return kept | {"_tape": to_numpy(self._tape)}
 
-    def __setstate__(self, kept: dict[str, Any]) -> None:
+    def __setstate__(self, kept: dict[str, object]) -> None:
         vars(self).update(kept)
         self._player = player(self.network)
         with jax.enable_x64(True):

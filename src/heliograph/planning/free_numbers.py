@@ -119,7 +119,7 @@ def marked(build: Build) -> tuple[Build, Numbers]:
         ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
         found[one.name] = Number(np.asarray(one.start), *ends)
 
-    def built(**values: Any) -> Network:
+    def built(**values: object) -> Network:
         return description.at(values)
 
     return built, Numbers(found)

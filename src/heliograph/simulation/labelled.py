@@ -115,7 +115,7 @@ def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
 
 def dataset_of(
     title: str,
-    variables: Mapping[str, tuple[list[str], Any]],
+    variables: Mapping[str, tuple[list[str], object]],
     labels: Mapping[str, Sequence[str]],
     time: np.ndarray,
     units: Mapping[str, str],
@@ -126,7 +126,7 @@ def dataset_of(
 
     data = {name: (axes, values, {"long_name": MEANING[name]} if name in MEANING else {})
             for name, (axes, values) in variables.items()}  # fmt: skip
-    coordinates: dict[str, Any] = {axis: ([axis], text(names)) for axis, names in labels.items()}
+    coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
     coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
     states = labels["state"]
     if any(state in units for state in states):

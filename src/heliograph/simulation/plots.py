@@ -95,7 +95,7 @@ def _places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
     return [list(known).index(name) for name in chosen]
 
 
-def _axes(axes: Any, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
+def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
     """The given axes, or those of a new figure, one below the other."""
     if axes is None:
         import matplotlib.pyplot as plt

@@ -1,7 +1,6 @@
 """Every filter of a network over recorded measurements."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +70,7 @@ def run(
 def _run_filters(
     filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
 ) -> PyTree:
-    def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
+    def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row
         return filters.step(states, z_k, u_k, k, drawn)
 

@@ -116,7 +116,7 @@ def _kind(path: Path) -> str:
     return kinds[path.suffix.lower()]
 
 
-def _texts(dataset: "xr.Dataset") -> list[tuple[Any, "xr.DataArray"]]:
+def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
     """The coordinates that are names."""
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, get_args, overload
+from typing import Literal, get_args, overload
 
 import equinox as eqx
 import jax
@@ -112,7 +112,7 @@ def monte_carlo(
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
-    both: Beside[Any] = Beside(reducer)
+    both: Beside[PyTree] = Beside(reducer)
     keeper = reducer if part is None else both
     job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
     kept = _kept(job, first_run, runs, chunk, progress)
@@ -129,10 +129,10 @@ class _Job(eqx.Module):
 
     world: World
     later: Smoother | None
-    inputs: Any
+    inputs: np.ndarray
     key: jax.Array
     stop: np.ndarray
-    reducer: AbstractReducer[Any]
+    reducer: AbstractReducer[PyTree]
     single: bool = eqx.field(static=True)
 
 
@@ -162,11 +162,11 @@ def _initial(job: _Job) -> PyTree:
 
 
 @partial(large_program, donate="all-except-first")
-def _lane(todo: tuple[_Job, Any], carry: PyTree) -> tuple[PyTree, PyTree]:
+def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
     return _blocks(*todo, carry)
 
 
-def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
+def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
     """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
 
     def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
@@ -176,7 +176,7 @@ def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
 
 
 @large_program
-def _all_lanes(job: _Job, blocks: Any, carries: PyTree) -> tuple[PyTree, PyTree]:
+def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
     return result
@@ -192,11 +192,11 @@ def _block(job: _Job, runs: jax.Array) -> PyTree:
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
 
 
-def _single(leaf: Any) -> Any:
+def _single(leaf: PyTree) -> PyTree:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _simulated(world: World, later: Smoother | None, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
+def _simulated(world: World, later: Smoother | None, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     found = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
     return found if later is None else later.both(found)

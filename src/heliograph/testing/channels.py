@@ -1,7 +1,6 @@
 """What a channel's moments must say: those of its samples."""
 
 from itertools import product
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -76,7 +75,7 @@ def _compare_modes(
 def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
     """First and second draws of H, after the contract of `init`, `draw` and `sample` was checked."""
 
-    def two_steps(key: jax.Array) -> Any:
+    def two_steps(key: jax.Array) -> object:
         start = channel.init(jax.random.fold_in(key, 2))
         state, h = channel.draw(start, key)
         return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1))

@@ -1,7 +1,6 @@
 """What a filter must keep: its sizes, its claim, and that a step is its prediction and its correction."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -63,7 +62,7 @@ def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
     assert item.states and len(set(item.states)) == len(item.states), "states: expected distinct names"
     assert item.received >= 0, "received: expected a length"
     state, fitting = item.init(), np.zeros(item.received)
-    wrong: list[tuple[str, Callable[[], Any]]] = [
+    wrong: list[tuple[str, Callable[[], object]]] = [
         ("inputs", lambda: item.predict(state, np.zeros(len(item.inputs) + 1)))
     ]
     if item.received:
