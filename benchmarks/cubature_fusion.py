@@ -1,6 +1,6 @@
 """Time of the whole published cubature-fusion experiment: four nodes, 40 steps, every filter, fusion included, 50 runs.
 
-Run: python benchmarks/cubature_fusion.py. The first call compiles; the target is 0.25 seconds for a warm one.
+Run: python benchmarks/cubature_fusion.py. The first call compiles; the limit is 0.25 seconds for a warm one.
 """
 
 import time

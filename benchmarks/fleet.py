@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from alone import show
 from timeline import readme_network
 
 from heliograph.serving.fleet import Fleet, Options
@@ -104,10 +105,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "us", "values": values, "at_most": {"processors": 2 * LIMIT, "two processes": LIMIT}}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.3g}")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

@@ -1,13 +1,13 @@
 """Time of H-infinity design on the published example: a re-solved recursive inequality, and the whole horizon.
 
-Run: python benchmarks/h_infinity.py. Prints milliseconds; the targets are 8 (median) and 300.
+Run: python benchmarks/h_infinity.py. Prints milliseconds; the limits are 8 (median) and 300.
 """
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from alone import milliseconds, show
 
 import heliograph as hg
 
@@ -26,13 +26,6 @@ def system() -> hg.h_infinity.GrowthSystem:
     return hg.h_infinity.growth_system(
         16, [[-0.15], [0.15]], [[0.3]], [[0.05, 0.05]], channel, 0.7, b, initial_weight=15.0
     )
-
-
-def milliseconds(call: Callable[[], object]) -> float:
-    """One call."""
-    start = time.perf_counter()
-    call()
-    return 1e3 * (time.perf_counter() - start)
 
 
 def recursion() -> tuple[float, float]:
@@ -74,10 +67,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "ms", "values": values, "at_most": limits}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.2f} ms")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

@@ -1,15 +1,14 @@
 """Time of network design: an error with its gradient, a convex design by both ways, and one of many starts.
 
 Three states; twenty sensors over one hop (fixed point, semidefinite programme) or two (descents from thirty starts).
-Run: python benchmarks/network_design.py. Prints milliseconds; the targets are 1 (error and gradient), 2000 (programme)
+Run: python benchmarks/network_design.py. Prints milliseconds; the limits are 1 (error and gradient), 2000 (programme)
 and 10 000 (starts).
 """
 
-import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from alone import milliseconds, show
 
 import heliograph as hg
 from heliograph.planning.one_hop import one_hop
@@ -20,16 +19,6 @@ TRANSITION, PROCESS = np.array([[0.95, 0.1, 0], [0, 0.9, 0.2], [0, -0.1, 0.8]]),
 DRAW = np.random.default_rng(0)
 ROWS, NOISES = DRAW.normal(size=(SENSORS, 3)), DRAW.uniform(0.3, 0.8, SENSORS)
 ALPHA = DRAW.uniform(0.5, 2.0, (SENSORS, 2)) ** 3
-
-
-def milliseconds(work: Callable[[], object], repeats: int = 1) -> float:
-    """Median of wall-clock times."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times)) * 1e3
 
 
 def relayed() -> hg.Network:
@@ -65,10 +54,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "ms", "values": values, "at_most": limits}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.2f} ms")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

@@ -11,6 +11,8 @@ import tempfile
 import time
 from typing import Any
 
+from alone import show
+
 REPEATS = 3
 NETWORK = """
 plant = hg.{plant}
@@ -55,10 +57,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "s", "values": values, "at_most": {"heliograph --help": 0.5, "import heliograph, and use it": 1.5}}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.2f} s")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

@@ -8,6 +8,7 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from alone import show
 
 import heliograph as hg
 
@@ -48,10 +49,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "us", "values": values, "at_most": dict.fromkeys(values, 60)}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.1f} us")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

@@ -9,6 +9,7 @@ import warnings
 from typing import Any
 
 import numpy as np
+from alone import show
 from stream import readme_filter
 
 import heliograph as hg
@@ -56,10 +57,5 @@ def measure() -> dict[str, Any]:
     return {"unit": "us", "values": values, "at_most": {"an event, mean": LIMIT}}
 
 
-def main() -> None:
-    for name, value in measure()["values"].items():
-        print(f"{name}: {value:.4g}")
-
-
 if __name__ == "__main__":
-    main()
+    show(measure())

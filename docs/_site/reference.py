@@ -24,19 +24,12 @@ def rooms() -> Iterator[tuple[str, str, list[str]]]:
     """Each room's full name, what it is, and its public names in the order of its list; the hall comes first."""
     folder = Path(heliograph.__file__).parent
     modules = [name for name in heliograph.__all__ if inspect.ismodule(getattr(heliograph, name))]
-    ordered = sorted(set(modules) - {"testing"}, key=lambda name: listed(folder / "__init__.pyi").index(name))
+    ordered = sorted(modules, key=lambda name: listed(folder / "__init__.pyi").index(name))
     yield "heliograph", summary(heliograph), [n for n in listed(folder / "__init__.pyi") if n not in modules]
     for name in ordered:
         names = listed(folder / name / "__init__.pyi")
         if names:
             yield f"heliograph.{name}", summary(import_module(f"heliograph.{name}")), names
-    testing = import_module("heliograph.testing")
-    checks = [name for name, item in vars(testing).items() if name.startswith("check_") and _home(item) == testing]
-    yield "heliograph.testing", summary(testing), checks
-
-
-def _home(item: object) -> object:
-    return inspect.getmodule(inspect.unwrap(item)) if callable(item) else None
 
 
 def listed(stub: Path) -> list[str]:

@@ -77,6 +77,8 @@ from .simulation.network import (
 )
 from .simulation.simulate import (
     monte_carlo as monte_carlo,
+)
+from .simulation.recorded import (
     run as run,
 )
 from .simulation.transmission import (
@@ -91,7 +93,7 @@ from .simulation.record import (
 from .simulation.sums import (
     Statistics as Statistics,
 )
-from .learning.parameters import (
+from .learning.free_marks import (
     free as free,
 )
 from .learning.fitting import (

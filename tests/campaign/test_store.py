@@ -15,13 +15,13 @@ from heliograph.campaign.engines import in_processes
 from heliograph.campaign.plan import versions
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.work import Job
-from heliograph.files.holding import LOCK, held, only_here
+from heliograph.disk.holding import LOCK, held, only_here
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, contents, write
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from heliograph.files.holding import only_here
+from heliograph.disk.holding import only_here
 with only_here(Path(sys.argv[1])) as alone:
     print(alone, flush=True)
     time.sleep(60)

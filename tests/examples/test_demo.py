@@ -9,9 +9,10 @@ import pytest
 import heliograph as hg
 from heliograph.examples.demo import compute as compute_module
 from heliograph.examples.demo import robot, run
-from heliograph.examples.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay, score
+from heliograph.examples.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay
 from heliograph.examples.demo.learned import FIRST_GUESS, HELD, Learned, direct, heard_by_one, learn, relayed, said
 from heliograph.examples.demo.recording import PlazaRecording, read_recording
+from heliograph.examples.demo.scores import score
 from heliograph.examples.demo.twin import Design, channel_less
 from heliograph.files.recording import read_recording as read_measurements
 from heliograph.learning import describe

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.examples.demo.compute import Score
+from heliograph.examples.demo.scores import Score
 from heliograph.examples.demo.twin import Design
 from heliograph.examples.network_design import compute, published, run
 from heliograph.examples.network_design.published import Circuit, packets

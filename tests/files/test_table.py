@@ -7,8 +7,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from heliograph.files.durable import naming
-from heliograph.files.table import check_output, check_output_folder, read_table, write_table
+from heliograph.disk.durable import naming
+from heliograph.disk.output_file import check_output, check_output_folder
+from heliograph.files.table import read_table, write_table
 
 COLUMNS = {
     "time": np.array([0.0, 0.1, 1e-300]),

@@ -13,7 +13,7 @@ from heliograph.fusion.intersection import relative_gap, trace_optimal_weights
 from tests.bounds import covariances, estimates
 from tests.oracles import cubature_fusion as oracle
 
-CERTIFIED = 1e-9  # what the issue of optimal weights asks for; the method stops at 1e-10
+CERTIFIED = 1e-9  # the method stops at 1e-10
 
 
 @jax.jit

@@ -43,7 +43,7 @@ UNITS = {
 
 @pytest.mark.parametrize("initial", [5.0, 1e-6, 1e6])
 def test_smallest_levels_are_the_riccati_forms_in_any_units(initial):
-    """To 1e-3 is asked; the margin of every inequality, 1e-7 of the level squared, and the solver's 1e-8 leave 1e-5."""
+    """The margin of every inequality, 1e-7 of the level squared, and the solver's 1e-8 leave 1e-5."""
     expected = riccati_level(system(initial))
     for units in UNITS.values():
         scaled = system(initial, *units)

@@ -12,8 +12,8 @@ from hypothesis.extra.numpy import arrays
 
 import heliograph as hg
 from heliograph.filters.plan import Plan
+from heliograph.learning.description import describe
 from heliograph.learning.objective import Data, _settling, at_points, objectives
-from heliograph.learning.parameters import describe
 from heliograph.learning.settling import in_chunks
 
 STEPS, RECORDINGS = 157, 2

@@ -1,4 +1,4 @@
-"""Relays that filter: the gains that are tuned today are a design with a budget."""
+"""Relays that filter: their gains are a design with a budget."""
 
 import numpy as np
 import pytest

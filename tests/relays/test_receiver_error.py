@@ -20,7 +20,7 @@ def ratio(design, own):
 
 def test_tuned_together_the_receiver_errs_less(own):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
-    assert np.mean(ratio(tuned, own)) <= 0.775  # of the issue; found: 0.7680
+    assert np.mean(ratio(tuned, own)) <= 0.775  # found: 0.7680
     found = recompute(example(), tuned.gains).covariance["receiver"]
     assert relative(found, tuned.covariance["receiver"]) < 1e-10  # a route that made no gains
     assert 1.0 < np.max(tuned.total_power() / own.total_power()) < 1.5

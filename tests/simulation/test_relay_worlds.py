@@ -13,7 +13,8 @@ from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.simulate import monte_carlo, run
+from heliograph.simulation.recorded import run
+from heliograph.simulation.simulate import monte_carlo
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.sums import Statistics, error_statistics
 from tests.relays.relay_problems import example, unusual

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.files.quoting import from_file, in_file
+from heliograph.disk.quoting import from_file, in_file
 from heliograph.simulation import ErrorStatistics, StatisticsByName, Uplink
 
 matplotlib.use("Agg")

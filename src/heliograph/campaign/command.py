@@ -12,7 +12,7 @@ from heliograph.campaign.read import load_campaign
 from heliograph.campaign.run import CampaignRun, run_campaign
 from heliograph.campaign.show import print_scores, showing
 from heliograph.campaign.summary import SUMMARY, read_summary
-from heliograph.files.quoting import visible
+from heliograph.disk.quoting import visible
 from heliograph.numerics.check import fail
 
 FAILED = 1  # exit code: some work failed, the rest is there

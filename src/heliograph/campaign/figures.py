@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from heliograph.campaign.plan import Campaign, Setting, canonical
 from heliograph.campaign.store import parameter_values
 from heliograph.campaign.summary import Score
-from heliograph.files.quoting import in_figure
+from heliograph.disk.quoting import in_figure
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, STYLE, VERMILION, WIDTH
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED)

@@ -14,7 +14,7 @@ from rich.text import Text
 from heliograph.campaign.plan import Campaign
 from heliograph.campaign.run import Tell
 from heliograph.campaign.summary import Score
-from heliograph.files.quoting import visible
+from heliograph.disk.quoting import visible
 from heliograph.report.progress import Countdown, counting
 
 ROWS = 30  # of the printed table; the file has all

@@ -21,8 +21,8 @@ from zarr.codecs import Crc32cCodec, ZstdCodec
 from heliograph.campaign.labels import Claims, Labels, labels_from
 from heliograph.campaign.plan import Campaign, Chunk
 from heliograph.campaign.read import read_campaign
-from heliograph.files.durable import sync
-from heliograph.files.output_folder import whole_folder
+from heliograph.disk.durable import sync
+from heliograph.disk.output_folder import whole_folder
 from heliograph.numerics.check import fail
 
 STORE = "results.zarr"
@@ -227,7 +227,7 @@ def check_same(path: Path, campaign: Campaign) -> None:
         )
 
 
-def _attributes(path: Path) -> Mapping[str, Any]:
+def _attributes(path: Path) -> Mapping[str, object]:
     try:
         found = zarr.open_group(path, mode="r").attrs.asdict()
         if not {"versions", "campaign", "network_source", "labels"} <= found.keys():

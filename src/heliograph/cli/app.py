@@ -35,7 +35,7 @@ def folder(command: str, out: Path | None, name: str) -> Path:
     Raises:
         ValueError: no folder given, which a command that only lists does without; one that cannot be written.
     """
-    from heliograph.files.table import check_output_folder
+    from heliograph.disk.output_file import check_output_folder
     from heliograph.numerics.check import fail
 
     if out is None:

@@ -73,7 +73,7 @@ def _command(arguments: Sequence[str] | None) -> int:
 
 
 def _refuse(message: str) -> int:
-    from heliograph.files.quoting import visible
+    from heliograph.disk.quoting import visible
 
     print("heliograph:", visible(" ".join(message.split())), file=sys.stderr)
     return BAD_INPUT

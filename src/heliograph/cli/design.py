@@ -26,8 +26,8 @@ def design(
     task:
         A TOML file that names the network, the budget or the wanted error, and what is free.
     """
+    from heliograph.disk.quoting import visible
     from heliograph.files.design_file import read_design
-    from heliograph.files.quoting import visible
     from heliograph.report.results import Results, write_results
 
     target = folder("design", out, NAME) / NAME

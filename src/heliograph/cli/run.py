@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from heliograph.files.recording import Recording
     from heliograph.simulation.network import Network
     from heliograph.simulation.record import Record
+    from heliograph.smoothing.modes import AbstractSmoothing
 
 
 def run(
@@ -39,8 +40,8 @@ def run(
         A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
         holds several. The name may be that of a function that returns one.
     """
+    from heliograph.disk.quoting import visible
     from heliograph.files.events import holds_events
-    from heliograph.files.quoting import visible
     from heliograph.numerics.check import fail
     from heliograph.report.progress import progress
     from heliograph.smoothing.modes import named_smoothing
@@ -48,12 +49,7 @@ def run(
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
     later, events = named_smoothing(smooth), holds_events(measurements)
-    if events and (out is None or report is not None or later is not None):
-        raise fail("--smooth and --report", f"rows of time, and --out FILE alone for events such as {measurements}",
-                   "events")  # fmt: skip
-    if not events and (window is not None or lag is not None):
-        raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
-    _check_places(measurements, out, report)
+    _check_asked(measurements, out, report, later is not None, events, window is not None or lag is not None)
     notes: list[str] = []
     doubtful: list[str] = []
     with progress(3) as advance:
@@ -71,10 +67,7 @@ def run(
         else:
             recording = read_recording(measurements, loaded)
             advance(f"filtering {len(recording.time)} rows")
-            with warnings.catch_warnings(record=True) as doubts:
-                warnings.simplefilter("always", UserWarning)
-                record = heliograph.run(loaded, *recording, smooth=later)
-            doubtful += [str(doubt.message) for doubt in doubts]
+            record, doubtful = _filtered(loaded, recording, later)
         if out is not None:
             advance(f"writing {out}")
             write_estimates(record, out)
@@ -82,19 +75,48 @@ def run(
         _write_report(network, loaded, record, recording, report)
     for line in (*record.failures(), *doubtful):
         print(f"heliograph: warning: {visible(line)}", file=sys.stderr)
+    for line in (*_written(record, out, report), *notes):
+        print(visible(line))
+
+
+def _check_asked(
+    measurements: Path, out: Path | None, report: Path | None, smooths: bool, events: bool, waits: bool
+) -> None:
+    """What goes together, and can be written, before the work starts."""
+    from heliograph.numerics.check import fail
+
+    if events and (out is None or report is not None or smooths):
+        raise fail("--smooth and --report", f"rows of time, and --out FILE alone for events such as {measurements}",
+                   "events")  # fmt: skip
+    if not events and waits:
+        raise fail("--window and --lag", "a file of events", f"rows of time in {measurements}")
+    _check_places(measurements, out, report)
+
+
+def _filtered(
+    network: "Network", recording: "Recording", smooth: "AbstractSmoothing | None"
+) -> tuple["Record", list[str]]:
+    """The record, and what is warned of."""
+    with warnings.catch_warnings(record=True) as doubts:
+        warnings.simplefilter("always", UserWarning)
+        record = heliograph.run(network, *recording, smooth=smooth)
+    return record, [str(doubt.message) for doubt in doubts]
+
+
+def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
+    """What was written where, a line each."""
     filters = [
         f"{node}/{name} ({estimate.claim})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
-    written = [path for path in (out, report and report / "report.html") if path is not None]
-    for line in (*(f"{target}: {len(record.time)} rows of {', '.join(filters)}" for target in written), *notes):
-        print(visible(line))
+    places = [path for path in (out, report and report / "report.html") if path is not None]
+    return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places]
 
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:
     """What is written can be written, before the work starts."""
-    from heliograph.files.table import check_output
+    from heliograph.disk.output_file import check_output
     from heliograph.numerics.check import fail
 
     if out is not None:
@@ -102,7 +124,7 @@ def _check_places(measurements: Path, out: Path | None, report: Path | None) -> 
         if out.resolve() == measurements.resolve():
             raise fail(f"output file {out}", "another file than the measurements", "the same")
     if report is not None:
-        from heliograph.files.output_folder import check_replaceable
+        from heliograph.disk.output_folder import check_replaceable
         from heliograph.report.results import NEEDS, SUMMARY
 
         for name in NEEDS:

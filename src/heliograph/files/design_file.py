@@ -92,7 +92,7 @@ def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
     return Budget(**value) if isinstance(value, dict) else Budget(scalar(f"{path.name}, budget", value, 0.0))
 
 
-def _map(path: Path, table: Mapping[str, Any]) -> MapAsked:
+def _map(path: Path, table: Mapping[str, object]) -> MapAsked:
     asked = _table(path, table, "map")
     file, name = _place(path, asked.get("network"), "map.network")
     if not name:
@@ -116,7 +116,7 @@ def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
     return file, name
 
 
-def _table(path: Path, table: Mapping[str, Any], key: str) -> dict[str, Any]:
+def _table(path: Path, table: Mapping[str, object], key: str) -> dict[str, Any]:
     value = table[key]
     if not isinstance(value, dict):
         raise fail(f"{path.name}, {key}", f"a table of {', '.join(TABLES[key])}", repr(value))

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from heliograph.disk.output_file import FORMATS
 from heliograph.files.recording import TIME_STEP, received_names, write_estimates
-from heliograph.files.table import FORMATS
 from heliograph.live.event import INPUTS, Event
 from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
@@ -123,7 +123,7 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
     return dict(zip(header, zip(*rows, strict=True), strict=True))
 
 
-def _times(columns: Mapping[str, Sequence[Any]], path: Path) -> tuple[np.ndarray, np.ndarray, np.datetime64 | None]:
+def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndarray, np.ndarray, np.datetime64 | None]:
     """Times and arrivals as numbers, and the moment that they are counted from if they were dates."""
     parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
     first = columns[TIME][0]

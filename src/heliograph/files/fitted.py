@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from heliograph.files.network_file import load_network
+from heliograph.learning.description import describe
 from heliograph.learning.fitting import Fit
-from heliograph.learning.parameters import describe
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
 
@@ -60,7 +60,7 @@ def as_json(found: Fit, **more: Any) -> dict[str, Any]:
     }
 
 
-def write_fitted(content: Mapping[str, Any], reference: str, measurements: str, folder: Path, place: Path) -> None:
+def write_fitted(content: Mapping[str, object], reference: str, measurements: str, folder: Path, place: Path) -> None:
     """Write `fitted.json` and `fitted_network.py` into a folder that will stand at `place`, where it finds the network.
 
     A file is found by its way from there, so that both may be moved together.
@@ -96,7 +96,7 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
     return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: object) -> object:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 

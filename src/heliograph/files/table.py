@@ -2,21 +2,20 @@
 
 import csv
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from heliograph.files.quoting import from_cell, in_cell
-from heliograph.files.whole_file import whole_file
+from heliograph.disk.output_file import check_output, format_of
+from heliograph.disk.quoting import from_cell, in_cell
+from heliograph.disk.whole_file import whole_file
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
 MISSING = ("na", "n/a", "null", "none", "nil", "-", "?")
-FORMATS = (".csv", ".parquet")
 
 
 def read_table(path: str | Path) -> dict[str, np.ndarray]:
@@ -31,7 +30,7 @@ def read_table(path: str | Path) -> dict[str, np.ndarray]:
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
     path = Path(path)
-    kind = _format(path)
+    kind = format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
     if path.stat().st_size == 0:
@@ -52,39 +51,7 @@ def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
     path = Path(path)
     check_output(path)
     with whole_file(path) as partial:
-        (_write_csv if _format(path) == ".csv" else _write_parquet)(columns, partial)
-
-
-def check_output(path: str | Path, formats: Sequence[str] = FORMATS) -> None:
-    """Raise what writing a file would, before the work starts."""
-    path = Path(path)
-    if _format(path, formats) == ".parquet":
-        import pyarrow.parquet  # noqa: F401
-    if path.is_dir():
-        raise fail(f"output file {path}", "a file", "a folder")
-    if not path.parent.exists():
-        raise fail(f"output folder {path.parent}", "an existing folder", "nothing of that name")
-    check_output_folder(path.parent)
-
-
-def check_output_folder(folder: str | Path) -> None:
-    """Raise ValueError unless files can be written in the folder, or it can be made."""
-    folder = Path(folder)
-    existing = next(place for place in (folder, *folder.absolute().parents) if place.exists())
-    name = f"output folder {folder}"
-    if not existing.is_dir():
-        raise fail(name, "a folder", "a file" if existing == folder else f"a file {existing} on its path")
-    try:
-        tempfile.TemporaryFile(dir=existing).close()
-    except OSError as error:
-        raise fail(name, "a folder that can be written", error.strerror) from None
-
-
-def _format(path: Path, formats: Sequence[str] = FORMATS) -> str:
-    kind = path.suffix.lower()
-    if kind not in formats:
-        raise fail(str(path), f"a name that ends in {' or '.join(formats)}", repr(path.suffix))
-    return kind
+        (_write_csv if format_of(path) == ".csv" else _write_parquet)(columns, partial)
 
 
 def _check_distinct(path: Path, header: Sequence[str]) -> None:

@@ -31,9 +31,11 @@ from .innovation import (
     gaussian_innovation as gaussian_innovation,
 )
 from .linear import (
-    open_loop_filter as open_loop_filter,
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
+)
+from .open_loop import (
+    open_loop_filter as open_loop_filter,
 )
 from .multiple_model import (
     gpb1_filter as gpb1_filter,

@@ -6,7 +6,6 @@ from typing import NamedTuple, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal
@@ -58,8 +57,8 @@ class GaussianFilter(AbstractFilter):
     channel: SecondOrder | OverTime
     transform: AbstractTransform
     update: AbstractUpdate
-    initial_mean: np.ndarray
-    initial_covariance: np.ndarray
+    initial_mean: Array
+    initial_covariance: Array
     linear: bool = eqx.field(static=True)
     heard_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -157,6 +156,18 @@ def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime
     return update.describe(channel)
 
 
+def prior_of(
+    plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
+) -> tuple[Array, Array, bool]:
+    """The plant's initial mean and covariance where no others are given, and whether any were."""
+    n = len(plant.states)
+    mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    spread = plant.initial_covariance
+    if initial_covariance is not None:
+        spread = covariance("filter's initial covariance", initial_covariance, n)
+    return mean, spread, initial_mean is not None or initial_covariance is not None
+
+
 def _build(
     plant: AnyPlant,
     sensor: AnySensor,
@@ -169,20 +180,15 @@ def _build(
 ) -> GaussianFilter:
     start = check_plant(plant)
     instance("update", update, AbstractUpdate, "one such as Polytope()")
-    n = len(start.states)
-    check_link(first(sensor), first(channel), n)
+    check_link(first(sensor), first(channel), len(start.states))
     angles = received_angles(plant, sensor, channel)
-    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    spread = start.initial_covariance
-    if initial_covariance is not None:
-        spread = covariance("filter's initial covariance", initial_covariance, n)
+    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
     pairs = zip(_each(channel), _each(described), strict=True)
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
-    own_prior = initial_mean is not None or initial_covariance is not None
     claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
     return GaussianFilter(
         plant=plant,

@@ -1,7 +1,5 @@
 """The best linear filter behind relays that are late by chance: it estimates what each of them holds."""
 
-from typing import Any
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -74,7 +72,7 @@ class HeldFilter(AbstractFilter):
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _heard(state: Any, link: SecondOrder, start: int, length: int, place: int) -> Any:
+def _heard(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
     """The moments after r at `place` is what the link makes of the line from `start` on."""
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
@@ -116,7 +114,7 @@ def with_relays(
     return moved, last, of_line(channel.stages[-1]), tuple(lines)
 
 
-def _holding(plant: Any, relay: int, size: int, steps: int) -> LinearPlant:
+def _holding(plant: PyTree, relay: int, size: int, steps: int) -> LinearPlant:
     """The plant, and a line of a relay that moves on by one."""
     held, n = size * (1 + steps), len(plant.states)
     xp, none = library(plant.matrix, plant.input_matrix), Gaussian(np.zeros((held, held)))
@@ -132,7 +130,7 @@ def _holding(plant: Any, relay: int, size: int, steps: int) -> LinearPlant:
     )
 
 
-def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: Any) -> HeldFilter:
+def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, lines: PyTree) -> HeldFilter:
     """From the filter of all lines.
 
     Raises:

@@ -1,4 +1,4 @@
-"""The best linear filter behind a random channel, and the filter that hears nothing."""
+"""The best linear filter behind a random channel that draws anew at each step, and the way to the others."""
 
 from dataclasses import replace
 from functools import partial
@@ -7,29 +7,26 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal, known_gain_covariance
 from heliograph.filters.delay import as_current, behind_delays
-from heliograph.filters.gaussian import Belief, describe, predicted
-from heliograph.filters.innovation import gaussian_innovation, innovation_covariance, no_innovation
+from heliograph.filters.gaussian import describe
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.modal import modal_filter
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
 from heliograph.filters.told import told_filter
-from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.uncertain import uncertain_modal_filter
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import memory_matters, uncertain_chain, without_memory
 from heliograph.model.over_time import OverTime, at, first
-from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
+from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, check_linear
-from heliograph.numerics.angle import wrapped
-from heliograph.numerics.check import array, covariance, fail
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -248,76 +245,3 @@ def as_current_filter(
     item = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
     assert isinstance(item, LinearFilter)  # what is neither late nor remembers has no other
     return replace(item, claim="nominal") if first(channel).past else item
-
-
-class OpenLoop(AbstractFilter):
-    """The filter that hears nothing: prediction only. What any use of the measurements has to beat."""
-
-    plant: AnyPlant
-    transform: AbstractTransform
-    initial_mean: np.ndarray
-    initial_covariance: np.ndarray
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    @in_float64
-    def init(self) -> Belief:
-        """The prior."""
-        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
-
-    @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
-        """Mean and covariance of f(x, u) + w."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = self.transform.apply(plant.moves(u, state.mean), *state)
-        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
-
-    @corrects
-    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
-        """z, of whatever length, is not used."""
-        return state, no_innovation()
-
-    @in_float64
-    def estimate(self, state: Belief) -> Estimate:
-        """The prediction."""
-        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
-
-    def retain(
-        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
-        """The prediction, of which nothing more is ever heard."""
-        cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
-        return moments_retained(after, prior, cross, self.claim, first(self.plant).angles)
-
-
-def open_loop_filter(
-    plant: AnyPlant, initial_mean: ArrayLike | None = None, initial_covariance: ArrayLike | None = None
-) -> OpenLoop:
-    """Prediction by cubature points without any measurement.
-
-    Claim: "exact" for a linear plant started from its own initial law, else "nominal".
-
-    Raises:
-        ValueError: an initial mean or covariance of the wrong shape.
-    Source: the prediction step of any of the filters, alone.
-    """
-    start = check_plant(plant)
-    n = len(start.states)
-    mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    spread = start.initial_covariance
-    if initial_covariance is not None:
-        spread = covariance("filter's initial covariance", initial_covariance, n)
-    own = initial_mean is None and initial_covariance is None
-    claim: Claim = "exact" if isinstance(start, LinearPlant) and own and not start.circular else "nominal"
-    return OpenLoop(
-        plant=plant,
-        transform=Cubature(),
-        initial_mean=mean,
-        initial_covariance=spread,
-        claim=claim,
-        states=start.states,
-        inputs=start.inputs,
-        received=0,
-    )

@@ -4,106 +4,31 @@ Each knows the chain, hears through each mode's map with a Gaussian update, and 
 They differ in when Gaussians are merged; all keep only two moments of a mixture, so that they claim nothing exact.
 """
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, corrected, predicted, signal_of
-from heliograph.filters.innovation import mixed_innovation
+from heliograph.filters.gaussian import Belief, predicted, signal_of
+from heliograph.filters.merging import AbstractMerging, MergeAll, MergeByMode, MergeByNextMode, ModalBeliefs, merged
+from heliograph.filters.modes_heard import describe_modes, hear
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import moments_retained
-from heliograph.filters.told import Told, by_pattern, pattern_of
+from heliograph.filters.told import Told
 from heliograph.filters.transform import AbstractTransform, Cubature
-from heliograph.filters.update import Polytope
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
-from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AnySensor
-from heliograph.numerics.angle import Angles, nearest, wrapped
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.check import instance
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.small_matrix import runs_last
-from heliograph.numerics.types import Array, ArrayLike, Bool, Float
-from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
+from heliograph.numerics.types import Array, ArrayLike, Float
 
 NODES = 3  # modes that stand for a gain that drifts
-
-
-class ModalBeliefs(NamedTuple):
-    """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
-
-    Shapes: mean (M, n), covariance (M, n, n), weight (M, M); `moved` once the chain was used.
-    """
-
-    mean: Float[jax.Array, "M n"]
-    covariance: Float[jax.Array, "M n n"]
-    weight: Float[jax.Array, "M M"]
-    moved: Bool[jax.Array, ""]
-
-
-class AbstractMerging(eqx.Module):
-    """When Gaussians are merged."""
-
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Components and weights after the chain has moved, before the plant does."""
-        raise NotImplementedError
-
-    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Components and modes to hear with: all that may have a weight."""
-        each = np.arange(modes)
-        return each, each
-
-
-class MergeAll(AbstractMerging):
-    """One Gaussian for all modes (GPB1)."""
-
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Every component is the whole mixture."""
-        law = jnp.sum(state.weight @ rows, axis=0)
-        whole, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-        every = [jnp.repeat(part, len(rows), axis=0) for part in whole]
-        return state._replace(mean=every[0], covariance=every[1], weight=jnp.diag(law))
-
-
-class MergeByNextMode(AbstractMerging):
-    """A Gaussian for each mode, mixed by where the chain comes from (IMM)."""
-
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Component j is the mixture of all that lead to mode j."""
-        (mean, covariance), law = merged(state.mean, state.covariance, state.weight @ rows)
-        return state._replace(mean=mean, covariance=covariance, weight=jnp.diag(law))
-
-
-class MergeByMode(AbstractMerging):
-    """A Gaussian for each mode, each heard with in every next mode (GPB2)."""
-
-    def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:
-        """Components stay with the mode they were heard in."""
-        (mean, covariance), law = merged(state.mean, state.covariance, state.weight)
-        return state._replace(mean=mean, covariance=covariance, weight=law[:, None] * rows)
-
-    def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Every component with every mode."""
-        return np.repeat(np.arange(modes), modes), np.tile(np.arange(modes), modes)
-
-
-@runs_last
-def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
-    """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
-    law = jnp.sum(weight, axis=0)
-    share = jnp.where(law > 0, weight / jnp.where(law > 0, law, 1.0), 1 / len(weight))
-    center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
-    apart = mean[:, None] - center
-    inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
-    return Belief(center, jnp.sum(share[:, :, None, None] * inside, axis=0)), law
 
 
 class MultipleModelFilter(AbstractFilter):
@@ -186,66 +111,6 @@ def _whole(state: ModalBeliefs) -> Belief:
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
     """Means (components, n) with their angles near those of the likeliest component, so that they can be averaged."""
     return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
-
-
-def hear(
-    belief: Belief,
-    signal: Signal,
-    channel: Told,
-    mode: jax.Array,
-    weight: jax.Array,
-    z: jax.Array,
-    angles: Angles = (),
-) -> tuple[Belief, jax.Array, Innovation]:
-    """Each belief corrected in its mode, its weight after z and after what arrived of it, and the mixture's innovation.
-
-    weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
-    """
-    kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
-    mean, spread = jnp.asarray(channel.mean)[mode, kind], jnp.asarray(channel.spread)[mode, kind]
-    chance = weight * jnp.asarray(channel.chance)[mode, kind]
-    prior = chance / jnp.sum(chance)
-
-    def one(own: Belief, sent: Signal, mean: jax.Array, spread: jax.Array) -> tuple[Belief, Innovation]:
-        law = QuadraticMap(spread, jnp.zeros_like(spread))
-        none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
-        link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
-        return corrected(own, sent, link, Polytope(), z, angles)
-
-    found, heard = jax.vmap(one)(belief, signal, mean, spread)
-    possible = prior > 0  # a mode in which this cannot arrive has no map for it
-    after = Belief(
-        jnp.where(possible[:, None], found.mean, belief.mean),
-        jnp.where(possible[:, None, None], found.covariance, belief.covariance),
-    )
-    weighed = jnp.where(possible, jnp.log(prior) + heard.log_likelihood, -jnp.inf)
-    value = nearest(jnp.asarray(heard.value), heard.value[jnp.argmax(prior)], angles)
-    mixed = mixed_innovation(prior, value, heard.covariance, jax.nn.logsumexp(weighed))
-    return after, jax.nn.softmax(weighed), mixed
-
-
-def describe_modes(channel: Channel, nodes: int) -> tuple[Float[Array, " M"], Told | OverTime]:
-    """The law of the modes at the first use, and the channel by mode and by what arrives, at each step if it varies.
-
-    Raises:
-        ValueError: too many modes, maps whose moments are not known, a mode whose output is certain beside others: a
-            probability cannot be weighed against densities.
-    """
-    steps = [joint_modes(c, nodes) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
-    no_flags = np.ones((len(steps[0].initial), 1))
-    parts = by_pattern(steps, no_flags)
-    for part in parts if len(no_flags) > 1 else []:
-        _check_random(part)
-    return steps[0].initial, over_time(parts) if isinstance(channel, OverTime) else parts[0]
-
-
-def _check_random(told: Told) -> None:
-    """Every combination of mode and pattern gives z a density, for an x that has one."""
-    for j, a in np.argwhere(np.asarray(told.chance) > 0):
-        rows, gain = np.flatnonzero(told.present[a]), np.asarray(told.mean[j, a])[:, :-1]
-        random = (gain @ gain.T + np.einsum("ilaa->il", np.asarray(told.spread[j, a])))[np.ix_(rows, rows)]
-        if np.linalg.matrix_rank(random) < len(rows):
-            raise fail("filter of modes", "outputs that are random in every mode (give the links noise)", f"mode {j}")
 
 
 def _build(

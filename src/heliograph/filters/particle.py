@@ -8,7 +8,9 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian import Belief, predicted, signal_of
-from heliograph.filters.multiple_model import describe_modes, hear, merged, together
+from heliograph.filters.merging import merged
+from heliograph.filters.modes_heard import describe_modes, hear
+from heliograph.filters.multiple_model import together
 from heliograph.filters.told import Told
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.model.angle import received_angles

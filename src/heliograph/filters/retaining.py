@@ -7,7 +7,9 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.retained import AbstractRetained, RetainedLinear, RetainedMoments
+from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.retained_linear import RetainedLinear
+from heliograph.filters.retained_moments import RetainedMoments
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.small_matrix import (

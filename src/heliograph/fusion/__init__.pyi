@@ -18,8 +18,12 @@ from .level import (
 )
 from .quantizer import (
     AbstractQuantizer as AbstractQuantizer,
-    EscapeQuantizer as EscapeQuantizer,
     Quantized as Quantized,
+)
+from .escape_quantizer import (
+    EscapeQuantizer as EscapeQuantizer,
+)
+from .uniform_quantizer import (
     UniformQuantizer as UniformQuantizer,
 )
 from .report_link import (

@@ -1,6 +1,5 @@
 """Quantizers on the uplinks from filters to a fusion centre: what arrives, and how far it can be off."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -8,15 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.model.estimate import Claim, weakest
+from heliograph.model.estimate import Claim
 from heliograph.model.over_time import OverTime
-from heliograph.numerics.check import array, check_count, fail
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
-from heliograph.numerics.traced import is_traced
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
-
-Parameter = Float[Array, "..."]  # of all components, or of each
 
 
 @readable
@@ -79,178 +74,6 @@ class AbstractQuantizer(eqx.Module):
 Quantizer = AbstractQuantizer | OverTime  # an OverTime holds one quantizer per step
 
 
-class UniformQuantizer(AbstractQuantizer):
-    """Midpoints of `levels` equal segments of [-amplitude, amplitude], its ends outside: u q(x / u), u = scale.
-
-    |error| <= scale amplitude / levels where x / u lies within the amplitude; outside nothing is guaranteed. Errors and
-    their bounds do not depend on the data, so what was "upper" stays so.
-
-    Raises:
-        ValueError: fewer than two levels, an amplitude or scale that is not positive, a reach or an error beyond what
-            numbers hold.
-    Source: H-infinity quantized fusion over amplify-and-forward relays, equations (10), (11) and (13).
-    """
-
-    levels: Float[Array, ""]
-    amplitude: Parameter
-    scale: Parameter
-
-    def __init__(self, levels: int, amplitude: ArrayLike, scale: ArrayLike = 1.0):
-        self.levels = _levels(levels)
-        self.amplitude, self.scale = _positive("amplitude", amplitude), _positive("scale", scale)
-        _check_range("amplitude times scale", self.amplitude, self.scale, self.levels)
-
-    def init(self, n: int) -> tuple[()]:
-        """There is none."""
-        return ()
-
-    @in_float64
-    def step(self, state: PyTree, value: ArrayLike) -> tuple[PyTree, Quantized]:
-        """Quantize with the one amplitude."""
-        return state, _published(jnp.asarray(value, dtype=float), self.amplitude, self.levels, self.scale)
-
-    def error(self, n: int) -> Float[Array, " n"]:
-        """Half of a segment."""
-        return np.asarray(np.broadcast_to(self.scale * self.amplitude / self.levels, (n,)))
-
-    def claim(self, claim: Claim) -> Claim:
-        """At most "upper"."""
-        return weakest([claim, "upper"])
-
-
-class Symbols(NamedTuple):
-    """What goes over the uplink for one value, by component.
-
-    How many escapes, then the segment from 0: -1 says that there is no number, `ABOVE` and `BELOW` that it is beyond
-    all that numbers hold. `number` counts the values that were sent; `restart` says that the first amplitude is used.
-    """
-
-    escapes: Int[Array, "*n"]
-    segment: Int[Array, "*n"]
-    number: Int[Array, "*n"]
-    restart: Bool[Array, "*n"]
-
-
-NOTHING, BELOW, ABOVE = -1, -2, -3  # segments that are none
-LOST = -1  # the number of the next value for a receiver that has missed one
-
-
-class UplinkState(NamedTuple):
-    """What one end of an uplink knows, by component: the next amplitude, and the number of the next value.
-
-    A receiver that has missed a value does not know the amplitude: `number` is negative then.
-    """
-
-    amplitude: Float[Array, "*n"]
-    number: Int[Array, "*n"]
-
-    @property
-    def synchronised(self) -> Bool[Array, "*n"]:
-        """Whether the end knows the amplitude."""
-        return self.number >= 0
-
-
-class EscapeQuantizer(AbstractQuantizer):
-    """A quantizer that the receiver can decode and that does not saturate, driven by nothing but what was sent.
-
-    Where x is outside [-d, d], an escape symbol doubles the amplitude, as often as needed: m = ceil(log2(|x| / d)).
-    Then the segment is sent, so |error| <= d 2^m / levels always, and both ends go on with
-    d+ = max(smallest, decay d 2^m + growth |sent|). Levels are odd, so that zero is one. Only a value whose d 2^m would
-    be no number saturates.
-
-    A value that is lost on the way leaves the receiver with a wrong d. It finds that from the number of the next one:
-    from then on it delivers NaN, without an error bound, and its state is not `synchronised`, until the sender restarts
-    from the first amplitude. That is so with every `interval`-th value, and with any that `encode` is told to restart
-    with. So after a loss the error bound holds again within `interval` values; without either, never.
-
-    Raises:
-        ValueError: an even number of levels or fewer than three, amplitude or smallest amplitude not positive or beyond
-            what numbers hold, decay outside (0, 1), negative growth, an interval below 1.
-    """
-
-    levels: Float[Array, ""]
-    amplitude: Parameter
-    decay: Parameter
-    growth: Parameter
-    smallest: Parameter
-    interval: int | None = eqx.field(static=True)
-
-    def __init__(
-        self,
-        levels: int,
-        amplitude: ArrayLike,
-        decay: ArrayLike,
-        growth: ArrayLike,
-        smallest: ArrayLike,
-        interval: int | None = None,
-    ):
-        self.levels = _levels(levels)
-        if levels % 2 == 0:
-            raise fail("levels", "an odd number, so that zero is a level", levels)
-        self.amplitude, self.smallest = _positive("amplitude", amplitude), _positive("smallest amplitude", smallest)
-        for name, value in (("amplitude", self.amplitude), ("smallest amplitude", self.smallest)):
-            _check_range(name, value, np.ones(()), self.levels)
-        self.decay, self.growth = _decay(decay), _growth(growth)
-        self.interval = None if interval is None else check_count("interval", interval)
-
-    @in_float64
-    def init(self, n: int) -> UplinkState:
-        """The first amplitude, known to both ends."""
-        count = check_count("components", n)
-        return UplinkState(jnp.broadcast_to(jnp.asarray(self.amplitude), (count,)), jnp.zeros(count, int))
-
-    @in_float64
-    def step(self, state: UplinkState, value: ArrayLike) -> tuple[UplinkState, Quantized]:
-        """What the receiver decodes of what the sender encodes."""
-        return self.decode(state, self.encode(state, value))
-
-    @in_float64
-    def encode(self, state: UplinkState, value: ArrayLike, restart: bool = False) -> Symbols:
-        """The sender: symbols of a value (n,), from the amplitude that both ends know, or from the first one."""
-        x = jnp.asarray(value, dtype=float)
-        anew = jnp.broadcast_to(self._restarts(state.number) | restart, x.shape)
-        amplitude = self._amplitude(state, anew)
-        (x_fraction, x_power), (fraction, power) = jnp.frexp(x), jnp.frexp(amplitude)
-        doublings = x_power - power + (jnp.abs(x_fraction) > fraction)  # smallest m with |x| <= d 2^m, exactly
-        most = np.finfo(x.dtype).maxexp - power  # the largest that leaves d 2^m a number
-        known, beyond = ~jnp.isnan(x), jnp.isinf(x) | (doublings > most)
-        escapes = jnp.where(x != 0, jnp.clip(jnp.where(beyond, most, doublings), 0), 0)
-        segment = _segment(x, jnp.ldexp(amplitude, escapes), self.levels)
-        segment = jnp.where(beyond, jnp.where(x > 0, ABOVE, BELOW), jnp.where(known, segment, NOTHING))
-        numbers = jnp.broadcast_to(state.number, x.shape)
-        return Symbols(jnp.where(known, escapes, 0).astype(int), segment.astype(int), numbers, anew & known)
-
-    @in_float64
-    def decode(self, state: UplinkState, symbols: Symbols) -> tuple[UplinkState, Quantized]:
-        """The receiver: next state and value, from the present state and the symbols alone."""
-        escapes, segment, number, restart = (jnp.asarray(part) for part in symbols)
-        restart, there, beyond = restart != 0, segment != NOTHING, segment <= BELOW
-        synchronised = restart | (state.number == number)
-        used = jnp.ldexp(self._amplitude(state, restart), escapes)
-        inside = _midpoint(segment, used, self.levels)
-        sent = jnp.where(beyond, jnp.where(segment == ABOVE, used, -used), inside)
-        largest = np.finfo(used.dtype).max
-        following = jnp.clip(self.decay * used + self.growth * jnp.abs(sent), self.smallest, largest)
-        known = there & synchronised
-        value = jnp.where(known, sent, jnp.nan)
-        error = jnp.where(known & ~beyond, used / self.levels, jnp.nan)
-        after = UplinkState(
-            jnp.where(known, following, state.amplitude),
-            jnp.where(there, jnp.where(synchronised, number + 1, LOST), state.number),
-        )
-        return after, Quantized(value, error, known & beyond, escapes + 1)
-
-    def _restarts(self, number: Int[Array, "*n"]) -> Bool[Array, "*n"]:
-        return number == 0 if self.interval is None else number % self.interval == 0
-
-    def _amplitude(self, state: UplinkState, restart: Bool[Array, "*n"]) -> Float[Array, "*n"]:
-        return jnp.where(restart, self.amplitude, state.amplitude)
-
-    def claim(self, claim: Claim) -> Claim:
-        """At most "nominal": the amplitude depends on the data, and may be small where errors are large."""
-        return weakest([claim, "nominal"])
-
-
 def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:
     """Bound on the covariance of x - q from that, P, of x - xhat (or a bound), where |q - xhat| <= D by component.
 
@@ -261,73 +84,3 @@ def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[ja
     s, r = jnp.sum(error), jnp.sqrt(jnp.trace(covariance))
     share = jnp.where(r == 0, 0.0, s / jnp.where(r == 0, 1.0, r))  # P = 0: only the quantizer's error is left
     return (1 + share) * covariance + (r + s) * jnp.diag(error)
-
-
-def _published(
-    x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""], scale: Parameter
-) -> Quantized:
-    """Equations (10), (11) and (13), with d for values from d on and -d for values below -d."""
-    scaled = x / scale
-    inside = _midpoint(_segment(scaled, amplitude, levels), amplitude, levels)
-    value = jnp.where(scaled >= amplitude, amplitude, jnp.where(scaled < -amplitude, -amplitude, inside))
-    saturated = jnp.abs(scaled) > amplitude
-    error = jnp.where(saturated | ~jnp.isfinite(x), jnp.nan, scale * amplitude / levels)
-    return Quantized(scale * value, error, saturated, jnp.ones(x.shape, dtype=int))
-
-
-def _segment(x: Float[jax.Array, "*n"], amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """Which of the equal segments of [-amplitude, amplitude] holds x, from 0."""
-    return jnp.clip(jnp.floor((x / amplitude + 1) * levels / 2), 0, levels - 1)
-
-
-def _midpoint(segment: Array, amplitude: Parameter, levels: Float[Array, ""]) -> Float[jax.Array, "*n"]:
-    """The middle of a segment; exactly zero for the middle one of an odd number.
-
-    The amplitude's power of two is taken out, which changes no bit, or its product with many levels would be no number.
-    """
-    fraction, power = jnp.frexp(jnp.asarray(amplitude))
-    return jnp.ldexp((2 * segment + 1 - levels) * fraction / levels, power)
-
-
-def _levels(value: int) -> Float[np.ndarray, ""]:
-    check_count("levels", value, 2)
-    return np.asarray(value, dtype=np.float64)
-
-
-def _parameter(name: str, value: ArrayLike) -> Parameter:
-    several = isinstance(value, Sequence) or np.ndim(value) > 0
-    result: Parameter = array(name, value, (None,) if several else ())
-    return result
-
-
-def _positive(name: str, value: ArrayLike) -> Parameter:
-    result = _parameter(name, value)
-    if not isinstance(result, jax.Array) and np.any(result <= 0):
-        raise fail(name, "positive numbers", value)
-    return result
-
-
-def _check_range(name: str, amplitude: Parameter, scale: Parameter, levels: Float[Array, ""]) -> None:
-    """Raise ValueError unless the reach and the error of a level are numbers, the latter to full precision."""
-    if is_traced(amplitude, scale):
-        return
-    with np.errstate(over="ignore", under="ignore"):
-        reach = np.asarray(amplitude) * scale
-        inside = np.isfinite(reach) & (reach / levels >= np.finfo(np.float64).tiny)
-    if not np.all(inside):
-        least = np.finfo(np.float64).tiny * float(levels)
-        raise fail(name, f"from {least:.3g} to {np.finfo(np.float64).max:.3g}", reach.tolist())
-
-
-def _decay(value: ArrayLike) -> Parameter:
-    result = _parameter("decay", value)
-    if not isinstance(result, jax.Array) and np.any((result <= 0) | (result >= 1)):
-        raise fail("decay", "numbers between 0 and 1", value)
-    return result
-
-
-def _growth(value: ArrayLike) -> Parameter:
-    result = _parameter("growth", value)
-    if not isinstance(result, jax.Array) and np.any(result < 0):
-        raise fail("growth", "no negative number", value)
-    return result

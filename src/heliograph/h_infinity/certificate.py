@@ -11,6 +11,7 @@ from heliograph.numerics.check import array, fail, instance, items, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
+FINDINGS = "findings of check_growth or check_size"
 ROUNDING = 1e-12  # an eigenvalue this close to zero has no sign, in a matrix whose diagonal is -1
 
 
@@ -65,9 +66,7 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level))
-    growth = items("growth", growth, "findings of check_growth or check_size")
-    for one in growth:
-        instance("growth", one, GrowthFinding, "findings of check_growth or check_size")
+    growth = [instance("growth", one, GrowthFinding, FINDINGS) for one in items("growth", growth, FINDINGS)]
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)
@@ -87,24 +86,22 @@ def certify_level(
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
     constants = _constants(system)
+    reasons += _against(constants, growth)
+    count = T if negative.all() else int(np.argmin(negative))
+    known = tuple(growth), tuple(reasons), _assumed(constants, growth)
+    return HInfinityCertificate(not reasons, level, tops, count, initial, margin, *known)
+
+
+def _against(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> list[str]:
+    """What the findings refute, and those that are about other constants than the system's."""
+    reasons = []
     for finding in growth:
         if finding.refuted:
             reasons.append(finding.text)
         elif not any(_supports(finding, value) for value, _ in constants):
             known = ", ".join(sorted({f"{value:g}" for value, _ in constants})) or "none"
             reasons.append(f"{finding.name}: a finding about the constant {finding.constant:g}, the system has {known}")
-    count = T if negative.all() else int(np.argmin(negative))
-    return HInfinityCertificate(
-        not reasons,
-        float(level),
-        tops,
-        count,
-        initial,
-        margin,
-        tuple(growth),
-        tuple(reasons),
-        _assumed(constants, growth),
-    )
+    return reasons
 
 
 def _supports(finding: GrowthFinding, constant: float) -> bool:

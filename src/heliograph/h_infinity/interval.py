@@ -40,7 +40,7 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     """
     values: dict[Any, Interval] = {}
 
-    def read(atom: Any) -> Interval:
+    def read(atom: object) -> Interval:
         return exact(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
@@ -61,13 +61,13 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     return [read(atom) for atom in jaxpr.jaxpr.outvars]
 
 
-def exact(value: Any) -> Interval:
+def exact(value: object) -> Interval:
     """The interval that holds one value."""
     array = np.asarray(value)
     return Interval(array, array)
 
 
-def outward(low: Any, high: Any, ulps: int = 1) -> Interval:
+def outward(low: object, high: object, ulps: int = 1) -> Interval:
     """Ends moved outward; an end that is no number is infinite."""
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)

@@ -48,8 +48,10 @@ from .many import (
     fit_each as fit_each,
 )
 from .parameters import (
-    Description as Description,
     Parameters as Parameters,
+)
+from .description import (
+    Description as Description,
     describe as describe,
 )
 from .solution import (

@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from heliograph.learning.description import Description, describe
+from heliograph.learning.free_marks import Build
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
 from heliograph.learning.maximise import Maximum
 from heliograph.learning.objective import Form, objectives
-from heliograph.learning.parameters import Build, Description, describe
 from heliograph.learning.recordings import gathered
 from heliograph.learning.solution import Row, Solution
 from heliograph.learning.surface import StoppedError, Surface
@@ -114,7 +114,7 @@ class Fit:
 
 def fit(
     network: Build,
-    recording: Any,
+    recording: object,
     inputs: ArrayLike | Sequence[ArrayLike] | None = None,
     starts: int = 6,
     seed: int = 0,

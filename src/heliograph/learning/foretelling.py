@@ -11,6 +11,7 @@ from scipy.stats import kstest
 from heliograph.filters.combinations import Component, atoms_of
 from heliograph.filters.gaussian import GaussianFilter, cubature_filter, signal_of
 from heliograph.learning.law_nodes import with_nodes
+from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import nearest
@@ -123,8 +124,9 @@ def expected_signals(
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, ...]]:
         k, z_k, u_k = row
         prior = item.predict(state, u_k, k)
-        y = signal_of(item.plant, item.sensor, item.transform, prior)  # type: ignore[arg-type]
-        near = nearest(z_k, item.channel.mean_gain @ y.mean + item.channel.offset, item.heard_angles)  # type: ignore[union-attr]
+        plant, sensor, channel = at((item.plant, item.sensor, item.channel), k)
+        y = signal_of(plant, sensor, item.transform, prior)
+        near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, item.heard_angles)
         return item.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
 
     start = jax.tree.map(jnp.asarray, item.init())

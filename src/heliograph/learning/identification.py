@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.learning.description import describe
+from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import quantile
 from heliograph.learning.objective import Data, Objective, objectives
-from heliograph.learning.parameters import Build, Parameters, describe
+from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
 from heliograph.learning.routes import route_sentences
 from heliograph.learning.surface import Surface

@@ -6,10 +6,12 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 
+from heliograph.learning.description import describe
+from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
 from heliograph.learning.maximise import Evaluated, maximise
 from heliograph.learning.objective import Form, Found, Objective, objectives, one_recording
-from heliograph.learning.parameters import Build, Parameters, describe
+from heliograph.learning.parameters import Parameters
 from heliograph.learning.surface import DIFFERENCE
 from heliograph.learning.transforms import unlink
 from heliograph.numerics.check import array, fail, shown

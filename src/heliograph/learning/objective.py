@@ -16,8 +16,8 @@ from heliograph.filters.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear import LinearFilter, linear_filter
 from heliograph.learning import settling
+from heliograph.learning.description import Description
 from heliograph.learning.joint import joint_world
-from heliograph.learning.parameters import Description
 from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.sensor import is_linear

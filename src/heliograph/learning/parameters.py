@@ -1,11 +1,7 @@
-"""What is free in a network: numbers marked where they stand, and the network built again with others there."""
+"""Free numbers: their places on the line that is searched, and the entries of the table that a user reads."""
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
-from contextvars import ContextVar
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,63 +9,9 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from heliograph.learning.transforms import from_line, size, slope, to_line, unlink, unlink_slope
-from heliograph.numerics.check import array, fail, function, instance, shown, shown_error
-from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
+from heliograph.numerics.domain import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.readable import readable
-from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.simulation.network import Network
-
-Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
-Build = Callable[[], Network]
-
-DOMAINS: dict[Kind, Domain] = {
-    "real": REAL,
-    "positive": POSITIVE,
-    "probability": PROBABILITY,
-    "simplex": SIMPLEX,
-    "covariance": COVARIANCE,
-}
-
-
-def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) -> Any:
-    """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
-
-    `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
-    that `hg.fit` calls. One name in several places is one number. Where it stands says what it is: a variance and a
-    scale stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain,
-    an entry of a matrix, a number in a function of your own may be any, unless `kind` says otherwise. Without a name it
-    is called after its place. Anywhere else than in a fit it is its start.
-
-    Shapes: start () or of any shape; kind "simplex" sums over the last axis.
-
-    Raises:
-        ValueError: a start that is no number, or an unknown kind.
-    """
-    if kind is not None and kind not in get_args(Kind):
-        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", shown(kind))
-    if name is not None and (not isinstance(name, str) or not name):
-        raise fail("name of a free number", "a text", shown(name))
-    what = "free number" if name is None else name
-    value = array(f"start of {what}", start, (None,) * np.ndim(np.asarray(start)))
-    reader = _reader.get()
-    return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
-
-
-class _Reader(Protocol):
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any: ...
-
-
-# What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
-_reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", default=None)
-
-
-@contextmanager
-def _reading(reader: _Reader) -> Iterator[None]:
-    token = _reader.set(reader)
-    try:
-        yield
-    finally:
-        _reader.reset(token)
+from heliograph.numerics.types import Array, Float
 
 
 @readable
@@ -202,135 +144,6 @@ class Parameters:
             return np.stack([slope(entry.domain, value) * row for entry, value, row in pairs])
 
 
-class _Mark:
-    """A free number while it is being asked for."""
-
-    def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
-        self.start, self.given, self.place = start, name, ""
-        self.domain = None if kind is None else DOMAINS[kind]
-        self.explicit = kind is not None
-
-    def told(self, name: str, domain: Domain) -> None:
-        """A check says what it is: the narrowest holds."""
-        self.place = self.place or name
-        if self.explicit:
-            return
-        known = REAL if self.domain is None else self.domain
-        if known.kind == domain.kind == "interval":
-            domain = Domain(low=max(known.low, domain.low), high=min(known.high, domain.high))
-        elif domain == REAL:
-            domain = known
-        self.domain = domain
-
-
-class _Asking:
-    """Collects what is free."""
-
-    def __init__(self) -> None:
-        self.marks: list[_Mark] = []
-
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
-        """The start, which learns what it is for."""
-        for mark in self.marks:
-            if name is not None and mark.given == name:
-                if not np.array_equal(mark.start, start):
-                    raise fail(
-                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
-                    )
-                return marked(start, mark.told)
-        self.marks.append(_Mark(start, name, kind))
-        return marked(start, self.marks[-1].told)
-
-    def parameters(self) -> Parameters:
-        """All of them; one without a name is called after its place."""
-        taken = {mark.given for mark in self.marks if mark.given is not None}
-        found = []
-        for mark in self.marks:
-            name = mark.given or _new(mark.place or "free number", taken)
-            taken.add(name)
-            domain = REAL if mark.domain is None else mark.domain
-            one = Parameter(name, mark.start, domain)
-            to_line(name, domain, mark.start)
-            found.append(one)
-        return Parameters(tuple(found))
-
-
-class _Given:
-    """Puts values in their places: by name, and in the order of asking where no name was given."""
-
-    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, Any]):
-        self.values = values
-        self.unnamed = iter([one.name for one, own in zip(parameters.every, named, strict=True) if not own])
-
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
-        """The value."""
-        key = next(self.unnamed, "") if name is None else name
-        if key not in self.values:
-            raise fail(
-                "network", "the same free numbers each time it is built", "another one" if name is None else name
-            )
-        return self.values[key]
-
-
-@readable
-@dataclass(frozen=True)
-class Description:
-    """A function that returns a network, and what is free in it; `named`: which names are the user's."""
-
-    build: Build
-    parameters: Parameters
-    named: tuple[bool, ...]
-
-    def at(self, values: Mapping[str, Any]) -> Network:
-        """The network with these values."""
-        with _reading(_Given(self.parameters, self.named, values)), jax.enable_x64(True):
-            try:
-                return checked(self.build())
-            except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
-                expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
-                got = f"one that is read: {shown_error(error)}"
-                raise fail("network to be learned", expected, got) from error
-
-    @cached_property
-    def start(self) -> Network:
-        """The network at its starts."""
-        return self.at({one.name: plain_number(one.start) for one in self.parameters.every})
-
-    def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
-        """The network at a point of the line, of plain numbers."""
-        return self.at(self.parameters.known(x))
-
-
-def describe(network: Build) -> Description:
-    """What is free in the network that a function returns.
-
-    Raises:
-        ValueError: no function, one that returns no network, or nothing free.
-    """
-    if isinstance(network, Network):
-        expected = "a function that returns it with hg.free(...) in it, so that it can be built with other numbers"
-        raise fail("network to be learned", expected, "a Network")
-    function("network to be learned", network, "nothing that returns a Network")
-    asking = _Asking()
-    with _reading(asking), jax.enable_x64(True):
-        checked(network())
-    if not asking.marks:
-        raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
-    parameters = asking.parameters()
-    return Description(network, parameters, tuple(mark.given is not None for mark in asking.marks))
-
-
-def checked(network: object) -> Network:
-    """What the function returned."""
-    return instance("network to be learned", network, Network, "a function that returns a Network")
-
-
 def plain_number(value: Array) -> float | np.ndarray:
     """A number as a float, more of them as an array."""
     return float(value) if np.ndim(value) == 0 else np.asarray(value)
-
-
-def _new(name: str, taken: set[str]) -> str:
-    if name not in taken:
-        return name
-    return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)

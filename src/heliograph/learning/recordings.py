@@ -14,7 +14,7 @@ from heliograph.simulation.network import Network
 FEWEST = 10  # numbers that arrived for each free one
 
 
-def gathered(network: Network, recording: Any, inputs: ArrayLike | Sequence[ArrayLike] | None, free: int) -> Data:
+def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[ArrayLike] | None, free: int) -> Data:
     """All recordings, checked against the network.
 
     Raises:
@@ -38,7 +38,7 @@ def gathered(network: Network, recording: Any, inputs: ArrayLike | Sequence[Arra
     return data
 
 
-def _inputs_of(inputs: Any, index: int, several: Sequence[Any]) -> Any:
+def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
     if not isinstance(inputs, list | tuple):
         return inputs
     if len(inputs) != len(several):

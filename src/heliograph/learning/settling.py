@@ -8,7 +8,7 @@ cut into chunks that run side by side, each from every unit vector and from noth
 
 from collections.abc import Callable
 from math import isqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -71,7 +71,7 @@ def innovations(
     return *_along(heard, (item, gains), (slopes, gain_slopes)), settled
 
 
-def _along(function: Callable[..., Any], primals: tuple[PyTree, ...], slopes: tuple[PyTree, ...]) -> Any:
+def _along(function: Callable[..., object], primals: tuple[PyTree, ...], slopes: tuple[PyTree, ...]) -> PyTree:
     """Value and derivatives along all directions at once."""
     return eqx.filter_vmap(lambda *along: eqx.filter_jvp(function, primals, along), out_axes=(None, 0))(*slopes)
 
@@ -119,7 +119,7 @@ def _moments(prior: LinearBelief, random: bool) -> list[jax.Array]:
     return [prior.covariance, own] if random else [prior.covariance]
 
 
-def _still(before: tuple[Any, Any], after: tuple[Any, Any]) -> jax.Array:
+def _still(before: tuple[PyTree, PyTree], after: tuple[PyTree, PyTree]) -> jax.Array:
     """Whether a step changed moments (n, n) and their derivatives (p, n, n) by rounding alone, whatever the units."""
     result = jnp.asarray(True)
     for old, old_slope, new, new_slope in zip(*before, *after, strict=True):

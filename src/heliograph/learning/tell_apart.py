@@ -8,7 +8,7 @@ import numpy as np
 from scipy.stats import norm
 
 from heliograph.filters.gaussian import GaussianFilter, cubature_filter
-from heliograph.filters.linear import open_loop_filter
+from heliograph.filters.open_loop import open_loop_filter
 from heliograph.learning.foretelling import NODES, Parts, expected_signals, of_signals
 from heliograph.learning.long_run import long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar

@@ -50,7 +50,7 @@ class Sweep(eqx.Module):
         return own, central
 
 
-def _each(function: Callable[..., Any], steps: Retained, *rest: PyTree) -> Any:
+def _each(function: Callable[..., object], steps: Retained, *rest: PyTree) -> Any:
     """A function of one filter's step for those of each kind, (filter, node, ...), and for the central ones."""
     own = {
         kind: jax.vmap(jax.vmap(function))(step, *(part[0][kind] for part in rest)) for kind, step in steps[0].items()

@@ -1,12 +1,14 @@
 """What objects that differ in numbers alone share: so they share compiled programs, called with arrays only."""
 
 from collections.abc import Hashable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+from heliograph.numerics.types import PyTree
 
 
 class Mould(NamedTuple):
@@ -15,10 +17,10 @@ class Mould(NamedTuple):
     A program is called with arrays only, since telling apart what is none costs more than all the rest of a step.
     """
 
-    tree: Any
+    tree: PyTree
     parts: tuple[Hashable, ...]
 
-    def filled(self, numbers: Sequence[jax.Array]) -> Any:
+    def filled(self, numbers: Sequence[jax.Array]) -> PyTree:
         """The object with these arrays."""
         rest = iter(numbers)
         return self.tree.unflatten([next(rest) if part is None else part for part in self.parts])

@@ -14,7 +14,7 @@ from heliograph.numerics.check import fail, shown
 HEAD = "head"
 
 
-def packed(head: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+def packed(head: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Bytes of both."""
     file = BytesIO()
     written = np.frombuffer(json.dumps(head).encode(), dtype=np.uint8)

@@ -79,7 +79,7 @@ class Stream:
         """Filter, steps and state, in double precision wherever it is read: what is compiled is no part of it."""
         return {"filter": self.filter, "steps": self.steps, "_state": to_numpy(self._state)}
 
-    def __setstate__(self, kept: dict[str, Any]) -> None:
+    def __setstate__(self, kept: dict[str, object]) -> None:
         vars(self).update(kept)
         self._placed = _place(self.filter)
 

@@ -21,8 +21,9 @@ from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
+from heliograph.simulation.by_name import by_name
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record, by_name
+from heliograph.simulation.record import Record
 
 
 @readable
@@ -85,7 +86,7 @@ class Timeline:
         kept = {name: value for name, value in vars(self).items() if name != "_player"}
         return kept | {"_tape": to_numpy(self._tape)}
 
-    def __setstate__(self, kept: dict[str, Any]) -> None:
+    def __setstate__(self, kept: dict[str, object]) -> None:
         vars(self).update(kept)
         self._player = player(self.network)
         with jax.enable_x64(True):

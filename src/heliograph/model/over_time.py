@@ -1,7 +1,7 @@
 """The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
 
 from collections.abc import Hashable, Sequence
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +12,7 @@ from jaxtyping import Array, Int
 from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
 from heliograph.numerics.readable import readable
+from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import one_memory
 
 T = TypeVar("T")
@@ -24,9 +25,9 @@ class OverTime(eqx.Module):
     `values` is an array (time, ...) or any model object stacked over time; build the latter with `over_time`.
     """
 
-    values: Any
+    values: PyTree
 
-    def __init__(self, values: Any):
+    def __init__(self, values: object):
         self.values = jax.tree.map(_as_array, values)
         steps = {leaf.shape[0] if leaf.ndim else None for leaf in _arrays(self.values)}
         if len(steps) != 1 or None in steps:
@@ -38,11 +39,11 @@ class OverTime(eqx.Module):
         return int(_arrays(self.values)[0].shape[0])
 
 
-def _as_array(leaf: Any) -> Any:
+def _as_array(leaf: object) -> object:
     return np.asarray(leaf, dtype=np.float64) if isinstance(leaf, int | float | list) else leaf
 
 
-def _arrays(tree: Any) -> list[Any]:
+def _arrays(tree: object) -> list[PyTree]:
     return [leaf for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf)]
 
 
@@ -61,7 +62,7 @@ def stack(items: Sequence[T]) -> T:
     return result
 
 
-def structure(item: Any) -> Hashable:
+def structure(item: object) -> Hashable:
     """What two model objects share that differ in nothing but the values of their arrays."""
     return _structure(*jax.tree.flatten(item))
 
@@ -70,18 +71,18 @@ def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 
-def alike(a: Any, b: Any) -> bool:
+def alike(a: object, b: object) -> bool:
     """Whether two model objects differ in nothing but the values of their arrays."""
     return structure(a) == structure(b)
 
 
-def _stack_leaves(*leaves: Any) -> Any:
+def _stack_leaves(*leaves: PyTree) -> object:
     if any(isinstance(leaf, jax.Array) for leaf in leaves):
         return jnp.stack(leaves)
     return np.stack(leaves)
 
 
-def over_time(items: Sequence[Any]) -> OverTime:
+def over_time(items: Sequence[object]) -> OverTime:
     """One model object per time step (a channel, a plant, ...) as a single object that varies in time.
 
     What channels remember without a name is one memory over time, whose transition may differ from step to step.
@@ -95,13 +96,13 @@ def over_time(items: Sequence[Any]) -> OverTime:
     return OverTime(stack(one_memory(items)))
 
 
-def at(tree: Any, k: int | np.integer | np.ndarray | Int[Array, ""]) -> Any:
+def at(tree: PyTree, k: int | np.integer | np.ndarray | Int[Array, ""]) -> PyTree:
     """Return `tree` as it is at step k: every `OverTime` inside is replaced by its k-th values.
 
     NumPy arrays stay NumPy arrays unless k is traced.
     """
 
-    def read(leaf: Any) -> Any:
+    def read(leaf: object) -> PyTree:
         if not isinstance(leaf, OverTime):
             return leaf
         values, rest = eqx.partition(leaf.values, eqx.is_array)
@@ -110,22 +111,22 @@ def at(tree: Any, k: int | np.integer | np.ndarray | Int[Array, ""]) -> Any:
     return jax.tree.map(read, tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
 
 
-def _entry(values: Any, k: Any) -> Any:
+def _entry(values: PyTree, k: PyTree) -> object:
     return jnp.asarray(values)[k] if isinstance(k, jax.Array) else values[k, ...]  # the dots keep a number an array
 
 
-def steps_covered(tree: Any) -> int | None:
+def steps_covered(tree: object) -> int | None:
     """Smallest number of steps that the time-varying parts of `tree` cover; None if nothing varies."""
     leaves = jax.tree.leaves(tree, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     steps = [leaf.steps for leaf in leaves if isinstance(leaf, OverTime)]
     return min(steps) if steps else None
 
 
-def unstack(stacked: OverTime) -> list[Any]:
+def unstack(stacked: OverTime) -> list[PyTree]:
     """The objects of each step, as they were given to `over_time`."""
     return [at(stacked, i) for i in range(stacked.steps)]
 
 
-def first(item: Any) -> Any:
+def first(item: object) -> PyTree:
     """A plant, sensor or channel at its first step."""
     return at(item, 0) if isinstance(item, OverTime) else item

@@ -260,7 +260,7 @@ def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector
 AnyPlant = AbstractPlant | OverTime  # an OverTime holds one plant per step
 
 
-def check_shape(name: str, called: Callable[..., Any], values: tuple[Any, ...], shape: tuple[int, ...]) -> None:
+def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:
     """Raise ValueError unless a user's function returns an array of `shape`."""
     try:
         with jax.enable_x64(True):

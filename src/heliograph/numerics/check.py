@@ -1,10 +1,10 @@
 """Checks at construction: one line that names the thing, what was expected and what came."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -91,7 +91,7 @@ def items(name: str, value: object, what: str) -> list[Any]:
     try:
         if isinstance(value, str | bytes | Mapping | AbstractSet):
             raise TypeError
-        return list(value)  # type: ignore[call-overload, no-any-return]
+        return list(cast(Iterable[Any], value))
     except TypeError:
         raise fail(name, f"a list of {what}", shown(value)) from None
 

@@ -1,7 +1,7 @@
 """Where a number may lie, and a start value that learns it from whatever checks it."""
 
 from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -24,14 +24,14 @@ class Marked(np.ndarray):
     told: Callable[[str, Domain], None] | None = None
 
 
-def marked(value: Any, told: Callable[[str, Domain], None]) -> Marked:
+def marked(value: object, told: Callable[[str, Domain], None]) -> Marked:
     """A copy of an array that calls `told(name, domain)` when it is checked."""
     result = np.array(value, dtype=np.float64).view(Marked)
     result.told = told
     return result
 
 
-def tell(name: str, value: Any, whole: Domain, entry: Domain | None = None) -> None:
+def tell(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
     """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
     if isinstance(value, Marked):
         if value.told is not None:
@@ -42,7 +42,7 @@ def tell(name: str, value: Any, whole: Domain, entry: Domain | None = None) -> N
                 tell(name, item, whole if entry is None else entry, entry)
 
 
-def tell_covariance(name: str, value: Any) -> None:
+def tell_covariance(name: str, value: object) -> None:
     """Tell a marked covariance or variance; in a list of rows, that those on the diagonal are variances."""
     if isinstance(value, Marked):
         tell(name, value, COVARIANCE if value.ndim else POSITIVE)

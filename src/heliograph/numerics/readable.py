@@ -25,7 +25,7 @@ def readable(kind: T) -> T:
     return kind
 
 
-def _repr(self: Any) -> str:
+def _repr(self: object) -> str:
     """One line, or a line for each part."""
     whole = line(self, DEPTH)
     if len(whole) <= WIDTH:
@@ -36,12 +36,12 @@ def _repr(self: Any) -> str:
     return "\n".join([f"{type(self).__name__}(", *(_cut(part) for part in (*parts, *more)), ")"])
 
 
-def _html(self: Any) -> str:
+def _html(self: object) -> str:
     """A table of the parts; what has parts itself opens where it stands."""
     return _table(self, DEPTH)
 
 
-def _equal(self: Any, other: object) -> bool:
+def _equal(self: object, other: object) -> bool:
     """Of the same class and the same in every part, NaN like NaN."""
     if type(self) is type(other) and not (is_dataclass(self) or isinstance(self, Mapping | tuple)):
         return same(self.__getstate__(), other.__getstate__())
@@ -69,11 +69,11 @@ def line(value: Any, depth: int) -> str:
     return " ".join(repr(value).split())
 
 
-def _ours(value: Any) -> bool:
+def _ours(value: object) -> bool:
     return getattr(type(value), "__repr__", None) is _repr
 
 
-def _parts(value: Any) -> Iterable[tuple[str, Any]]:
+def _parts(value: object) -> Iterable[tuple[str, Any]]:
     """Names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
         return ((repr(key), each) for key, each in value.items())
@@ -91,13 +91,13 @@ def _array(value: Any) -> str:
     return repr(numbers) if value.dtype.kind != "f" else _rounded(numbers)
 
 
-def _rounded(numbers: Any) -> str:
+def _rounded(numbers: object) -> str:
     if isinstance(numbers, list):
         return f"[{', '.join(map(_rounded, numbers))}]"
     return f"{numbers:.4g}"
 
 
-def _joined(start: str, items: Iterable[Any], count: int, depth: int, of: Callable[[Any], str], end: str) -> str:
+def _joined(start: str, items: Iterable[object], count: int, depth: int, of: Callable[[Any], str], end: str) -> str:
     if count and depth <= 0:
         return f"{start}…{end}"
     more = [f"… {count - SOME} more"] if count > SOME else []
@@ -108,12 +108,12 @@ def _cut(text: str) -> str:
     return text if len(text) <= WIDTH else f"{text[: WIDTH - 1]}…"
 
 
-def _table(value: Any, depth: int) -> str:
+def _table(value: object, depth: int) -> str:
     rows = [f"<tr><th>{escape(name)}</th><td>{_cell(each, depth - 1)}</td></tr>" for name, each in _entries(value)]
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
 
-def _entries(value: Any) -> Iterable[tuple[str, Any]]:
+def _entries(value: object) -> Iterable[tuple[str, Any]]:
     found = _parts(value)
     yield from islice(found, MANY)
     left = sum(1 for _ in found)
@@ -121,7 +121,7 @@ def _entries(value: Any) -> Iterable[tuple[str, Any]]:
         yield "…", f"{left} more"
 
 
-def _cell(value: Any, depth: int) -> str:
+def _cell(value: object, depth: int) -> str:
     text = escape(_cut(line(value, depth)))
     opens = _ours(value) or (isinstance(value, Mapping) and value)
     return f"<details><summary>{text}</summary>{_table(value, depth)}</details>" if opens and depth > 0 else text

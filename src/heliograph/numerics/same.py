@@ -38,7 +38,7 @@ def same(one: Any, other: Any) -> bool:
     return bool(one == other) or (isinstance(one, float) and one != one and other != other)
 
 
-def _rest(one: Any, other: Any) -> bool:
+def _rest(one: object, other: object) -> bool:
     """What a dictionary of a class of its own holds beside its entries."""
     return same(getattr(one, "__dict__", None), getattr(other, "__dict__", None))
 

@@ -16,17 +16,17 @@ import scipy.linalg
 import scipy.special
 
 
-def is_traced(*values: Any) -> bool:
+def is_traced(*values: object) -> bool:
     """Whether some number in these arrays or lists of numbers is traced."""
     return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
 
 
-def library(*values: Any) -> Any:
+def library(*values: object) -> Any:
     """numpy for numbers that are known, jax.numpy where one is traced."""
     return jnp if is_traced(*values) else np
 
 
-def scipy_for(*values: Any) -> Any:
+def scipy_for(*values: object) -> Any:
     """scipy, or jax.scipy where a number is traced."""
     return jax.scipy if is_traced(*values) else scipy
 
@@ -37,7 +37,7 @@ def plain(value: Any) -> float | jax.Array:
     return result
 
 
-def stacked(parts: Sequence[Any]) -> jax.Array | np.ndarray:
+def stacked(parts: Sequence[object]) -> jax.Array | np.ndarray:
     """Numbers or arrays of one shape along a new first axis."""
     result: jax.Array | np.ndarray = library(parts).stack(parts)
     return result

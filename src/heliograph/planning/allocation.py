@@ -29,7 +29,7 @@ class Allocation(NamedTuple):
     @property
     def words(self) -> str:
         """How good the powers are, in a line."""
-        return f"optimal within {self.gap:.1e}: the problem is convex, and no error is below {self.bound:.8g}"
+        return no_error_below(self.bound, self.gap)
 
 
 @readable
@@ -53,3 +53,8 @@ class LeastPower(NamedTuple):
     def words(self) -> str:
         """How good the powers are, in a line."""
         return f"optimal within {self.gap:.1e}: the problem is convex, and no power below {self.bound:.8g} reaches it"
+
+
+def no_error_below(bound: float, gap: float) -> str:
+    """What the bound of a convex problem says, in a line."""
+    return f"optimal within {gap:.1e}: the problem is convex, and no error is below {bound:.8g}"

@@ -1,7 +1,7 @@
 """Power budgets: what transmitters may send, and the best allocation within them for a linear cost, by a sort."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat, cast
 
 import equinox as eqx
 import numpy as np
@@ -45,7 +45,7 @@ def as_budget(value: object) -> Budget:
     if isinstance(value, Budget):
         return value
     try:
-        number = float(value)  # type: ignore[arg-type]
+        number = float(cast(SupportsFloat, value))
     except (TypeError, ValueError):
         return instance("budget", value, Budget, "a number (the total power) or a Budget")
     return Budget(number)

@@ -16,6 +16,7 @@ from heliograph.h_infinity.solver import run_solver, solvers
 from heliograph.numerics.check import array, covariance, fail, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
+from heliograph.planning.allocation import no_error_below
 from heliograph.planning.independent import at_least
 from heliograph.planning.lyapunov import steady_moment
 
@@ -63,7 +64,7 @@ class CoherentDesign(NamedTuple):
     @property
     def words(self) -> str:
         """How good the amplitudes are, in a line."""
-        return f"optimal within {self.gap:.1e}: the problem is convex, and no error is below {self.bound:.8g}"
+        return no_error_below(self.bound, self.gap)
 
 
 def coherent_sum(

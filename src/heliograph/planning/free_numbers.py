@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.learning.parameters import describe
+from heliograph.learning.description import describe
 from heliograph.numerics.check import array, fail, items, table
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import Network
@@ -119,7 +119,7 @@ def marked(build: Build) -> tuple[Build, Numbers]:
         ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
         found[one.name] = Number(np.asarray(one.start), *ends)
 
-    def built(**values: Any) -> Network:
+    def built(**values: object) -> Network:
         return description.at(values)
 
     return built, Numbers(found)

@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
-from heliograph.model.sensor import LinearSensor, refuse_angles
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array
 from heliograph.planning.criterion import Error
@@ -33,8 +34,8 @@ LISTED = 64  # modes of all nodes together
 class World(NamedTuple):
     """A sensor and the channel of what it sends, each of one step or OverTime."""
 
-    sensor: Any
-    channel: Any
+    sensor: AnySensor
+    channel: Channel
 
 
 def transmitters_of(network: Network) -> tuple[str, ...]:

@@ -29,6 +29,7 @@ LINEAR = 1e-12  # a, of s kappa, below which j = p / b
 KEPT = 1e-14  # eigenvalue of W or Q, of the largest, that counts
 LOUD = 1e3  # of a hop's noise: powers are measured in no larger units
 FLAT = 1e-9  # of a variance: directions in which the error is smaller are not scaled up to it
+Expression = Any  # of cvxpy, which has no types
 
 
 def semidefinite_powers(
@@ -113,7 +114,7 @@ class _Programme:
         self.tops: dict[int, Constraint] = {}  # by step: its largest eigenvalue is below what is made small
         told = [cp.Variable((n, n), symmetric=True) for _ in range(steps)]
         informed = self._information()
-        pieces: list[Any] = []
+        pieces: list[Expression] = []
         for k in range(steps):
             a = back @ paths.plants.transition[k] @ self.root
             noise = [_factor(back @ paths.plants.process[k] @ back.T)]
@@ -139,7 +140,7 @@ class _Programme:
         unit = np.where(unit > 0, unit, 1.0)
         return np.asarray(unit[:, None] * np.linalg.cholesky(p / np.outer(unit, unit) + FLAT * np.eye(len(p))))
 
-    def _information(self) -> list[Any]:
+    def _information(self) -> list[Expression]:
         """sum_i j_i c_i' c_i of each step, with j (a p + b) <= p: in u = a j and q = p a / b, 1 / (1 + q) <= 1 - u.
 
         A path that unlimited power frees of noise has a = 0 and j = p / b, one whose hop is free b = 0 and j = 1 / a.
@@ -154,7 +155,7 @@ class _Programme:
             outer = np.einsum("in,im->inm", c, c).reshape(len(c), -1)
             straight, free = a[k] <= LINEAR * full[k], b[k] == 0
             bent = np.flatnonzero(~straight & ~free)
-            told: Any = np.zeros(n * n)
+            told: Expression = np.zeros(n * n)
             if bent.size:
                 u, rate = cp.Variable(bent.size), self.size[k, bent] * a[k, bent] / b[k, bent]
                 self.constraints.append(cp.inv_pos(1 + cp.multiply(rate, self.x[k, bent])) <= 1 - u)
@@ -166,7 +167,9 @@ class _Programme:
             result.append(cp.reshape(told, (n, n), order="C"))
         return result
 
-    def _predict(self, told: Any, before: Any, a: np.ndarray, b: np.ndarray, informed: Any, k: int) -> None:
+    def _predict(
+        self, told: Expression, before: Expression, a: np.ndarray, b: np.ndarray, informed: Expression, k: int
+    ) -> None:
         """Y_k from Y_k-1, or from the start, which is then part of b."""
         cp = solvers()
         n, m = b.shape
@@ -179,7 +182,7 @@ class _Programme:
             block = cp.bmat([[v, over], [over.T, cp.bmat(corner)]])
         self.constraints += [block >> 0, v + informed - told >> 0]
 
-    def _piece(self, told: Any, k: int) -> Any:
+    def _piece(self, told: Expression, k: int) -> Expression:
         """What step k adds to the error, in units of `unit`."""
         cp = solvers()
         f = self._seen(k)
@@ -196,7 +199,7 @@ class _Programme:
         """W^1/2 of step k in these coordinates."""
         return _factor(self.root.T @ self.problem.weights[k] @ self.root / self.unit).T
 
-    def within(self, allowed: Allowed) -> list[Any]:
+    def within(self, allowed: Allowed) -> list[Expression]:
         """The budget, which is linear."""
         cp = solvers()
         p = cp.multiply(self.size, self.x)
@@ -212,7 +215,7 @@ class _Programme:
             found.append(self.x[rows, columns] <= peak[rows, columns] / self.size[rows, columns])
         return found
 
-    def solve(self, goal: Any, within: list[Any]) -> None:
+    def solve(self, goal: Expression, within: list[Expression]) -> None:
         """Solve, and keep powers and the weights that the dual names."""
         cp = solvers()
         task = cp.Problem(cp.Minimize(goal), self.constraints + within)

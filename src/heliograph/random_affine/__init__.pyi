@@ -9,10 +9,12 @@ from .chain import (
     Autoregression as Autoregression,
 )
 from .combine import (
-    Lift as Lift,
     Mixture as Mixture,
     Series as Series,
     Stack as Stack,
+)
+from .lift import (
+    Lift as Lift,
     square as square,
 )
 from .law import (

@@ -8,8 +8,9 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library, placed, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
-from heliograph.random_affine.combine import Lift, Series, Stack
+from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.lift import Lift
 from heliograph.random_affine.monomials import count, exponents, position, product_table
 
 CORNERS = 2048  # corner laws evaluated one by one; above, intervals are combined (sound, but looser)

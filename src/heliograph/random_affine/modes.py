@@ -24,8 +24,9 @@ from heliograph.random_affine.base import (
     memories,
 )
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
-from heliograph.random_affine.combine import Lift, Mixture, Stack
+from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.lift import Lift
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from heliograph.files.quoting import in_figure, visible
+from heliograph.disk.quoting import in_figure, visible
 from heliograph.planning.front import Front
 from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.purchases import Purchase

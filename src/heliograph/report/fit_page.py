@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
-from heliograph.files.quoting import in_figure, visible
+from heliograph.disk.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.losses import Losses

@@ -7,7 +7,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
-from heliograph.files.output_folder import check_replaceable, whole_folder
+from heliograph.disk.output_folder import check_replaceable, whole_folder
 from heliograph.report.progress import Advance, progress
 
 if TYPE_CHECKING:  # a missing extra is told by `write_results`, in one line
@@ -32,7 +32,7 @@ class Results:
     figures: "Mapping[str, Figure]"
     page: "Callable[[Mapping[str, bytes]], Page]"
     summary: Mapping[str, Json]
-    write_data: Callable[[Path], None]
+    write_data: Callable[[Path], None] = lambda folder: None
 
 
 def write_results(
@@ -55,6 +55,19 @@ def write_results(
         advance("drawing and writing")
         _write(tell(found), folder)
     return found
+
+
+def report_results(
+    target: Path, stages: int, compute: Callable[[Advance], T], tell: Callable[[T], Results], needs: Sequence[str] = ()
+) -> None:
+    """As `write_results`, and print where the report is.
+
+    Raises:
+        ValueError: a folder that cannot be written, or that holds something else.
+        ModuleNotFoundError: an extra is not installed.
+    """
+    write_results(target, stages, compute, tell, needs)
+    print(f"Report: {target / 'report.html'}")
 
 
 def _write(results: Results, folder: Path) -> None:

@@ -9,7 +9,7 @@ from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from heliograph.files.quoting import in_figure, visible
+from heliograph.disk.quoting import in_figure, visible
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text

@@ -4,7 +4,7 @@ So plants come and go without compiling, and no bit of an estimate depends on wh
 """
 
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -21,8 +21,8 @@ from heliograph.numerics.compiler import understood
 from heliograph.numerics.small_matrix import runs_last, squared_distance
 from heliograph.numerics.types import Float, PyTree
 from heliograph.serving.flat import Flat, flat_like, row_of
+from heliograph.simulation.by_name import by_name
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.record import by_name
 from heliograph.simulation.stepping import AllFilters
 
 TOGETHER = 16  # lanes of one turn of the loop: they fill the vectors of a processor
@@ -101,7 +101,7 @@ class Lanes:
 
 
 @lru_cache
-def _program(mould: Mould, state: Flat, received: int, inputs: int) -> Any:
+def _program(mould: Mould, state: Flat, received: int, inputs: int) -> PyTree:
     """(numbers, rows, turns) to rows: a loop over TOGETHER lanes, so that what is computed does not depend on turns."""
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
@@ -124,7 +124,7 @@ def _program(mould: Mould, state: Flat, received: int, inputs: int) -> Any:
     return jax.jit(run, compiler_options=understood())
 
 
-def _step(item: Ears, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, dict[str, Any]]:
+def _step(item: Ears, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, dict[str, PyTree]]:
     """One step of all filters, and what is told of it."""
     after, told = item.step(state, heard, u, k)
     groups = item.groups(heard)

@@ -4,7 +4,7 @@ import asyncio
 import signal
 from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from heliograph.serving.output import Output
 from heliograph.serving.transport import Transport
@@ -74,7 +74,7 @@ async def _publish(service: Takes, transport: Transport, outputs: Sequence[Outpu
     service.published(outputs)
 
 
-async def _unless(stop: asyncio.Event, waiting: Coroutine[Any, Any, T]) -> T | None:
+async def _unless(stop: asyncio.Event, waiting: Coroutine[object, object, T]) -> T | None:
     """What is waited for; None if it is to stop before."""
     task, stopped = asyncio.ensure_future(waiting), asyncio.ensure_future(stop.wait())
     await asyncio.wait({task, stopped}, return_when=asyncio.FIRST_COMPLETED)

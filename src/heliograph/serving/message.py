@@ -1,7 +1,7 @@
 """What comes in: one event of one plant, as JSON; its schema is the documentation that a sender needs."""
 
 from datetime import datetime
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
@@ -65,6 +65,6 @@ def seconds(moment: float | datetime, origin: datetime | None) -> float:
     return moment
 
 
-def schema() -> dict[str, Any]:
+def schema() -> dict[str, object]:
     """JSON schema of a message."""
     return Message.model_json_schema()

@@ -1,6 +1,6 @@
 """What goes out: estimates, provisional and final, and what was refused."""
 
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 from pydantic import BaseModel, Field, TypeAdapter
 
@@ -54,6 +54,6 @@ class Refused(BaseModel):
 AnyOutput = Annotated[Estimates | Refused, Field(discriminator="kind")]
 
 
-def schema() -> dict[str, Any]:
+def schema() -> dict[str, object]:
     """JSON schema of a line that is told."""
     return TypeAdapter(AnyOutput).json_schema()

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, time, timedelta
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from heliograph.live.event import INPUTS, Verdict
 from heliograph.numerics.check import InputError, shown
@@ -223,6 +223,6 @@ def _refusal(message: Message, why: Verdict) -> Entry:
     return _refused(message.plant, parts, why, WHY[why])
 
 
-def _refused(plant: str | None, parts: dict[str, Any], why: str, detail: str) -> Entry:
+def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
     found = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
     return Entry(plant or "", "refused", line(found | parts | {"reason": why, "detail": detail}))

@@ -4,13 +4,13 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 from heliograph.serving.loop import signals
 from heliograph.serving.retry import LOG
 from heliograph.serving.transport import TakenOverError
 
-Serve = Callable[[int, asyncio.Event], Coroutine[Any, Any, None]]
+Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 
 
 class Leased(Protocol):

@@ -175,14 +175,14 @@ class Store:
         done = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
         return int(connection.execute(done.returning(NUMBERS.c.value)).scalar_one())
 
-    def _put(self, connection: Connection, table: Table, rows: list[dict[str, Any]]) -> None:
+    def _put(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
         """Insert rows, or replace those of the same name."""
         new = self._insert(table)
         others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)
 
 
-def _of(connection: Connection, columns: Sequence[Column[Any]], names: list[str]) -> list[Any]:
+def _of(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
     """Columns of the plants of these names."""
     found: list[Any] = []
     for i in range(0, len(names), AT_ONCE):

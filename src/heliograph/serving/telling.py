@@ -1,7 +1,5 @@
 """Estimates and refusals as lines of JSON."""
 
-from typing import Any
-
 from pydantic_core import to_json
 
 from heliograph.serving.lanes import Lanes, Place
@@ -23,15 +21,15 @@ class Teller:
         }
         return line({"kind": kind, "plant": plant, "time": time, "estimates": found})
 
-    def _filter(self, place: Place, told: list[float]) -> dict[str, Any]:
+    def _filter(self, place: Place, told: list[float]) -> dict[str, object]:
         n, mean, begin, surprise = self._n, place.mean, place.covariance, place.surprise
         covariance = None if place.claim == "none" else [told[i : i + n] for i in range(begin, begin + n * n, n)]
-        found: dict[str, Any] = {"mean": told[mean : mean + n], "covariance": covariance, "claim": place.claim}
+        found: dict[str, object] = {"mean": told[mean : mean + n], "covariance": covariance, "claim": place.claim}
         if surprise is not None:
             found["nis"], found["heard"] = told[surprise], int(told[surprise + 1])
         return found
 
 
-def line(parts: dict[str, Any]) -> bytes:
+def line(parts: dict[str, object]) -> bytes:
     """One line of JSON, without its end."""
     return to_json(parts, inf_nan_mode="null")

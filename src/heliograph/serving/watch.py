@@ -81,7 +81,7 @@ class Point(NamedTuple):
 
     number: int
     time: float | str
-    estimates: dict[str, dict[str, dict[str, Any]]]
+    estimates: dict[str, dict[str, dict[str, object]]]
 
 
 class Watch:
@@ -217,7 +217,7 @@ def _newest(found: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
     return found[plant]
 
 
-def _band(told: Mapping[str, Any]) -> dict[str, Any]:
+def _band(told: Mapping[str, Any]) -> dict[str, object]:
     """Means, and deviations where the filter claims any."""
     rows = told["covariance"]
     claimed = None if rows is None else [_root(row[i]) for i, row in enumerate(rows)]

@@ -18,16 +18,16 @@ from .compilation_cache import (
 from .over_runs import (
     over_runs as over_runs,
 )
-from .record import (
+from .reducer import (
     AbstractReducer as AbstractReducer,
     Trajectories as Trajectories,
-    Uplink as Uplink,
 )
 from .stepping import (
     centre_filter as centre_filter,
 )
 from .uplinks import (
     SentReports as SentReports,
+    Uplink as Uplink,
 )
 from .tree import (
     RelayTree as RelayTree,
@@ -38,8 +38,10 @@ from .statistics import (
     pool as pool,
 )
 from .sums import (
-    StatisticsByName as StatisticsByName,
     error_statistics as error_statistics,
+)
+from .statistics_by_name import (
+    StatisticsByName as StatisticsByName,
 )
 from .whiteness import (
     memory_test as memory_test,

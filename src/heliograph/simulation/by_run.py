@@ -5,7 +5,6 @@ not depend on what is carried is drawn for many steps at once, since a step's ra
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -44,13 +43,13 @@ def trajectories(
     advance = jax.vmap(evaluated(rest), in_axes=[*_axes(spread), 0, *row_axes, *[-1] * len(drawn)], out_axes=out_axes)
 
     def several(carry: list[jax.Array], rows: list[jax.Array]) -> tuple[list[jax.Array], list[jax.Array]]:
-        def scanned(carry: list[jax.Array], item: Any) -> tuple[list[jax.Array], list[jax.Array]]:
+        def scanned(carry: list[jax.Array], item: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
             results = advance(*carry, keys, *item[0], *item[1])
             return results[: len(one)], results[len(one) :]
 
         return jax.lax.scan(scanned, carry, (rows, draw(keys, *rows)))
 
-    avals: list[Any] = [v.aval for v in drawn]
+    avals: list[PyTree] = [v.aval for v in drawn]
     parts = -(-steps * len(keys) * sum(a.size * a.dtype.itemsize for a in avals) // AHEAD)
     width = -(-steps // min(max(parts, 1), steps))
     dealt = [_dealt(leaf, width) for leaf in jax.tree.leaves(rows)]
@@ -87,7 +86,7 @@ def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:
     return any(v and u for v, u in zip(varies, used, strict=True))
 
 
-def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], Any]:
+def _start(init: Callable[[jax.Array], PyTree], keys: jax.Array) -> tuple[list[jax.Array], list[bool], PyTree]:
     traced, shape = jax.make_jaxpr(init, return_shape=True)(keys[0])
     varies = _dependent(traced, [True])
     start = jax.vmap(jaxpr_as_fun(traced), out_axes=_axes(varies))(keys)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:  # an extra
 
     from heliograph.simulation.record import Record
     from heliograph.simulation.statistics import ErrorStatistics
-    from heliograph.simulation.sums import StatisticsByName
+    from heliograph.simulation.statistics_by_name import StatisticsByName
 
 LEVELS = ["node", "filter", "quantity", "component", "other"]
 Column = tuple[str, str, str, str, str]
@@ -53,7 +53,8 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
     Raises:
         ValueError: no such table.
     """
-    from heliograph.simulation.record import Record, Uplink
+    from heliograph.simulation.record import Record
+    from heliograph.simulation.uplinks import Uplink
 
     if list(getattr(getattr(frame, "columns", None), "names", ())) != LEVELS:
         raise fail("table", f"columns {LEVELS}, as Record.to_pandas makes them", type(frame).__name__)

@@ -49,7 +49,7 @@ def _split(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
     return jnp.stack(_hashed(key, _counters(shape)), axis=-1)
 
 
-def _fold_in(key: jax.Array, data: Any) -> jax.Array:
+def _fold_in(key: jax.Array, data: object) -> jax.Array:
     number = jnp.asarray(data, dtype=jnp.uint32)
     return jnp.stack(_hashed(key, (jnp.zeros_like(number), number)))
 
@@ -84,7 +84,7 @@ def written_out(keys: jax.Array, programs: Sequence[ClosedJaxpr]) -> jax.Array:
 def evaluated(program: ClosedJaxpr) -> Callable[..., list[jax.Array]]:
     """A traced program as a function that takes keys of another hash than those it was traced with."""
 
-    def call(*args: Any) -> list[jax.Array]:
+    def call(*args: object) -> list[jax.Array]:
         return _evaluate(program.jaxpr, program.consts, args)
 
     return call
@@ -149,7 +149,7 @@ def _is_key(item: Var | Literal) -> bool:
 
 
 def _holds_programs(operation: JaxprEqn) -> bool:
-    def parts(value: Any) -> Iterable[Any]:
+    def parts(value: object) -> Iterable[Any]:
         return value if isinstance(value, tuple | list) else (value,)
 
     return any(

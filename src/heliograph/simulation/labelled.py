@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import heliograph
-from heliograph.files.quoting import visible
+from heliograph.disk.quoting import visible
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail, instance, table
 
 if TYPE_CHECKING:  # an extra
     import xarray as xr
 
-    from heliograph.simulation.record import Uplink
+    from heliograph.simulation.uplinks import Uplink
 
 TIME = "time"
 Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
@@ -97,7 +97,7 @@ def uplink_variables(
 
 def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
     """The uplinks in a dataset, by the fusion's name."""
-    from heliograph.simulation.record import Uplink
+    from heliograph.simulation.uplinks import Uplink
 
     if "place" not in dataset:
         return {}
@@ -115,7 +115,7 @@ def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
 
 def dataset_of(
     title: str,
-    variables: Mapping[str, tuple[list[str], Any]],
+    variables: Mapping[str, tuple[list[str], object]],
     labels: Mapping[str, Sequence[str]],
     time: np.ndarray,
     units: Mapping[str, str],
@@ -126,7 +126,7 @@ def dataset_of(
 
     data = {name: (axes, values, {"long_name": MEANING[name]} if name in MEANING else {})
             for name, (axes, values) in variables.items()}  # fmt: skip
-    coordinates: dict[str, Any] = {axis: ([axis], text(names)) for axis, names in labels.items()}
+    coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
     coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
     states = labels["state"]
     if any(state in units for state in states):

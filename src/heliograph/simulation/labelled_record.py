@@ -1,11 +1,11 @@
 """A record as labelled arrays, and back: nothing is lost."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Claim, Estimate
 from heliograph.simulation.labelled import (
     TIME,
     check_title,
@@ -83,7 +83,7 @@ def record_from(dataset: "xr.Dataset") -> "Record":
     length, estimated = values_of(dataset, "length", ["node"]), values_of(dataset, "estimated", ["node"])
     estimates: dict[str, dict[str, Estimate]] = {node: {} for node, kept in zip(nodes, estimated, strict=True) if kept}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
-        value = Estimate(mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy(), str(claim[i, j]))  # type: ignore[arg-type]
+        value = Estimate(mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy(), cast(Claim, str(claim[i, j])))
         estimates[nodes[i]][filters[j]] = value
     return Record(
         time=np.asarray(dataset[TIME].values),

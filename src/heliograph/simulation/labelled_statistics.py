@@ -1,9 +1,10 @@
 """Statistics as labelled arrays, and back: figures for people beside the sums that they are made from."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.simulation.labelled import (
     TIME,
@@ -24,7 +25,7 @@ from heliograph.simulation.statistics import ErrorStatistics, matrices
 if TYPE_CHECKING:  # an extra
     import xarray as xr
 
-    from heliograph.simulation.sums import StatisticsByName
+    from heliograph.simulation.statistics_by_name import StatisticsByName
 
 STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
 
@@ -75,7 +76,7 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
     Raises:
         ValueError: no such dataset.
     """
-    from heliograph.simulation.sums import StatisticsByName
+    from heliograph.simulation.statistics_by_name import StatisticsByName
 
     check_title(dataset, STATISTICS)
     nodes, filters, states = (names_of(dataset, axis) for axis in ("node", "filter", "state"))
@@ -97,7 +98,7 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
             pairs=errors[:, :, i, j].copy(),
             claimed_pairs=claimed[:, :, i, j].copy(),
             nees=nees[:, :, i, j].copy(),
-            claim=str(claim[i, j]),  # type: ignore[arg-type]
+            claim=cast(Claim, str(claim[i, j])),
             uplink=uplinks.get(filters[j]) if nodes[i] == FUSED else None,
             failed=by_step,
             failed_runs=int(failed_runs[i, j]),

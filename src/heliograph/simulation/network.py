@@ -100,6 +100,9 @@ class Network(eqx.Module):
             if isinstance(node, Node):
                 check_link(first(node.sensor), first(node.channel), len(self.states), late=True)
                 received_angles(plant, node.sensor, node.channel)
+        self._check_fused()
+
+    def _check_fused(self) -> None:
         for name, item in self.fused.items():
             if isinstance(item, Fusion):
                 item.check(self.nodes_with(item.filter), len(self.states))
@@ -107,7 +110,7 @@ class Network(eqx.Module):
             else:
                 check_type(f"fused {name!r}", item, AbstractFilter)
                 check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
-                _check_sizes(f"fused {name!r}", item, states, inputs)
+                _check_sizes(f"fused {name!r}", item, self.states, self.inputs)
 
     @staticmethod
     def of_relays(

@@ -3,7 +3,6 @@
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,11 +10,12 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import PyTree
 
 WIDTH = 128  # runs side by side: what a hundred steps of them retain for a sweep back stays near the core
 
 
-def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) -> Any:
+def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WIDTH) -> PyTree:
     """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
 
     The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
@@ -36,7 +36,7 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
     share = -(-runs // (width * cores))  # blocks of each core
     width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
 
-    def work(core: int) -> Any:
+    def work(core: int) -> PyTree:
         first, last = core * share * width, min((core + 1) * share * width, runs)
         parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
@@ -56,7 +56,7 @@ def over_runs(function: Callable[..., Any], *arrays: Any, width: int = WIDTH) ->
     return whole
 
 
-def _numbers(value: Any) -> np.ndarray:
+def _numbers(value: PyTree) -> np.ndarray:
     try:
         found = np.asarray(value)
     except ValueError:  # rows of different lengths
@@ -73,5 +73,5 @@ def _filled(part: np.ndarray, count: int) -> np.ndarray:
 
 
 @eqx.filter_jit
-def _blocks(function: Callable[..., Any], parts: list[Any]) -> Any:
+def _blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
     return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from heliograph.files.quoting import in_figure
+from heliograph.disk.quoting import in_figure
 from heliograph.numerics.check import check_count, fail
 
 if TYPE_CHECKING:  # an extra
     from matplotlib.axes import Axes
 
     from heliograph.simulation.record import Record
-    from heliograph.simulation.sums import StatisticsByName
+    from heliograph.simulation.statistics_by_name import StatisticsByName
 
 
 def plot_record(
@@ -95,7 +95,7 @@ def _places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
     return [list(known).index(name) for name in chosen]
 
 
-def _axes(axes: Any, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
+def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
     """The given axes, or those of a new figure, one below the other."""
     if axes is None:
         import matplotlib.pyplot as plt

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from heliograph.files.output_folder import check_replaceable, whole_folder
-from heliograph.files.quoting import from_file, in_file
-from heliograph.files.table import check_output
-from heliograph.files.whole_file import whole_file
+from heliograph.disk.output_file import check_output
+from heliograph.disk.output_folder import check_replaceable, whole_folder
+from heliograph.disk.quoting import from_file, in_file
+from heliograph.disk.whole_file import whole_file
 from heliograph.numerics.check import fail, file_path
 
 if TYPE_CHECKING:  # an extra
@@ -116,7 +116,7 @@ def _kind(path: Path) -> str:
     return kinds[path.suffix.lower()]
 
 
-def _texts(dataset: "xr.Dataset") -> list[tuple[Any, "xr.DataArray"]]:
+def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
     """The coordinates that are names."""
     return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
 

@@ -1,7 +1,7 @@
 """Filters of one kind run side by side: stacked along axes of filters and nodes, and vmapped."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -59,8 +59,8 @@ class Alike(eqx.Module):
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
 
     def matrices(
-        self, read: Callable[..., Any], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
-    ) -> Any:
+        self, read: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
+    ) -> PyTree:
         """What `read` gives of this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))

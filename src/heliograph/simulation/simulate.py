@@ -1,8 +1,8 @@
-"""The one scan: it simulates the world, feeds every filter, and serves Monte Carlo runs and recordings alike."""
+"""Monte Carlo: the world and every filter in it, simulated run by run in blocks."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal, get_args, overload
+from typing import Literal, get_args, overload
 
 import equinox as eqx
 import jax
@@ -11,23 +11,19 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import at
-from heliograph.model.plant import AbstractPlant, AnyPlant
-from heliograph.numerics.angle import wrapped
-from heliograph.numerics.check import array, check_count, check_seed, check_times, fail, instance, shown, table
+from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import large_program
-from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
-from heliograph.simulation.air import AbstractAir, air_of
+from heliograph.simulation.air import air_of
 from heliograph.simulation.by_run import trajectories
-from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
+from heliograph.simulation.given import inputs_of, key_of
 from heliograph.simulation.lanes import BLOCK, Lanes
 from heliograph.simulation.network import Network, lowered
-from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories
-from heliograph.simulation.smoothed import Beside, Smoother, found_record, one_run, smoothed_part
+from heliograph.simulation.record import Record
+from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories
+from heliograph.simulation.smoothed import Beside, Smoother, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
-from heliograph.simulation.uplinks import Drawn, SentReports
+from heliograph.simulation.world import World
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Progress = Callable[[int, int], None]
@@ -108,18 +104,40 @@ def monte_carlo(
     network.check_horizon(horizon)
     reducer: AbstractReducer[Record] | AbstractReducer[Result] = Trajectories() if keep is None else keep
     instance("keep", reducer, AbstractReducer, "what is kept, such as Statistics()")
-    u = _check_inputs(network, inputs, horizon)
-    base = _key(key)
+    u = inputs_of(network, inputs, horizon)
+    base = key_of(key)
     if not isinstance(precision, str) or precision not in get_args(Precision):
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
-    later = part and part.smoother(filters)
-    both: Beside[Any] = Beside(reducer)
+    both: Beside[PyTree] = Beside(reducer)
     keeper = reducer if part is None else both
-    job = _Job(world, later, u, base, np.asarray(first_run + runs), keeper, single)
+    job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
+    kept = _kept(job, first_run, runs, chunk, progress)
+    told = network.in_single_precision() if single else network
+    if part is not None:
+        claims = lowered(part.claims) if single else part.claims
+        result: Record | Result = both.finished(*kept, told, part._replace(claims=claims))
+        return result
+    return reducer.finish(*kept, told)
+
+
+class _Job(eqx.Module):
+    """What is simulated and smoothed, up to which run, what is kept of it, and whether in single precision."""
+
+    world: World
+    later: Smoother | None
+    inputs: np.ndarray
+    key: jax.Array
+    stop: np.ndarray
+    reducer: AbstractReducer[PyTree]
+    single: bool = eqx.field(static=True)
+
+
+def _kept(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:
+    """What the reducer holds after all runs, and what it collected of them, chunk by chunk."""
     parts = []
     with jax.enable_x64(True):
         lanes = Lanes(
@@ -134,121 +152,7 @@ def monte_carlo(
             parts.append(jax.tree.map(lambda leaf: leaf[: done - begun], lanes.advance(start, blocks)))  # noqa: B023
             if progress is not None:
                 progress(done, runs)
-    kept = lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
-    told = network.in_single_precision() if single else network
-    if part is not None:
-        claims = lowered(part.claims) if single else part.claims
-        result: Record | Result = both.finished(*kept, told, part._replace(claims=claims))
-        return result
-    return reducer.finish(*kept, told)
-
-
-def run(
-    network: Network,
-    measurements: Mapping[str, ArrayLike],
-    inputs: ArrayLike | None = None,
-    time: ArrayLike | None = None,
-    smooth: AbstractSmoothing | None = None,
-    reports: Mapping[str, Mapping[str, SentReports | ArrayLike]] | None = None,
-) -> Record:
-    """Run every filter of the network over recorded measurements.
-
-    measurements: for each node an array (steps, received), NaN where a component did not arrive; what relays heard may
-    be left out, and with it their own filters. inputs: (steps,
-    inputs), the input that led to each row. time: (steps,), kept in the record; 0, 1, ... unless given. smooth: as of
-    `monte_carlo`.
-    reports: of each fusion by `AllReports` and each of its nodes what became of the report that was sent at each step,
-    (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be left out where
-    nothing happens to them by chance.
-
-    Raises:
-        ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
-            filter or fusion that cannot be smoothed.
-    """
-    check_process()
-    instance("network", network, Network, "a Network")
-    network = network.restricted_to(table("measurements", measurements, "arrays of nodes"))
-    steps = len(np.asarray(next(iter(measurements.values()))))
-    if steps == 0:
-        raise fail("measurements", "at least one row", "none")
-    z = {
-        name: _check_measurement(name, measurements[name], steps, node.received) for name, node in network.nodes.items()
-    }
-    network.check_horizon(steps)
-    u = _check_inputs(network, inputs, steps)
-    clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
-    grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
-    part = None if smooth is None else smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, part and part.kinds)
-    with jax.enable_x64(True):
-        given = {} if reports is None else table("reports", reports, "reports by fusion")
-        arrivals = {
-            name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
-            for name, item in filters.reporting.items()
-        }
-        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u, arrivals))
-    return found_record(network, part, found, clock)
-
-
-@large_program
-def _run_filters(
-    filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
-) -> PyTree:
-    def body(states: PyTree, row: tuple[Any, ...]) -> tuple[PyTree, PyTree]:
-        k, u_k, z_k, drawn = row
-        return filters.step(states, z_k, u_k, k, drawn)
-
-    rows = jnp.arange(len(u)), u, z, arrivals
-    found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
-    return found if later is None else one_run(later.both, found)
-
-
-class World(eqx.Module):
-    """A network as it is simulated: the plant, what is between it and the nodes, and all filters."""
-
-    plant: AnyPlant
-    air: AbstractAir
-    filters: AllFilters
-
-    def init(self, key: jax.Array) -> PyTree:
-        """Before the first step of the run with this key."""
-        x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
-        return x, self.air.init(key), self.filters.init()
-
-    def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        """After step k with the input u, and what there is to see of it: truth (n,), measurements, estimates."""
-        (x, air, states), (k, u) = carry, row
-        plant = at(self.plant, k)
-        x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
-        air, z = self.air.hear(air, x, u, key, k)
-        drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
-        states, found = self.filters.step(states, z, u, k, drawn)
-        after = x, self.air.told(air, found["estimates"]), states
-        return after, {"truth": x, "measurements": z, **_near(plant, x, found)}
-
-
-def _near(plant: AbstractPlant, x: jax.Array, found: dict[str, PyTree]) -> dict[str, PyTree]:
-    """What was estimated, angles within half a turn of the truth: then x - xhat is the error, whoever subtracts."""
-    if not plant.circular:
-        return found
-
-    def near(one: Estimate) -> Estimate:
-        return Estimate(plant.near(jnp.asarray(one.mean), x), one.covariance, one.claim)
-
-    each = {key: found[key] for key in ("estimates", "fused")}
-    return {**found, **jax.tree.map(near, each, is_leaf=lambda leaf: isinstance(leaf, Estimate))}
-
-
-class _Job(eqx.Module):
-    """What is simulated and smoothed, up to which run, what is kept of it, and whether in single precision."""
-
-    world: World
-    later: Smoother | None
-    inputs: Any
-    key: jax.Array
-    stop: np.ndarray
-    reducer: AbstractReducer[Any]
-    single: bool = eqx.field(static=True)
+    return lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
 @large_program
@@ -258,11 +162,11 @@ def _initial(job: _Job) -> PyTree:
 
 
 @partial(large_program, donate="all-except-first")
-def _lane(todo: tuple[_Job, Any], carry: PyTree) -> tuple[PyTree, PyTree]:
+def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
     return _blocks(*todo, carry)
 
 
-def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
+def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
     """Blocks one after another. Their width never changes, nor the order of sums: so chunks do not change a bit."""
 
     def body(carry: PyTree, runs: jax.Array) -> tuple[PyTree, PyTree]:
@@ -272,7 +176,7 @@ def _blocks(job: _Job, blocks: Any, carry: PyTree) -> tuple[PyTree, PyTree]:
 
 
 @large_program
-def _all_lanes(job: _Job, blocks: Any, carries: PyTree) -> tuple[PyTree, PyTree]:
+def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)
     return result
@@ -288,11 +192,11 @@ def _block(job: _Job, runs: jax.Array) -> PyTree:
     return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
 
 
-def _single(leaf: Any) -> Any:
+def _single(leaf: PyTree) -> PyTree:
     return leaf.astype(np.float32) if eqx.is_inexact_array(leaf) else leaf
 
 
-def _simulated(world: World, later: Smoother | None, u: Any, key: jax.Array, runs: jax.Array) -> PyTree:
+def _simulated(world: World, later: Smoother | None, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
     found = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
     return found if later is None else later.both(found)
@@ -300,26 +204,3 @@ def _simulated(world: World, later: Smoother | None, u: Any, key: jax.Array, run
 
 # Traced once, for its shapes and for the program alike: tracing is half of what a first call takes.
 _trajectories: Callable[..., PyTree] = eqx.filter_jit(_simulated, inline=True)  # type: ignore[call-overload]
-
-
-def _key(key: object) -> jax.Array:
-    """A key from a seed, or as it is given."""
-    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
-        return key
-    if isinstance(key, jax.Array | np.ndarray):
-        raise fail("key", "a seed, or one key of jax.random.key", f"an array of {key.dtype} of shape {key.shape}")
-    return jax.random.key(check_seed("key", key))
-
-
-def _check_inputs(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
-    count = len(network.inputs)
-    if inputs is None and count:
-        raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
-    return np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
-
-
-def _check_measurement(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
-    flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
-    shape = (steps,) if flat else (steps, received)
-    result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
-    return result[:, None] if flat else result

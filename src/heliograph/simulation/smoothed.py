@@ -21,7 +21,8 @@ from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_run import each_run
 from heliograph.simulation.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
-from heliograph.simulation.record import AbstractReducer, Record, Result, Trajectories, trajectories_record
+from heliograph.simulation.record import Record
+from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories, trajectories_record
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing

@@ -11,7 +11,7 @@ from scipy.special import stdtrit
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance, items
 from heliograph.numerics.readable import readable
-from heliograph.simulation.record import Uplink
+from heliograph.simulation.uplinks import Uplink
 
 BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
 

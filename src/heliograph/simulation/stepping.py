@@ -15,6 +15,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plan import Plan
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
+from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import large_program
@@ -135,11 +136,8 @@ class AllFilters(eqx.Module):
             uplinks |= traffic
         learned = []
         for centre, state in zip(self.centres, known, strict=True):
-            parts = [
-                self.alike[i].matrices(centre.read, own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
-            ]
-            state, found = centre.step(state, parts, [estimates[i].mean[f] for i, f in centre.sources], u, k)
-            learned.append(state)
+            following, found = self._centred(centre, state, own, z, estimates, u, k)
+            learned.append(following)
             fused |= found
         told, reports = {}, {}
         for name, link in self.reporting.items():
@@ -153,6 +151,23 @@ class AllFilters(eqx.Module):
             result["retained"] = tuple(one.retained for _, one in results)
             result["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
         return following, result
+
+    def _centred(
+        self,
+        centre: Centre | LinearisedCentre,
+        state: PyTree,
+        own: PyTree,
+        z: Sequence[jax.Array],
+        estimates: Sequence[Estimate],
+        u: jax.Array,
+        k: jax.Array,
+    ) -> tuple[PyTree, dict[str, Estimate]]:
+        """A centre's step, which reads the matrices of its sources' steps before they are taken."""
+        parts = [
+            self.alike[i].matrices(centre.read, own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
+        ]
+        means = [jnp.asarray(estimates[i].mean)[f] for i, f in centre.sources]
+        return centre.step(state, parts, means, u, k)
 
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -69,7 +69,7 @@ class RelayTree:
 
 def relay_tree(
     plant: AnyPlant,
-    node: Callable[[Any], Node],
+    node: Callable[[PyTree], Node],
     numbers: PyTree,
     degree: int,
     horizon: int,
@@ -123,7 +123,7 @@ class Level(NamedTuple):
 
 @large_program
 def _followed(
-    leaf: tuple[AnyPlant, str, Callable[[Any], Node], int], numbers: PyTree, u: np.ndarray
+    leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
 ) -> tuple[Array, Array, Level]:
     """Leaves of one block: covariances of their errors, the weights of the relays above, and these as nodes."""
     plant, name, node, degree = leaf

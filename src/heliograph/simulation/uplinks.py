@@ -1,6 +1,7 @@
 """The uplinks of a fusion that hears reports: what a node sends is quantized, drawn into the air, and may be late."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -216,3 +217,25 @@ def _links(told: Sequence[Any], received: Sequence[int], error: np.ndarray) -> L
     offset = np.stack([np.pad(one.offset, a) for one, a in zip(told, more, strict=True)])
     spread = [np.pad(one.nominal.center, (a, a, (0, 0), (0, 0))) for one, a in zip(told, more, strict=True)]
     return Links(gain, offset, np.stack(spread), error)
+
+
+@readable
+@dataclass(frozen=True)
+class Uplink:
+    """What a fusion's quantizers did to the estimates of `nodes`, by component.
+
+    saturated, whether a component was out of reach, and symbols, how many were sent for it: (run, time, node, n) in a
+    record; in statistics their means over the runs, (time, node, n).
+    """
+
+    nodes: tuple[str, ...]
+    saturated: np.ndarray
+    symbols: np.ndarray
+
+    def saturated_share(self) -> dict[str, float]:
+        """Share of the samples (runs, steps and components) that were out of reach, by node."""
+        return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
+
+    def symbols_per_value(self) -> float:
+        """Mean number of symbols that one component of one estimate took."""
+        return float(self.symbols.mean())

@@ -1,6 +1,6 @@
 """Sweeps over what a filter retained of one run: back from its end, back over a lag, or ahead with one state."""
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -93,7 +93,7 @@ def _back(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
         found = step.told(moments)
         return jnp.asarray(found.mean), jnp.asarray(found.covariance)
 
-    def body(carry: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, Any]:
+    def body(carry: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, PyTree]:
         (later, known), (before, step) = carry, item
         earlier = step.back(later, before.mean, before.covariance)
         moments = step.before(before, earlier, known)
@@ -132,7 +132,7 @@ def carried_ahead(steps: AbstractRetained, step: int) -> Estimate:
     """The state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
-    def body(point: Point, item: Any) -> tuple[Point, Moments]:
+    def body(point: Point, item: PyTree) -> tuple[Point, Moments]:
         after = item.ahead(point)
         return after, Moments(after.mean, after.covariance)
 

@@ -5,9 +5,7 @@ from pathlib import Path
 
 from heliograph.examples.delays.compute import RUNS, STAGES, Outcome, Score, compute, trap
 from heliograph.examples.delays.setting import CLOCK_STEPS, STEPS
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "delays"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -17,16 +15,14 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: the extra `report` is not installed.
     """
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, seed), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "delays", STAGES, partial(compute, seed), results)
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.delays.page import delay_figures, delay_page
 
-    return Results(delay_figures(outcome), partial(delay_page, outcome), summary(outcome), lambda folder: None)
+    return Results(delay_figures(outcome), partial(delay_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.examples.demo import robot
+from heliograph.examples.demo.learned import Learned
 from heliograph.examples.demo.recording import PlazaRecording
+from heliograph.examples.demo.scores import Score, score
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.model.channel import hop, perfect
 from heliograph.model.estimate import Estimate
@@ -19,10 +20,7 @@ from heliograph.random_affine.base import AbstractRandomAffine, apply
 from heliograph.random_affine.second_moments import second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.simulate import run
-
-if TYPE_CHECKING:
-    from heliograph.examples.demo.learned import Learned
+from heliograph.simulation.recorded import run
 
 SEEDS = 5  # seeds of the relay for the spread: the one asked for and those after it
 NAMES = ("relay_aware", "extra_noise", "mean_gain", "perfect_channel", "open_loop")
@@ -35,21 +33,6 @@ TABLE_HEADERS = (
     "RMSE, all seeds",
     "NEES, all seeds",
 )
-INSIDE_95 = -2 * np.log(0.05)  # 95 % point of chi-square with two degrees of freedom
-
-
-@dataclass(frozen=True)
-class Score:
-    """How far off the position is, and whether the filter knew.
-
-    NEES e' B^-1 e / 2 of the 2-D position error e against the claimed covariance B; 1 is honest. claimed_rmse_m:
-    root of the mean trace of B. inside_95: share of rows where the truth lies inside the claimed 95 % ellipse.
-    """
-
-    position_rmse_m: float
-    claimed_rmse_m: float
-    nees_per_dimension: float
-    inside_95: float
 
 
 @dataclass(frozen=True)
@@ -72,7 +55,7 @@ class Outcome:
     recording: PlazaRecording
     extra_variance: float
     trials: list[Trial]
-    learned: "Learned | None" = None
+    learned: Learned | None = None
 
 
 def relay(channel: AbstractRandomAffine, signals: np.ndarray, seed: int) -> np.ndarray:
@@ -116,25 +99,6 @@ def one_trial(recording: PlazaRecording, network: Network, seed: int) -> Trial:
     by_name = {name: e for filters in record.estimates.values() for name, e in filters.items()}
     estimates = {name: by_name[name] for name in NAMES}
     return Trial(seed, received, estimates, {name: score(e, recording.truth) for name, e in estimates.items()})
-
-
-def position_nees(estimate: Estimate, truth: np.ndarray) -> np.ndarray:
-    """e' B^-1 e / 2 of the position at each row, (rows,)."""
-    error = (np.asarray(estimate.mean) - truth)[:, :2, None]
-    weighted = np.linalg.solve(np.asarray(estimate.covariance)[:, :2, :2], error)
-    result: np.ndarray = np.sum(error * weighted, axis=(1, 2)) / 2
-    return result
-
-
-def score(estimate: Estimate, truth: np.ndarray, first: int = 0) -> Score:
-    """Score one filter's estimates of the position, from row `first` on."""
-    estimate = Estimate(np.asarray(estimate.mean)[first:], np.asarray(estimate.covariance)[first:], estimate.claim)
-    truth = truth[first:]
-    nees = position_nees(estimate, truth)
-    squared = np.sum((np.asarray(estimate.mean) - truth)[:, :2] ** 2, axis=1)
-    claimed = np.trace(np.asarray(estimate.covariance)[:, :2, :2], axis1=1, axis2=2)
-    inside = np.mean(2 * nees <= INSIDE_95)
-    return Score(float(np.sqrt(squared.mean())), float(np.sqrt(claimed.mean())), float(nees.mean()), float(inside))
 
 
 def compute(recording: PlazaRecording, seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:

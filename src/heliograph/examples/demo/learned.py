@@ -8,9 +8,10 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import Score, score
 from heliograph.examples.demo.recording import PlazaRecording
+from heliograph.examples.demo.scores import Score, score
 from heliograph.learning import Fit, Row
+from heliograph.learning.free_marks import Kind
 from heliograph.report.results import Json
 
 FIRST_GUESS = robot.Constants(0.0, 1.0, 1.0, 0.02, 1e-5)  # of one who knows nothing but that odometry drifts slowly
@@ -38,8 +39,8 @@ class Learned:
 def direct(drive: robot.Drive) -> hg.Network:
     """The robot whose ranges arrive as they are, with all five constants free."""
     guess = FIRST_GUESS._asdict()
-    kinds = {"gyro_rate": "real", "range_scale": "real"}
-    found = {name: hg.free(value, name, kinds.get(name, "positive")) for name, value in guess.items()}  # type: ignore[arg-type]
+    kinds: dict[str, Kind] = {"gyro_rate": "real", "range_scale": "real"}
+    found = {name: hg.free(value, name, kinds.get(name, "positive")) for name, value in guess.items()}
     return heard_by_one(drive, robot.Constants(**found), hg.perfect(len(drive.beacons)))
 
 

@@ -7,8 +7,9 @@ from matplotlib.figure import Figure
 
 from heliograph.examples.demo import robot
 from heliograph.examples.demo.calibration import CALIBRATED, WINDOW
-from heliograph.examples.demo.compute import NAMES, TABLE_HEADERS, Outcome, position_nees, table_rows
+from heliograph.examples.demo.compute import NAMES, TABLE_HEADERS, Outcome, table_rows
 from heliograph.examples.demo.learned import interval, said
+from heliograph.examples.demo.scores import position_nees
 from heliograph.examples.demo.twin import Design
 from heliograph.report.figures import (
     BLUE,

@@ -12,9 +12,10 @@ import rich.console
 import rich.table
 
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, Score, compute, table_rows
+from heliograph.examples.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, compute, table_rows
 from heliograph.examples.demo.learned import learn, learned_line, learned_summary
 from heliograph.examples.demo.recording import find_recording, read_recording
+from heliograph.examples.demo.scores import Score
 from heliograph.examples.demo.twin import Design, as_it_is, twins
 from heliograph.files.recording import write_estimates
 from heliograph.files.table import write_table

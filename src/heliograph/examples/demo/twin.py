@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.examples.demo import robot
-from heliograph.examples.demo.compute import Score, relay, score
+from heliograph.examples.demo.compute import relay
 from heliograph.examples.demo.recording import PlazaRecording
+from heliograph.examples.demo.scores import Score, score
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.model.centred import centred
 from heliograph.model.channel import amplify_and_forward, hop, parallel
@@ -18,7 +19,7 @@ from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.simulate import run
+from heliograph.simulation.recorded import run
 
 DESIGNS = {"centred": 1.0, "centred_thousandth": 1e-3}  # by what the sensor's power is multiplied
 
@@ -74,11 +75,10 @@ def twins(
 ) -> dict[str, Design]:
     """Each of DESIGNS, with a cubature filter that knows its relays."""
     drive = robot.DRIVES[recording.name]
-    model, reference = robot.network_of(drive), at_start(drive)
-    sensor = model.nodes["robot"].sensor  # type: ignore[union-attr]
+    (plant, sensor), reference = robot.model(drive, robot.Constants(drive.gyro_rate)), at_start(drive)
     channels = {name: channel_less(reference, power) for name, power in DESIGNS.items()}
-    filters = {name: {name: cubature_filter(model.plant, sensor, channel)} for name, channel in channels.items()}
-    network = Network(model.plant, {name: Node(sensor, channels[name], filters[name]) for name in DESIGNS})
+    filters = {name: {name: cubature_filter(plant, sensor, channel)} for name, channel in channels.items()}
+    network = Network(plant, {name: Node(sensor, channels[name], filters[name]) for name in DESIGNS})
     found: dict[str, list[Score]] = {name: [] for name in DESIGNS}
     for seed in seeds:
         advance(f"designed relays, seed {seed}")

@@ -7,9 +7,7 @@ from pathlib import Path
 from heliograph.examples.demo.recording import find_recording
 from heliograph.examples.late_data.compute import STAGES, Outcome, Through, compute
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "late-data"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0, trace: Path | None = None) -> None:
@@ -22,17 +20,15 @@ def example(out: Path, seed: int = 0, trace: Path | None = None) -> None:
         ModuleNotFoundError: an extra of `recordings`, `report` is not installed.
     """
     find_recording()  # a missing extra is told before the work starts
-    target = Path(out) / NAME
     work = partial(compute, check_seed("seed", seed), None if trace is None else Path(trace))
-    write_results(target, STAGES, work, results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "late-data", STAGES, work, results)
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.late_data.page import late_data_figures, late_data_page
 
-    return Results(late_data_figures(outcome), partial(late_data_page, outcome), summary(outcome), lambda folder: None)
+    return Results(late_data_figures(outcome), partial(late_data_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

@@ -1,6 +1,5 @@
 """How often intervals cover the truth: recordings in batches, each kept, so that a run can be taken up again."""
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache, partial
@@ -10,8 +9,8 @@ from typing import TypedDict
 import numpy as np
 
 import heliograph as hg
+from heliograph.examples.learning.parts import kept
 from heliograph.examples.learning.setting import METHODS, ROWS, Row, learned, square_wave, true_values, world
-from heliograph.files.whole_file import whole_file
 from heliograph.learning.many import fit_each
 
 BATCH = 64
@@ -44,7 +43,7 @@ def compute(parts: Path, seed: int, batches: int, advance: Callable[[str], None]
             key = f"{row.name}.{row.form}"
             advance(f"{key}: recordings {batch * BATCH + 1} to {(batch + 1) * BATCH}")
             found.setdefault(key, []).append(
-                _kept(parts / f"{key}.{seed}.{batch}.json", partial(counts, row, seed, batch))
+                kept(parts / f"{key}.{seed}.{batch}.json", partial(counts, row, seed, batch))
             )
     return {key: pooled(each) for key, each in found.items()}
 
@@ -78,14 +77,3 @@ def pooled(batches: list[Counts]) -> Coverage:
         for method, each in batches[0]["covered"].items()
     }
     return Coverage(recordings, 1 - inside / recordings, covered)
-
-
-def _kept(path: Path, work: Callable[[], Counts]) -> Counts:
-    """What was counted before, or is now."""
-    if path.exists():
-        kept: Counts = json.loads(path.read_text(encoding="utf-8"))
-        return kept
-    found = work()
-    with whole_file(path) as partial_file:
-        partial_file.write_text(json.dumps(found), encoding="utf-8")
-    return found

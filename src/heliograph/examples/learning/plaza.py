@@ -1,6 +1,5 @@
 """What learning gives on a recorded drive, Plaza2: direct ranges, and relayed ones for several seeds of the relay."""
 
-import json
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -12,7 +11,7 @@ from heliograph.examples.demo import robot
 from heliograph.examples.demo.compute import networks, one_trial, relay
 from heliograph.examples.demo.learned import direct, fitted, judged, learn, learned_summary, parameters, relayed
 from heliograph.examples.demo.recording import PlazaRecording, read_recording
-from heliograph.files.whole_file import whole_file
+from heliograph.examples.learning.parts import kept
 from heliograph.report.results import Json
 
 if TYPE_CHECKING:
@@ -31,11 +30,12 @@ def plaza(parts: Path, advance: Callable[[str], None]) -> Numbers:
     """
     parts.mkdir(parents=True, exist_ok=True)
     recording = read_recording()
-    own = _kept(parts / "plaza.direct.json", partial(of_direct, recording), "direct ranges", advance)
-    each = [
-        _kept(parts / f"plaza.relayed.{seed}.json", partial(of_relayed, recording, seed), f"relay {seed}", advance)
-        for seed in range(SEEDS)
-    ]
+    advance("learning from direct ranges")
+    own = kept(parts / "plaza.direct.json", partial(of_direct, recording))
+    each = []
+    for seed in range(SEEDS):
+        advance(f"learning from relay {seed}")
+        each.append(kept(parts / f"plaza.relayed.{seed}.json", partial(of_relayed, recording, seed)))
     return {"direct": own, "relayed": {name: [one[name] for one in each] for name in each[0]}}
 
 
@@ -89,15 +89,3 @@ def plaza_section(found: Numbers) -> "Section":
         "those that were calibrated by the true path. Behind the relay the gain's variance is learned as well."
     )
     return Section("On a recorded drive", [Table(["ranges", "learned", "calibrated"], rows, caption)])
-
-
-def _kept(path: Path, work: Callable[[], Numbers], what: str, advance: Callable[[str], None]) -> Numbers:
-    """What was found before, or is now."""
-    advance(f"learning from {what}")
-    if path.exists():
-        kept: Numbers = json.loads(path.read_text(encoding="utf-8"))
-        return kept
-    found = work()
-    with whole_file(path) as partial_file:
-        partial_file.write_text(json.dumps(found), encoding="utf-8")
-    return found

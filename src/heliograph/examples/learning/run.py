@@ -10,12 +10,11 @@ from heliograph.examples.demo.recording import find_recording
 from heliograph.examples.learning.compute import BATCH, BATCHES, Coverage, compute
 from heliograph.examples.learning.plaza import PIECES, Numbers, plaza, plaza_section
 from heliograph.examples.learning.setting import ROWS
-from heliograph.report.results import Json, Results, write_results
+from heliograph.report.results import Json, Results, report_results
 
 if TYPE_CHECKING:
     from heliograph.report.page import Page
 
-NAME = "learning"
 PARTS = "learning.parts"  # what is counted so far, beside the results
 
 
@@ -36,10 +35,8 @@ def example(out: Path, seed: int = 0, batches: int = BATCHES) -> None:
         ModuleNotFoundError: an extra of `recordings`, `report` is not installed.
     """
     find_recording()  # a missing extra is told before the work starts
-    target = Path(out) / NAME
     stages = batches * len(ROWS) + PIECES
-    write_results(target, stages, partial(work, Path(out) / PARTS, seed, batches), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "learning", stages, partial(work, Path(out) / PARTS, seed, batches), results)
 
 
 def work(parts: Path, seed: int, batches: int, advance: Callable[[str], None]) -> Outcome:
@@ -58,7 +55,7 @@ def results(outcome: Outcome) -> Results:
         own = learning_page(coverage, drawings)
         return replace(own, sections=[*own.sections[:-1], plaza_section(drive), own.sections[-1]])
 
-    return Results(learning_figures(coverage), page, {**summary(coverage), "plaza": drive}, lambda folder: None)
+    return Results(learning_figures(coverage), page, {**summary(coverage), "plaza": drive})
 
 
 def summary(coverage: dict[str, Coverage]) -> dict[str, Json]:

@@ -4,9 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from heliograph.examples.links_with_memory.compute import RUNS, STAGES, STEPS, Outcome, Score, compute
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "links-with-memory"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -16,16 +14,14 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: the extra `report` is not installed.
     """
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, seed), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "links-with-memory", STAGES, partial(compute, seed), results)
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.links_with_memory.page import memory_figures, memory_page
 
-    return Results(memory_figures(outcome), partial(memory_page, outcome), summary(outcome), lambda folder: None)
+    return Results(memory_figures(outcome), partial(memory_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 from heliograph.examples.demo.recording import find_recording
 from heliograph.examples.live.server import find_server
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
+from heliograph.report.progress import Advance
+from heliograph.report.results import Json, Results, report_results
 
 if TYPE_CHECKING:  # extras that are missing are told by `example`, in one line
     from heliograph.examples.live.compute import Outcome
 
-NAME = "live"
 NEEDS = ("nats", "paho", "prometheus_client", "pydantic", "sqlalchemy", "starlette", "uvicorn")
 STAGES = 7
 
@@ -26,12 +26,10 @@ def example(out: Path, seed: int = 0) -> None:
     """
     find_recording()  # what is missing is told before the work starts
     find_server()
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(_compute, check_seed("seed", seed)), results, NEEDS)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "live", STAGES, partial(_compute, check_seed("seed", seed)), results, NEEDS)
 
 
-def _compute(seed: int, advance):  # type: ignore[no-untyped-def]
+def _compute(seed: int, advance: Advance) -> "Outcome":
     from heliograph.examples.live.compute import compute
 
     return compute(seed, advance)

@@ -15,9 +15,7 @@ from heliograph.examples.motor_drive.compute import (
     compute,
 )
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "motor-drive"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -28,16 +26,14 @@ def example(out: Path, seed: int = 0) -> None:
         ModuleNotFoundError: the extra `motor` or `report` is not installed.
     """
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, SEEDS, seed), results, ("gym_electric_motor",))
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "motor-drive", STAGES, partial(compute, SEEDS, seed), results, ("gym_electric_motor",))
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.motor_drive.page import motor_figures, motor_page
 
-    return Results(motor_figures(outcome), partial(motor_page, outcome), summary(outcome), lambda folder: None)
+    return Results(motor_figures(outcome), partial(motor_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

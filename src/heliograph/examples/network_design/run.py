@@ -7,9 +7,7 @@ from heliograph.examples.demo.recording import find_recording
 from heliograph.examples.demo.run import numbers
 from heliograph.examples.network_design.compute import SEEDS, STAGES, Case, Outcome, compute, path_powers
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "network-design"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -21,21 +19,18 @@ def example(out: Path, seed: int = 0) -> None:
     """
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     find_recording()  # a missing extra is told before the work starts
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, seed), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "network-design", STAGES, partial(compute, seed), results)
 
 
 def results(outcome: Outcome) -> Results:
     """Everything that the folder holds."""
     from heliograph.examples.network_design.page import design_figures, design_page
 
-    return Results(design_figures(outcome), partial(design_page, outcome), summary(outcome), lambda folder: None)
+    return Results(design_figures(outcome), partial(design_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:
     """Errors, powers and bounds by case."""
-    schedule, bursts = outcome.schedule, outcome.bursts
     return {
         "one_hop": {
             f"{total:g}": {**_case(one), "gap": one.best.certificate.gap} for total, one in outcome.one_hop.items()
@@ -57,21 +52,7 @@ def summary(outcome: Outcome) -> dict[str, Json]:
             "power_saved_percent": outcome.circuit.power_saved_percent,
         },
         "packets": {f"{times:g}": dict(saved) for times, saved in outcome.packets.items()},
-        "schedules": {
-            "by_period": {str(period): error for period, error in schedule.by_period.items()},
-            "steps": [list(step) for step in schedule.steps],
-            "error": schedule.error,
-            "bound": schedule.bound,
-            "greedy": schedule.greedy,
-            "bursts": {
-                "errors": {str(every): error for every, error in bursts.errors.items()},
-                "every": bursts.every, "error": bursts.error, "bound": bursts.bound,
-            },
-            "sensors": {
-                str(count): {"chosen": list(one.chosen), "error": one.error, "bound": one.bound}
-                for count, one in outcome.sensors.items()
-            },
-        },
+        "schedules": _schedules(outcome),
         "sites": {
             f"{rho:g}": {
                 "one_relay": {
@@ -80,6 +61,25 @@ def summary(outcome: Outcome) -> dict[str, Json]:
                 "with_fading": {"relays": len(best.lengths) - 1, "noise": best.noise, "direct": best.direct},
             }
             for rho, (one, best) in outcome.lines.items()
+        },
+    }  # fmt: skip
+
+
+def _schedules(outcome: Outcome) -> dict[str, Json]:
+    schedule, bursts = outcome.schedule, outcome.bursts
+    return {
+        "by_period": {str(period): error for period, error in schedule.by_period.items()},
+        "steps": [list(step) for step in schedule.steps],
+        "error": schedule.error,
+        "bound": schedule.bound,
+        "greedy": schedule.greedy,
+        "bursts": {
+            "errors": {str(every): error for every, error in bursts.errors.items()},
+            "every": bursts.every, "error": bursts.error, "bound": bursts.bound,
+        },
+        "sensors": {
+            str(count): {"chosen": list(one.chosen), "error": one.error, "bound": one.bound}
+            for count, one in outcome.sensors.items()
         },
     }  # fmt: skip
 

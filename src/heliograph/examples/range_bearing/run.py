@@ -6,9 +6,7 @@ from pathlib import Path
 
 from heliograph.examples.range_bearing.compute import FADING_RUNS, RUNS, STAGES, Outcome, compute
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "range-bearing"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -18,9 +16,7 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: the extra `report` is not installed.
     """
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, check_seed("seed", seed)), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "range-bearing", STAGES, partial(compute, check_seed("seed", seed)), results)
 
 
 def results(outcome: Outcome) -> Results:
@@ -28,7 +24,7 @@ def results(outcome: Outcome) -> Results:
     from heliograph.examples.range_bearing.page import range_bearing_figures, range_bearing_page
 
     figures = range_bearing_figures(outcome)
-    return Results(figures, partial(range_bearing_page, outcome), summary(outcome), lambda folder: None)
+    return Results(figures, partial(range_bearing_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

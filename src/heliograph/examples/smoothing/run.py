@@ -7,9 +7,7 @@ import numpy as np
 
 from heliograph.examples.smoothing.compute import LAG_STEP, SHOWN, STAGES, Outcome, compute
 from heliograph.numerics.check import check_seed
-from heliograph.report.results import Json, Results, write_results
-
-NAME = "smoothing"
+from heliograph.report.results import Json, Results, report_results
 
 
 def example(out: Path, seed: int = 0) -> None:
@@ -19,9 +17,7 @@ def example(out: Path, seed: int = 0) -> None:
         ValueError: a folder that cannot be written, or one that holds something else.
         ModuleNotFoundError: the extra `report` is not installed.
     """
-    target = Path(out) / NAME
-    write_results(target, STAGES, partial(compute, check_seed("seed", seed)), results)
-    print(f"Report: {target / 'report.html'}")
+    report_results(Path(out) / "smoothing", STAGES, partial(compute, check_seed("seed", seed)), results)
 
 
 def results(outcome: Outcome) -> Results:
@@ -29,7 +25,7 @@ def results(outcome: Outcome) -> Results:
     from heliograph.examples.smoothing.page import smoothing_figures, smoothing_page
 
     figures = smoothing_figures(outcome)
-    return Results(figures, partial(smoothing_page, outcome), summary(outcome), lambda folder: None)
+    return Results(figures, partial(smoothing_page, outcome), summary(outcome))
 
 
 def summary(outcome: Outcome) -> dict[str, Json]:

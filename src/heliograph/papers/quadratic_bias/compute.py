@@ -26,7 +26,8 @@ from heliograph.papers.quadratic_bias.bounds import Boundedness, boundedness
 from heliograph.papers.quadratic_bias.printed import Printed, printed_quadratic
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.record import AbstractReducer, Record, trajectories_record
+from heliograph.simulation.record import Record
+from heliograph.simulation.reducer import AbstractReducer, trajectories_record
 from heliograph.simulation.simulate import monte_carlo
 from heliograph.simulation.statistics import ErrorStatistics
 from heliograph.simulation.sums import Statistics

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from matplotlib.figure import Figure
 
-from heliograph.files.quoting import FORMULA, from_cell, in_cell, in_figure, visible
+from heliograph.disk.quoting import FORMULA, from_cell, in_cell, in_figure, visible
 
 matplotlib.use("agg")
 

@@ -9,8 +9,9 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.centre import Centre
 from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.linear import LinearFilter, OpenLoop
+from heliograph.filters.linear import LinearFilter
 from heliograph.filters.mixture import Components, MixtureFilter
+from heliograph.filters.open_loop import OpenLoop
 from heliograph.filters.polynomial import PolynomialFilter
 from heliograph.filters.prediction import PredictionFilter
 from heliograph.filters.scheduled import LinearSystemFilter

@@ -16,11 +16,12 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.second_moments import SecondOrder, second_order
+from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, second_order
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.rescaling import Units, rescaled, rescaled_channel
-from heliograph.simulation.simulate import monte_carlo, run
+from heliograph.simulation.recorded import run
+from heliograph.simulation.simulate import monte_carlo
+from heliograph.testing.rescaling import Units, rescaled, rescaled_channel
 
 DECADES = 9  # factors from 1e-9 to 1e9
 DIGITS = 1e-8  # of each component's own scale
@@ -136,14 +137,17 @@ def _node(name: str, network: Network, units: Units) -> Node:
 def _apart(a: SecondOrder, b: SecondOrder) -> float:
     """Largest difference of two descriptions, of each entry's own scale: two reaches of z_i times two of y_a."""
     each: list[Callable[[SecondOrder], np.ndarray]] = [
-        lambda d, part=part: np.asarray(getattr(d, part).center + getattr(d, part).radius)  # type: ignore[misc]
-        for part in ("spread", "shift", "power", "nominal")
-    ]
+        lambda d: _ends(d.spread), lambda d: _ends(d.shift), lambda d: _ends(d.power), lambda d: _ends(d.nominal)
+    ]  # fmt: skip
     power = np.einsum("iiaa->ia", np.abs(each[0](a)) + np.abs(each[2](a)))
     reach = np.sqrt(power + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
     size = np.einsum("ia,jb->ijab", reach, reach)
     size = size + size.swapaxes(2, 3)
     return max(float(np.max(np.abs(one(a) - one(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for one in each)
+
+
+def _ends(part: QuadraticMap) -> np.ndarray:
+    return np.asarray(part.center + part.radius)
 
 
 def _fused(name: str, item: Fusion | AbstractFilter, units: Units) -> Fusion | AbstractFilter:

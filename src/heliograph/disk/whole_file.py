@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from glob import escape as glob_escape
 from pathlib import Path
 
-from heliograph.files.durable import naming, replace
+from heliograph.disk.durable import naming, replace
 
 
 @contextmanager

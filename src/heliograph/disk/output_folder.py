@@ -8,9 +8,9 @@ from contextlib import contextmanager, suppress
 from glob import escape as glob_escape
 from pathlib import Path
 
-from heliograph.files.durable import naming, sync, sync_tree
-from heliograph.files.holding import LOCK, held
-from heliograph.files.table import check_output_folder
+from heliograph.disk.durable import naming, sync, sync_tree
+from heliograph.disk.holding import LOCK, held
+from heliograph.disk.output_file import check_output_folder
 from heliograph.numerics.check import fail
 
 

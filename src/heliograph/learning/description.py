@@ -1,0 +1,69 @@
+"""The network that a function returns, built again with other numbers where some are free."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.learning.free_marks import Asking, Build, Given, reading
+from heliograph.learning.parameters import Parameters, plain_number
+from heliograph.numerics.check import fail, function, instance, shown_error
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Float
+from heliograph.simulation.network import Network
+
+
+@readable
+@dataclass(frozen=True)
+class Description:
+    """A function that returns a network, and what is free in it; `named`: which names are the user's."""
+
+    build: Build
+    parameters: Parameters
+    named: tuple[bool, ...]
+
+    def at(self, values: Mapping[str, Any]) -> Network:
+        """The network with these values."""
+        with reading(Given(self.parameters, self.named, values)), jax.enable_x64(True):
+            try:
+                return checked(self.build())
+            except (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError) as error:
+                expected = "free numbers that only jax.numpy computes with, so that derivatives pass"
+                got = f"one that is read: {shown_error(error)}"
+                raise fail("network to be learned", expected, got) from error
+
+    @cached_property
+    def start(self) -> Network:
+        """The network at its starts."""
+        return self.at({one.name: plain_number(one.start) for one in self.parameters.every})
+
+    def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
+        """The network at a point of the line, of plain numbers."""
+        return self.at(self.parameters.known(x))
+
+
+def describe(network: Build) -> Description:
+    """What is free in the network that a function returns.
+
+    Raises:
+        ValueError: no function, one that returns no network, or nothing free.
+    """
+    if isinstance(network, Network):
+        expected = "a function that returns it with hg.free(...) in it, so that it can be built with other numbers"
+        raise fail("network to be learned", expected, "a Network")
+    function("network to be learned", network, "nothing that returns a Network")
+    asking = Asking()
+    with reading(asking), jax.enable_x64(True):
+        checked(network())
+    if not asking.marks:
+        raise fail("network to be learned", "at least one number marked by hg.free(start)", "none")
+    parameters = asking.parameters()
+    return Description(network, parameters, tuple(mark.given is not None for mark in asking.marks))
+
+
+def checked(network: object) -> Network:
+    """What the function returned."""
+    return instance("network to be learned", network, Network, "a function that returns a Network")

@@ -1,0 +1,144 @@
+"""Marks on the numbers of a network that are free: collected where they stand, and answered with values."""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Literal, Protocol, get_args
+
+import numpy as np
+
+from heliograph.learning.parameters import Parameter, Parameters
+from heliograph.learning.transforms import to_line
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
+from heliograph.numerics.types import ArrayLike
+from heliograph.simulation.network import Network
+
+Kind = Literal["real", "positive", "probability", "simplex", "covariance"]
+Build = Callable[[], Network]
+
+DOMAINS: dict[Kind, Domain] = {
+    "real": REAL,
+    "positive": POSITIVE,
+    "probability": PROBABILITY,
+    "simplex": SIMPLEX,
+    "covariance": COVARIANCE,
+}
+
+
+def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) -> Any:
+    """Mark a number of a network as one to be learned, from `start`; it stands wherever the number itself would.
+
+    `hg.hop(hg.Rayleigh(hg.free(0.8, "fading")), noise=hg.free(0.3))`, inside a function that returns the network and
+    that `hg.fit` calls. One name in several places is one number. Where it stands says what it is: a variance and a
+    scale stay positive, a probability between 0 and 1, probabilities sum to 1, a covariance matrix stays one; a gain,
+    an entry of a matrix, a number in a function of your own may be any, unless `kind` says otherwise. Without a name it
+    is called after its place. Anywhere else than in a fit it is its start.
+
+    Shapes: start () or of any shape; kind "simplex" sums over the last axis.
+
+    Raises:
+        ValueError: a start that is no number, or an unknown kind.
+    """
+    if kind is not None and kind not in get_args(Kind):
+        raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", shown(kind))
+    if name is not None and (not isinstance(name, str) or not name):
+        raise fail("name of a free number", "a text", shown(name))
+    what = "free number" if name is None else name
+    value = array(f"start of {what}", start, (None,) * np.ndim(np.asarray(start)))
+    reader = _reader.get()
+    return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
+
+
+class _Reader(Protocol):
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any: ...
+
+
+# What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
+_reader: ContextVar[_Reader | None] = ContextVar("reader of free numbers", default=None)
+
+
+@contextmanager
+def reading(reader: _Reader) -> Iterator[None]:
+    """Inside, `free` answers as this reader does."""
+    token = _reader.set(reader)
+    try:
+        yield
+    finally:
+        _reader.reset(token)
+
+
+class _Mark:
+    """A free number while it is being asked for."""
+
+    def __init__(self, start: np.ndarray, name: str | None, kind: Kind | None):
+        self.start, self.given, self.place = start, name, ""
+        self.domain = None if kind is None else DOMAINS[kind]
+        self.explicit = kind is not None
+
+    def told(self, name: str, domain: Domain) -> None:
+        """A check says what it is: the narrowest holds."""
+        self.place = self.place or name
+        if self.explicit:
+            return
+        known = REAL if self.domain is None else self.domain
+        if known.kind == domain.kind == "interval":
+            domain = Domain(low=max(known.low, domain.low), high=min(known.high, domain.high))
+        elif domain == REAL:
+            domain = known
+        self.domain = domain
+
+
+class Asking:
+    """Collects what is free."""
+
+    def __init__(self) -> None:
+        self.marks: list[_Mark] = []
+
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
+        """The start, which learns what it is for."""
+        for mark in self.marks:
+            if name is not None and mark.given == name:
+                if not np.array_equal(mark.start, start):
+                    raise fail(
+                        f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
+                    )
+                return marked(start, mark.told)
+        self.marks.append(_Mark(start, name, kind))
+        return marked(start, self.marks[-1].told)
+
+    def parameters(self) -> Parameters:
+        """All of them; one without a name is called after its place."""
+        taken = {mark.given for mark in self.marks if mark.given is not None}
+        found = []
+        for mark in self.marks:
+            name = mark.given or _new(mark.place or "free number", taken)
+            taken.add(name)
+            domain = REAL if mark.domain is None else mark.domain
+            one = Parameter(name, mark.start, domain)
+            to_line(name, domain, mark.start)
+            found.append(one)
+        return Parameters(tuple(found))
+
+
+class Given:
+    """Puts values in their places: by name, and in the order of asking where no name was given."""
+
+    def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
+        self.values = values
+        self.unnamed = iter([one.name for one, own in zip(parameters.every, named, strict=True) if not own])
+
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
+        """The value."""
+        key = next(self.unnamed, "") if name is None else name
+        if key not in self.values:
+            raise fail(
+                "network", "the same free numbers each time it is built", "another one" if name is None else name
+            )
+        return self.values[key]
+
+
+def _new(name: str, taken: set[str]) -> str:
+    if name not in taken:
+        return name
+    return next(f"{name} {i}" for i in range(2, 10_000) if f"{name} {i}" not in taken)

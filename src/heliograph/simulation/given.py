@@ -1,0 +1,34 @@
+"""What a run is given: its key, its inputs, and what was measured."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.check import array, check_seed, fail
+from heliograph.simulation.network import Network
+
+
+def key_of(key: object) -> jax.Array:
+    """A key from a seed, or as it is given."""
+    if isinstance(key, jax.Array) and jnp.issubdtype(key.dtype, jax.dtypes.prng_key) and key.shape == ():
+        return key
+    if isinstance(key, jax.Array | np.ndarray):
+        raise fail("key", "a seed, or one key of jax.random.key", f"an array of {key.dtype} of shape {key.shape}")
+    return jax.random.key(check_seed("key", key))
+
+
+def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
+    """The plant's inputs (horizon, inputs), which a plant without any does not need."""
+    count = len(network.inputs)
+    if inputs is None and count:
+        raise fail("inputs", f"an array ({horizon}, {count}) of {list(network.inputs)}", "none")
+    return np.zeros((horizon, 0)) if inputs is None else array("inputs", inputs, (horizon, count))
+
+
+def measurement_of(name: str, value: ArrayLike, steps: int, received: int) -> np.ndarray:
+    """What a node received (steps, received), NaN where nothing arrived; (steps,) of one component is taken too."""
+    flat = received == 1 and np.asarray(value, dtype=None if isinstance(value, np.ndarray) else object).ndim == 1
+    shape = (steps,) if flat else (steps, received)
+    result: np.ndarray = array(f"measurements of node {name!r}", value, shape, missing=True)
+    return result[:, None] if flat else result

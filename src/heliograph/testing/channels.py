@@ -1,0 +1,116 @@
+"""What a channel's moments must say: those of its samples."""
+
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.monomials import monomials
+
+FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
+
+
+def check_random_affine(channel: AbstractRandomAffine, seed: int = 0, samples: int = 20_000, highest: int = 4) -> float:
+    """Compare a channel's samples with its joint moments, E[mono_k(z) | y] for k = 1 .. highest, at two points y.
+
+    Returns the largest |z| seen. Wrong moments of size s are found when s exceeds about 6 standard errors, so more
+    samples make it stricter. Of a map with modes two draws are taken one after the other: their moments are compared
+    under the modes' laws, and together E[H_1 x H_2] and E[mono_i(z_1) mono_j(z_2)] for i, j = 1 .. highest / 2, which a
+    wrong transition changes.
+    Of a map that remembers in a way of its own, which has no such moments, only `init` and `draw` are checked: a state
+    that keeps its structure and shapes.
+
+    Raises:
+        AssertionError: a moment that differs from the samples by more than chance, shapes that disagree.
+    """
+    generator = np.random.default_rng(seed)
+    first, second = _drawn(channel, seed, samples)
+    points = [channel.example_input(generator), channel.example_input(generator)]
+    if channel.remembers:
+        if not memories(channel):
+            return 0.0
+        modes = joint_modes(channel, order=-(-highest // 2))
+        now, later = (h[:, :-1] @ np.append(y, 1.0) for h, y in zip((first, second), points, strict=True))
+        worst = _compare_lagged(modes, first[:, :-1], second[:, :-1])
+        return max(worst, _compare_modes(modes, points, now, later, highest))
+    worst = 0.0
+    for y in points:
+        z = first[:, :-1] @ np.append(y, 1.0)
+        for order in range(1, highest + 1):
+            expected = channel.moments(order).expect(monomials(y, order))
+            worst = max(worst, _compare(f"order {order}", expected, _monomials(z, order)))
+    return worst
+
+
+def _compare_lagged(modes: JointModes, now: np.ndarray, later: np.ndarray) -> float:
+    """E[(G, n)_1 x (G, n)_2] of two draws in a row."""
+    means = np.array([m.moments(1).mean[:-1] for m in modes.maps])
+    expected = np.einsum("i,ij,iab,jcd->abcd", modes.initial, modes.transition, means, means)
+    seen = np.einsum("sab,scd->sabcd", now, later)
+    return _compare("two draws in a row", expected.reshape(-1), seen.reshape(len(now), -1))
+
+
+def _compare_modes(
+    modes: JointModes, points: list[np.ndarray], now: np.ndarray, later: np.ndarray, highest: int
+) -> float:
+    """Moments of two draws in a row, each and together."""
+    begin, rows, worst = np.asarray(modes.initial), np.asarray(modes.transition), 0.0
+    given = {
+        order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
+    }  # E[mono(z) | mode], (mode, monomials)
+    for order, (one, two) in given.items():
+        worst = max(worst, _compare(f"order {order}, first draw", begin @ one, _monomials(now, order)))
+        worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ two, _monomials(later, order)))
+    for i, j in product(range(1, highest // 2 + 1), repeat=2):
+        expected = np.einsum("a,ab,am,bl->ml", begin, rows, given[i][0], given[j][1]).reshape(-1)
+        seen = np.einsum("sm,sl->sml", _monomials(now, i), _monomials(later, j)).reshape(len(now), -1)
+        worst = max(worst, _compare(f"orders {i} and {j} of two draws in a row", expected, seen))
+    return worst
+
+
+def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and second draws of H, after the contract of `init`, `draw` and `sample` was checked."""
+
+    def two_steps(key: jax.Array) -> object:
+        start = channel.init(jax.random.fold_in(key, 2))
+        state, h = channel.draw(start, key)
+        return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1))
+
+    with jax.enable_x64(True):
+        keys = jax.random.split(jax.random.key(seed), samples)
+        start, state, h, following, later = jax.jit(jax.vmap(two_steps))(keys)
+        assert channel.remembers or start == (), f"init: expected () of a map that forgets, got {start}"
+        shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), s) for s in (start, state, following)]
+        assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
+        if not channel.remembers:
+            sampled = jax.jit(jax.vmap(channel.sample))(keys)
+            assert np.array_equal(h, sampled, equal_nan=True), "draw: expected what sample draws from the same key"
+    drawn = np.asarray(h)
+    expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
+    assert drawn.shape == expected_shape, f"draw: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"
+    bottom = np.eye(1, channel.inputs + 1, channel.inputs)
+    assert np.array_equal(drawn[:, -1:], np.broadcast_to(bottom, drawn[:, -1:].shape)), "last row: expected [0, 1]"
+    return drawn, np.asarray(later)
+
+
+def _monomials(z: np.ndarray, order: int) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(jax.vmap(lambda row: monomials(row, order))(jnp.asarray(z)))
+
+
+def _compare(what: str, expected: np.ndarray | jax.Array, seen: np.ndarray) -> float:
+    """Means over samples (sample, number) against what is expected; the largest ratio to the standard error."""
+    error = seen.std(axis=0) / np.sqrt(len(seen))
+    difference = np.abs(seen.mean(axis=0) - expected)
+    scale = np.abs(seen).max(axis=0) + np.abs(expected)
+    certain = error <= 1e-12 * scale  # the monomial does not vary: moments must agree to rounding
+    assert np.all(difference[certain] <= 1e-9 * scale[certain]), f"{what}: a known moment differs"
+    ratios = difference[~certain] / error[~certain]
+    limit = float(stats.norm.isf(FALSE_ALARM / 2 / max(len(ratios), 1)))
+    largest = float(ratios.max(initial=0.0))
+    assert largest <= limit, f"{what}: a moment differs from the samples by {largest:.1f} standard errors"
+    return largest

@@ -1,0 +1,118 @@
+"""What a filter must keep: its sizes, its claim, and that a step is its prediction and its correction."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.model.estimate import STRENGTH, Estimate, Innovation
+from heliograph.numerics.check import own_units
+from heliograph.numerics.types import ArrayLike
+from heliograph.simulation.likelihood import log_likelihood
+
+ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
+
+
+def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, seed: int = 0) -> None:
+    """Check the contract of a filter on random measurements, with the same inputs at each step.
+
+    Its claim and sizes are stated, and a measurement or input of another size is refused. A step is its prediction and
+    correction; is deterministic; leaves the structure of the state alone; gives a finite mean and a symmetric positive
+    semidefinite covariance (NaN if it claims none), also when some or all components are missing; and does the same
+    inside vmap. An innovation is NaN where a component is missing; its log-likelihood is finite unless no covariance
+    is claimed, 0 where nothing arrived, and `log_likelihood` of a run is the sum.
+
+    Raises:
+        AssertionError: naming what does not hold.
+    """
+    _check_sizes(item, inputs)
+    data = np.random.default_rng(seed).normal(size=(steps, item.received))
+    data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < 0.3] = np.nan
+    data[-1] = np.nan
+    state, total = item.init(), 0.0
+    structure = str(jax.tree.structure(state))
+    side_by_side = jax.jit(jax.vmap(lambda s, z, k: item.step(s, z, inputs, k)[1].mean, in_axes=(0, 0, None)))
+    for k, z in enumerate(data):
+        following, estimate = item.step(state, z, inputs, k)
+        again = item.step(state, z, inputs, k)[1]
+        assert np.array_equal(estimate.mean, again.mean), "step: expected the same estimate from the same arguments"
+        corrected, innovation = item.correct(item.predict(state, inputs, k), z, k)
+        for part in (following, corrected):
+            assert str(jax.tree.structure(part)) == structure, "step: expected a state of init's structure"
+        _check_estimate(estimate, len(item.states), k)
+        _same(f"step {k}: the prediction, corrected", item.estimate(corrected), estimate)
+        _check_innovation(innovation, z, item, k)
+        with jax.enable_x64(True):
+            twice = np.asarray(side_by_side(*jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z)), k))
+        gap = np.abs(twice - estimate.mean).max()
+        scale = 1 + np.abs(estimate.mean).max()
+        assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
+        state, total = following, total + float(innovation.log_likelihood)
+    whole = float(
+        log_likelihood(item, data, np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(item.inputs))))
+    )
+    same = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
+    assert same, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
+
+
+def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
+    assert item.claim in STRENGTH, f"claim: expected one of {list(STRENGTH)}, got {item.claim!r}"
+    assert item.states and len(set(item.states)) == len(item.states), "states: expected distinct names"
+    assert item.received >= 0, "received: expected a length"
+    state, fitting = item.init(), np.zeros(item.received)
+    wrong: list[tuple[str, Callable[[], object]]] = [
+        ("inputs", lambda: item.predict(state, np.zeros(len(item.inputs) + 1)))
+    ]
+    if item.received:
+        longer = np.zeros(item.received + 1)
+        wrong.append(("measurement", lambda: item.correct(item.predict(state, inputs), longer)))
+        wrong.append(("measurement", lambda: item.step(state, np.full(item.received, np.inf), inputs)))
+        wrong.append(("measurement", lambda: item.step(state, longer, inputs)))
+    wrong.append(("step", lambda: item.step(state, fitting, inputs, -1)))
+    for name, call in wrong:
+        try:
+            call()
+        except ValueError as error:
+            assert str(error).startswith(name), f"{name}: expected an error that names it, got {error}"
+        else:
+            raise AssertionError(f"{name}: expected a refusal of what does not fit (@predicts and @corrects do)")
+
+
+def _check_estimate(estimate: Estimate, n: int, k: int) -> None:
+    mean, bound = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    assert mean.shape == (n,), f"step {k}: expected a mean of shape {(n,)}, got {mean.shape}"
+    assert bound.shape == (n, n), f"step {k}: expected a covariance of shape {(n, n)}, got {bound.shape}"
+    assert np.all(np.isfinite(mean)), f"step {k}: expected a finite mean"
+    if estimate.claim == "none":
+        assert np.all(np.isnan(bound)), f"step {k}: expected a covariance of NaN, since none is claimed"
+        return
+    assert np.all(np.isfinite(bound)), f"step {k}: expected a finite covariance"
+    unit = own_units(bound)
+    correlations = bound / np.outer(unit, unit)
+    assert np.abs(correlations - correlations.T).max() <= ROUNDING, f"step {k}: expected a symmetric covariance"
+    smallest = np.linalg.eigvalsh((correlations + correlations.T) / 2)[0]
+    assert smallest >= -ROUNDING, (
+        f"step {k}: expected a positive semidefinite covariance, smallest eigenvalue of correlations {smallest:g}"
+    )
+
+
+def _check_innovation(innovation: Innovation, z: np.ndarray, item: AbstractFilter, k: int) -> None:
+    m, missing, likelihood = len(z), np.isnan(z), float(innovation.log_likelihood)
+    value, covariance = np.asarray(innovation.value), np.asarray(innovation.covariance)
+    assert value.shape == (m,) and covariance.shape == (m, m), f"step {k}: expected an innovation of {m} components"
+    assert np.array_equal(np.isnan(value), missing), f"step {k}: expected an innovation of NaN where z is, only there"
+    if np.all(missing):
+        assert likelihood == 0, f"step {k}: expected a log-likelihood of 0 where nothing arrived, got {likelihood:g}"
+    elif item.claim != "none":
+        assert np.isfinite(likelihood), f"step {k}: expected a finite log-likelihood, got {likelihood:g}"
+        unknown = missing[:, None] | missing
+        assert np.array_equal(np.isnan(covariance), unknown), f"step {k}: expected a covariance where z arrived"
+
+
+def _same(what: str, found: Estimate, expected: Estimate) -> None:
+    for name in ("mean", "covariance"):
+        a, b = np.asarray(getattr(found, name)), np.asarray(getattr(expected, name))
+        same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)
+        assert same, f"{what}: expected the {name} of step"
