@@ -37,7 +37,7 @@ def understood() -> dict[str, bool | int]:
 
     None where JAX is told to disable most optimisations: that asks for less than they leave.
     """
-    if jax.config.read("jax_disable_most_optimizations"):
+    if jax.config.values["jax_disable_most_optimizations"]:
         return {}
     try:
         jax.jit(lambda: jnp.zeros(()), compiler_options=OPTIONS)()
