@@ -1,12 +1,13 @@
 """What is taken off before sending and added back after: the same mean, less power, less of the gain's noise."""
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.model import centred, delayed, expected_signal, over_time
+from heliograph.model import centred, delayed, expected_signal
 from heliograph.random_affine.base import conditional_moments
 from heliograph.random_affine.second_moments import second_order
 
@@ -54,7 +55,7 @@ def found() -> dict[str, dict[str, hg.Statistics]]:
     """The plain relay, less the trajectory, less a constant between the hops, and a bursty link less a constant."""
     bursts = hg.gilbert_elliott(hg.hop(GAIN, 0.1), hg.hop(0.1, 0.4), 0.3, 0.2)
     channels = {
-        "plain": over_time([RELAYED] * HORIZON),
+        "plain": centred(RELAYED, hg.model.OverTime(np.zeros((HORIZON, 1)))),  # less nothing, as one program with
         "trajectory": centred(RELAYED, hg.model.OverTime(expected_signal(PLANT, SENSOR, HORIZON, INPUTS))),
         "relay": hg.amplify_and_forward([HOPS[0], centred(HOPS[1], 6.0)]),
         "bursts": centred(bursts, 7.0),
@@ -101,6 +102,11 @@ def test_the_gain_noise_of_one_path_of_many_is_its_own() -> None:
     np.testing.assert_allclose(together.mean_gain, apart.mean_gain, atol=1e-14)
     np.testing.assert_allclose(together.offset, apart.offset, atol=1e-14)
     np.testing.assert_allclose(together.spread.center, apart.spread.center, atol=1e-12)
+
+
+def test_less_nothing_is_plain() -> None:
+    for less, plain in zip(*(jax.tree.leaves(second_order(c)) for c in (centred(RELAYED, 0.0), RELAYED)), strict=True):
+        np.testing.assert_allclose(less, plain, rtol=0, atol=1e-15)
 
 
 def test_angles_stay_angles() -> None:

@@ -18,7 +18,7 @@ TWO_HOPS = hg.amplify_and_forward(
         hg.hop(hg.Rayleigh(0.8), 0.1, amplification=2.0, dimension=2),
     ]
 )
-SCALAR = hg.amplify_and_forward([hg.hop(hg.Rician(1.0, 0.3), 0.2), hg.hop(hg.Nakagami(2.0), 0.1)])
+SCALAR = hg.amplify_and_forward([hg.hop(hg.Rician(1.0, 0.3), 0.2), hg.hop(hg.Discrete([0.6, 1.2], [0.4, 0.6]), 0.1)])
 
 CHANNELS = {
     "known": hg.random_affine.known([[1.0, 2.0]], [0.5]),

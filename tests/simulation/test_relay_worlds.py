@@ -11,6 +11,7 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
+from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
@@ -35,8 +36,22 @@ def relays(net, design):
     return Network.of_relays(net, *world(net, design))
 
 
-def worst(statistics):
+RUNS, CHUNK = 3072, LANES * BLOCK  # one block for each lane at a time: any number of runs is one program
+
+
+@pytest.fixture(scope="module")
+def designed():
+    return own_error_design(example(), 20)
+
+
+@pytest.fixture(scope="module")
+def recorded(designed):
+    return monte_carlo(relays(example(), designed), 20, RUNS, 1, chunk=CHUNK)
+
+
+def worst(record, node, name):
     """Largest |z| over the steps of the squared error against the claimed trace, and what chance would give."""
+    statistics = error_statistics(record, node, name)
     batches = np.trace(statistics.outer, axis1=2, axis2=3) / statistics.count[:, None]
     error = batches.std(axis=0, ddof=1) / np.sqrt(BATCHES)
     claimed = np.trace(statistics.claimed(), axis1=1, axis2=2)
@@ -45,52 +60,54 @@ def worst(statistics):
 
 
 @pytest.mark.parametrize("kind", ["greedy", "another kind"])
-def test_designed_and_simulated_errors_agree_at_every_step(kind):
-    net, horizon = (unusual(), 7) if kind == "another kind" else (example(), 20)
-    design = own_error_design(net, horizon)
-    found = monte_carlo(relays(net, design), horizon, 3000, 1, Statistics())
-    for node, filters in found.items():
-        for name, statistics in filters.items():
-            largest, limit = worst(statistics)
+def test_designed_and_simulated_errors_agree_at_every_step(kind, request):
+    if kind == "another kind":
+        network = relays(unusual(), own_error_design(unusual(), 7))
+        record = monte_carlo(network, 7, RUNS, 1, chunk=CHUNK)
+    else:
+        record = request.getfixturevalue("recorded")
+    for node, filters in record.estimates.items():
+        for name in filters:
+            largest, limit = worst(record, node, name)
             assert largest < limit, (node, name)
 
 
-def test_a_wrong_design_is_seen():
+def test_a_wrong_design_is_seen(designed):
     """Claims for twice the gains that run: the comparison above can fail."""
-    net = example()
-    design = own_error_design(net, 20)
-    schedules, receivers = world(net, design)
+    schedules, receivers = world(example(), designed)
     gains = schedules["relay_2"].gains
     short = 0.5 * gains.gain
     moved = gains._replace(gain=short, direct=short, transition=gains.transition + 0.5 * gains.gain @ gains.expected,
                            output=gains.transition + 0.5 * gains.gain @ gains.expected)  # fmt: skip
     schedules["relay_2"] = type(schedules["relay_2"])(moved, schedules["relay_2"].start, "exact")
-    found = monte_carlo(Network.of_relays(net, schedules, receivers), 20, 3000, 1, Statistics())
-    largest, limit = worst(found["relay_2"]["own"])
+    record = monte_carlo(Network.of_relays(example(), schedules, receivers), 20, RUNS, 1, chunk=CHUNK)
+    largest, limit = worst(record, "relay_2", "own")
     assert largest > 2 * limit
 
 
-def test_runs_do_not_depend_on_chunks_or_on_other_receivers():
+def test_runs_do_not_depend_on_chunks_or_on_other_receivers(designed, recorded):
     net = example()
-    schedules, receivers = world(net, own_error_design(net, 6))
-    a = monte_carlo(Network.of_relays(net, schedules, {"own": receivers["own"]}), 6, 70, 3)
-    b = monte_carlo(Network.of_relays(net, schedules, {}), 4, 70, 3, chunk=32)
-    assert np.array_equal(a.truth[:, :4], b.truth)
+    other = monte_carlo(Network.of_relays(net, world(net, designed)[0], {}), 4, 70, 1, chunk=32)
+    assert np.array_equal(recorded.truth[:70, :4], other.truth)
     for name in net.filters:
-        np.testing.assert_array_equal(a.measurements[name][:, :4], b.measurements[name])
-    assert np.all(np.isnan(a.measurements["relay_1"][:, 0])) and not np.any(np.isnan(a.measurements["receiver"]))
+        np.testing.assert_array_equal(recorded.measurements[name][:70, :4], other.measurements[name])
+    heard = recorded.measurements
+    assert np.all(np.isnan(heard["relay_1"][:, 0])) and not np.any(np.isnan(heard["receiver"]))
 
 
-def test_what_holds_for_every_network_holds_for_relays():
+def test_what_holds_for_every_network_holds_for_relays(designed, recorded):
     """A first run, chunks of statistics, single precision, and a record's statistics."""
-    network = relays(example(), own_error_design(example(), 5))
-    whole, part = monte_carlo(network, 5, 96, 7), monte_carlo(network, 5, 32, 7, first_run=64)
-    np.testing.assert_array_equal(
-        whole.estimates["receiver"]["best"].mean[64:], part.estimates["receiver"]["best"].mean
-    )
-    assert whole.failures() == []
+    network = relays(example(), designed)
+    whole, part = monte_carlo(network, 20, 96, 1), monte_carlo(network, 20, 32, 1, first_run=64)
+    for found, runs in ((whole, slice(96)), (part, slice(64, 96))):
+        np.testing.assert_array_equal(
+            recorded.estimates["receiver"]["best"].mean[runs], found.estimates["receiver"]["best"].mean
+        )
+    assert recorded.failures() == []
     told = []
-    sums = [monte_carlo(network, 5, 96, 7, Statistics(), chunk=c, progress=lambda *n: told.append(n)) for c in (32, 96)]
+    sums = [
+        monte_carlo(network, 20, 96, 1, Statistics(), chunk=c, progress=lambda *n: told.append(n)) for c in (32, 96)
+    ]
     assert told == [(32, 96), (64, 96), (96, 96), (96, 96)]
     one, other = (s["relay_2"]["own"] for s in sums)
     np.testing.assert_array_equal(one.outer, other.outer)
@@ -98,7 +115,7 @@ def test_what_holds_for_every_network_holds_for_relays():
     np.testing.assert_allclose(kept.outer, one.outer, rtol=1e-12)
     np.testing.assert_allclose(kept.covariance, one.covariance, rtol=1e-12)
     np.testing.assert_allclose(kept.nees, one.nees, rtol=1e-9)
-    single = monte_carlo(network, 5, 96, 7, Statistics(), precision="float32")["receiver"]["own"]
+    single = monte_carlo(network, 20, 96, 1, Statistics(), precision="float32")["receiver"]["own"]
     assert single.rmse()[0] == pytest.approx(one.rmse()[0], rel=2)
 
 
@@ -110,18 +127,22 @@ def quiet():
     return RelayNetwork(plant, LinearSensor([[1.0]], [[0.3]]), ("a",), slots)
 
 
-def test_a_planned_silence_is_no_gap_and_a_loss_is_one():
-    net, horizon = quiet(), 12
-    design = own_error_design(net, horizon)
-    network = relays(net, design)
-    record = monte_carlo(network, horizon, 40, 2)
+@pytest.fixture(scope="module")
+def silences():
+    """The network, and its record."""
+    network = relays(quiet(), own_error_design(quiet(), 12))
+    return network, monte_carlo(network, 12, RUNS, 2, chunk=CHUNK)
+
+
+def test_a_planned_silence_is_no_gap_and_a_loss_is_one(silences):
+    network, record = silences
     heard = record.measurements["receiver"]
     assert np.all(np.isnan(heard[:, ::2])) and np.all(np.isfinite(heard[:, 1::2]))
     assert record.failures() == []
     for name in ("own", "best"):
         claimed = record.estimates["receiver"][name].covariance
         assert np.all(np.isfinite(claimed)) and np.array_equal(claimed[0], claimed[-1])
-    largest, limit = worst(monte_carlo(network, horizon, 3000, 1, Statistics())["receiver"]["own"])
+    largest, limit = worst(record, "receiver", "own")
     assert largest < limit
     lost = heard[3].copy()
     lost[5] = np.nan
@@ -129,10 +150,8 @@ def test_a_planned_silence_is_no_gap_and_a_loss_is_one():
     assert np.all(np.isfinite(bound[:5])) and np.all(np.isnan(bound[5:]))
 
 
-def test_a_recording_needs_what_the_receiver_heard_alone():
-    net, horizon = quiet(), 8
-    network = relays(net, own_error_design(net, horizon))
-    record = monte_carlo(network, horizon, 1, 5)
+def test_a_recording_needs_what_the_receiver_heard_alone(silences):
+    network, record = silences
     z = {name: values[0] for name, values in record.measurements.items()}
     alone, whole = run(network, {"receiver": z["receiver"]}), run(network, z)
     assert list(alone.estimates) == ["receiver"] and list(whole.estimates) == ["a", "receiver"]

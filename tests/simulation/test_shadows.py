@@ -1,6 +1,7 @@
 """Nodes whose links hold one memory are in one shadow, whatever they are called and however runs are cut."""
 
 import numpy as np
+import pytest
 
 import heliograph as hg
 
@@ -13,56 +14,76 @@ def link(transition=BURSTS, name=None):
     return hg.markov_fading([0.2, 1.0], transition, 0.0, name=name)
 
 
-def gains(channels, runs=64, horizon=30):
+RUNS, HORIZON = 64, 30
+CHAIN = hg.random_affine.MarkovChain(BURSTS)
+
+
+def gains(channels):
     """What each node hears, (run, time): its gain."""
-    listen = {"silent": hg.filters.open_loop_filter(PLANT)}
-    nodes = {name: hg.Node(SENSOR, channel, listen) for name, channel in channels.items()}
-    record = hg.monte_carlo(hg.Network(PLANT, nodes), horizon, runs, 7)
+    nodes = {name: hg.Node(SENSOR, channel, {}) for name, channel in channels.items()}
+    record = hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 7)
     return {name: record.measurements[name][..., 0] for name in channels}
 
 
-def test_one_chain_is_one_shadow_across_nodes_and_another_is_not():
-    chain = hg.random_affine.MarkovChain(BURSTS)
-    heard = gains({"a": link(chain), "b": link(chain), "c": link(), "d": link(name="road"), "e": link(name="road")})
+def in_turn(name):
+    """A link that switches surely at odd steps and stays at even ones."""
+    moves = [np.eye(2), np.eye(2)[::-1]]
+    chains = [hg.random_affine.MarkovChain(moves[k % 2], [1.0, 0.0], name) for k in range(HORIZON)]
+    return hg.model.over_time([link(chain) for chain in chains])
+
+
+@pytest.fixture(scope="module")
+def heard():
+    """Of one plant, through links of every kind of memory."""
+    channels = {
+        "a": link(CHAIN),
+        "b": link(CHAIN),
+        "c": link(),
+        "d": link(name="road"),
+        "z": link(name="road"),
+        "two hops": hg.amplify_and_forward([link(CHAIN), link(CHAIN)]),
+        "low": hg.autoregressive_fading(1.0, 0.2, 0.9, 0.0, name="hill"),
+        "high": hg.autoregressive_fading(2.0, 0.5, 0.9, 0.0, name="hill"),
+        "in turn": in_turn("turn"),
+        "in turn, unnamed": in_turn(None),
+    }
+    return gains(channels)
+
+
+@pytest.fixture(scope="module")
+def alone():
+    return gains({"z": link(name="road")})["z"]
+
+
+def test_one_chain_is_one_shadow_across_nodes_and_another_is_not(heard):
     np.testing.assert_array_equal(heard["a"], heard["b"])
-    np.testing.assert_array_equal(heard["d"], heard["e"])
+    np.testing.assert_array_equal(heard["d"], heard["z"])
     assert np.mean(heard["a"] == heard["c"]) < 0.8 and np.mean(heard["a"] == heard["d"]) < 0.8
     assert set(np.unique(heard["c"])) == {0.2, 1.0}
 
 
-def test_a_name_keeps_its_draws_whatever_else_there_is():
-    alone, among = gains({"z": link(name="road")}), gains({"a": link(), "z": link(name="road"), "q": link(name="road")})
-    np.testing.assert_array_equal(alone["z"], among["z"])
+def test_a_name_keeps_its_draws_whatever_else_there_is(heard, alone):
+    np.testing.assert_array_equal(alone, heard["z"])
 
 
-def test_a_shared_drift_may_have_another_size_at_each_node():
-    channels = {
-        name: hg.autoregressive_fading(mean, size, 0.9, 0.0, name="hill")
-        for name, mean, size in (("a", 1.0, 0.2), ("b", 2.0, 0.5))
-    }
-    heard = gains(channels)
-    np.testing.assert_allclose((heard["a"] - 1) / 0.2, (heard["b"] - 2) / 0.5, rtol=1e-9, atol=1e-12)
+def test_a_shared_drift_may_have_another_size_at_each_node(heard):
+    np.testing.assert_allclose((heard["low"] - 1) / 0.2, (heard["high"] - 2) / 0.5, rtol=1e-9, atol=1e-12)
 
 
-def test_hops_of_one_channel_share_with_another_node():
-    chain = hg.random_affine.MarkovChain(BURSTS)
-    heard = gains({"two hops": hg.amplify_and_forward([link(chain), link(chain)]), "one": link(chain)})
-    np.testing.assert_allclose(heard["two hops"], heard["one"] ** 2, rtol=1e-12)
+def test_hops_of_one_channel_share_with_another_node(heard):
+    np.testing.assert_allclose(heard["two hops"], heard["a"] ** 2, rtol=1e-12)
 
 
-def test_hops_of_relays_share_too_in_every_slot():
+def test_hops_of_relays_share_too_in_every_slot(alone):
     """A named chain moves on at every step, and draws the same as anywhere else."""
     plant = hg.LinearPlant([[1.0]], [[0.0]], [1.0], [[0.0]])
     slots = [{"receiver": {"sensor": link(name="road")}}, {"receiver": {"sensor": link(name="road")}}]
     relays = hg.model.RelayNetwork(plant, SENSOR, (), slots)
-    record = hg.monte_carlo(hg.Network.of_relays(relays, {}, {}), 30, 64, 7)
-    np.testing.assert_allclose(record.measurements["receiver"][..., 0], gains({"a": link(name="road")})["a"])
+    record = hg.monte_carlo(hg.Network.of_relays(relays, {}, {}), HORIZON, RUNS, 7)
+    np.testing.assert_allclose(record.measurements["receiver"][..., 0], alone)
 
 
-def test_a_chain_that_varies_moves_by_the_step():
-    """It switches surely at odd steps and stays at even ones."""
-    stay, switch = np.eye(2), np.eye(2)[::-1]
-    for name in ("c", None):
-        steps = [hg.random_affine.MarkovChain(switch if k % 2 else stay, [1.0, 0.0], name) for k in range(6)]
-        heard = gains({"a": hg.model.over_time([link(chain) for chain in steps])}, runs=2, horizon=6)["a"]
-        np.testing.assert_array_equal(heard, [[0.2, 0.2, 1.0, 1.0, 0.2, 0.2]] * 2)
+@pytest.mark.parametrize("name", ["in turn", "in turn, unnamed"])
+def test_a_chain_that_varies_moves_by_the_step(heard, name):
+    expected = np.resize([0.2, 0.2, 1.0, 1.0], HORIZON)
+    np.testing.assert_array_equal(heard[name], np.broadcast_to(expected, (RUNS, HORIZON)))

@@ -13,225 +13,6 @@ HORIZON, RUNS = 7, 70  # more than one block of runs, and not a multiple of it
 INPUTS = np.linspace(-1, 1, HORIZON)[:, None]
 
 
-def node(row, channel=CHANNEL):
-    sensor = hg.LinearSensor([row], 0.05)
-    filters = {
-        "relay_aware": hg.cubature_filter(PLANT, sensor, channel),
-        "linear": hg.linear_filter(PLANT, sensor, channel),
-    }
-    return hg.Node(sensor, channel, filters)
-
-
-NETWORK = hg.Network(PLANT, {"b": node([1.0, 0.0]), "a": node([0.5, 1.0]), "direct": node([0.0, 1.0], hg.perfect())})
-
-
-@pytest.fixture(scope="module")
-def record():
-    return hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS)
-
-
-def leaves(record):
-    return [record.truth, *record.measurements.values(), *jax.tree.leaves(record.estimates)]
-
-
-def test_shapes_and_order(record):
-    assert record.truth.shape == (RUNS, HORIZON, 2)
-    assert list(record.measurements) == ["b", "a", "direct"] and record.measurements["a"].shape == (RUNS, HORIZON, 1)
-    assert list(record.estimates["b"]) == ["relay_aware", "linear"]
-    assert all(isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 for leaf in leaves(record))
-    assert record.failures() == []
-
-
-def test_chunks_change_no_bit(record):
-    other = hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
-    assert all(np.array_equal(a, b) for a, b in zip(leaves(record), leaves(other), strict=True))
-
-
-def test_chunks_change_no_bit_of_the_statistics():
-    some = [hg.monte_carlo(NETWORK, 3, 140, 11, hg.Statistics(), INPUTS[:3], chunk) for chunk in (64, 256)]
-    for name in ("outer", "covariance", "nees", "count"):
-        assert np.array_equal(*(getattr(s["a"]["linear"], name) for s in some)), name
-
-
-def test_fewer_runs_are_the_first_of_more_runs(record):
-    few = hg.monte_carlo(NETWORK, HORIZON, 5, 11, inputs=INPUTS)
-    assert np.array_equal(few.truth, record.truth[:5])
-    assert np.array_equal(few.measurements["b"], record.measurements["b"][:5])
-
-
-def test_another_node_changes_no_draw(record):
-    more = hg.Network(PLANT, {"new": node([1.0, 1.0]), **NETWORK.nodes})
-    other = hg.monte_carlo(more, HORIZON, RUNS, 11, inputs=INPUTS)
-    assert np.array_equal(other.truth, record.truth)
-    for name in NETWORK.nodes:
-        assert np.array_equal(other.measurements[name], record.measurements[name])
-
-
-def test_run_equals_step_by_step(record):
-    measurements = {name: z[3].copy() for name, z in record.measurements.items()}
-    measurements["a"][2] = np.nan
-    result = hg.run(NETWORK, measurements, INPUTS)
-    for name, part in NETWORK.nodes.items():
-        for label, item in part.filters.items():
-            stream = hg.Stream(item)
-            for k in range(HORIZON):
-                estimate = stream.push(measurements[name][k], INPUTS[k])
-                together = result.estimates[name][label]
-                # The same arithmetic in another compilation: equal to rounding.
-                np.testing.assert_allclose(estimate.mean, together.mean[k], rtol=0, atol=1e-12)
-                np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
-
-
-def test_the_true_channel_makes_the_data_and_the_filter_believes_another():
-    sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
-    item = hg.linear_filter(PLANT, sensor, CHANNEL)
-    worlds = [hg.Network(PLANT, {"n": hg.Node(sensor, c, {"f": item})}) for c in (CHANNEL, hg.model.silent())]
-    rmse = [
-        hg.monte_carlo(w, HORIZON, 500, 1, hg.Statistics(), INPUTS)["n"]["f"].rmse()[0] for w in worlds
-    ]  # fmt: skip
-    assert rmse[0] < rmse[1]
-
-
-def test_a_lost_covariance_is_reported_with_its_step():
-    plant = hg.Plant(lambda x, u: x**3, 1e-3, [5.0], 1.0)  # leaves the range of numbers after a few steps
-    sensor = hg.LinearSensor([[1.0]], 1.0)
-    network = hg.Network(
-        plant, {"n": hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(plant, sensor, hg.perfect())})}
-    )
-    record = hg.run(network, {"n": np.full((12, 1), np.nan)})
-    (line,) = record.failures()
-    assert line.startswith("n/f: no valid covariance from step ")
-    step = int(line.split("step ")[1].split()[0])
-    assert 0 < step < 12 and np.all(np.isfinite(record.estimates["n"]["f"].mean[: step - 1]))
-
-
-LINEAR = {
-    name: hg.Node(item.sensor, item.channel, {"linear": item.filters["linear"]}) for name, item in NETWORK.nodes.items()
-}
-STATIC = {
-    "b": hg.fusion.UniformQuantizer(32, 0.8),  # saturates now and then
-    "a": hg.fusion.UniformQuantizer(16, 12.0),
-    "direct": hg.fusion.UniformQuantizer(64, 10.0),
-}
-LINKED = hg.Network(
-    PLANT,
-    LINEAR,
-    {
-        "plain": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5])),
-        "static": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
-        "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.fusion.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
-        "by component": hg.Fusion(
-            "linear", hg.fusion.EqualIntersection(), hg.fusion.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
-        ),
-    },
-)
-
-
-@pytest.fixture(scope="module")
-def linked():
-    return hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS)
-
-
-def sent_step_by_step(fusion, record, run):
-    """What each node's quantizer delivers of its filter's means in one run, by a plain loop."""
-    delivered = []
-    for name in NETWORK.nodes:
-        quantizer = fusion.quantizer[name] if isinstance(fusion.quantizer, dict) else fusion.quantizer
-        state = quantizer.init(2)
-        for k in range(HORIZON):
-            state, sent = quantizer.step(state, record.estimates[name][fusion.filter].mean[run, k])
-            delivered.append(sent)
-    return [
-        np.stack([getattr(s, part) for s in delivered]).reshape(3, HORIZON, 2).swapaxes(0, 1)
-        for part in ("value", "error", "saturated", "symbols")
-    ]
-
-
-@pytest.mark.parametrize("name", ["static", "escape", "by component"])
-def test_quantizers_in_the_scan_are_quantizers_in_a_loop(linked, name):
-    fusion, uplink = LINKED.fused[name], linked.uplinks[name]
-    for run in (0, 5):
-        value, error, saturated, symbols = sent_step_by_step(fusion, linked, run)
-        np.testing.assert_array_equal(uplink.saturated[run], saturated)
-        np.testing.assert_array_equal(uplink.symbols[run], symbols)
-        k = int(np.flatnonzero(~saturated.any(axis=(1, 2)))[-1])
-        local = []
-        for i, node in enumerate(NETWORK.nodes):
-            p, d = linked.estimates[node][fusion.filter].covariance[run, k], error[k, i]
-            s, r = d.sum(), np.sqrt(np.trace(p))
-            local.append(hg.model.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
-        outside, inside = hg.fusion.fuse(fusion.rule, local), linked.estimates["fused"][name]
-        # The same arithmetic in another compilation; searched weights agree to the root of rounding.
-        np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
-        np.testing.assert_allclose(inside.covariance[run, k], outside.covariance, rtol=0, atol=1e-7)
-
-
-def test_links_change_nothing_else(linked, record):
-    assert np.array_equal(linked.truth, record.truth) and record.uplinks == {}
-    assert list(linked.uplinks) == ["static", "escape", "by component"]
-    for node in NETWORK.nodes:
-        np.testing.assert_allclose(linked.estimates[node]["linear"].mean, record.estimates[node]["linear"].mean)
-
-
-def test_saturation_is_reported_and_nothing_is_claimed_there(linked):
-    uplink, fused = linked.uplinks["static"], linked.estimates["fused"]["static"]
-    assert uplink.nodes == ("b", "a", "direct") and uplink.saturated.shape == (RUNS, HORIZON, 3, 2)
-    count = int(uplink.saturated[:, :, 0].sum())
-    assert count > 0 and not uplink.saturated[:, :, 1:].any()
-    lines = [line for line in linked.failures() if line.startswith("fused/static")]
-    assert lines[1] == f"fused/static: the quantizer of node b saturated in {count} of {RUNS * HORIZON * 2} samples"
-    assert lines[0].startswith("fused/static: no valid covariance from step ")
-    anywhere = uplink.saturated.any(axis=(-1, -2))
-    assert np.array_equal(np.isnan(fused.covariance).all(axis=(-1, -2)), anywhere)
-    assert np.array_equal(np.isnan(fused.covariance).any(axis=(-1, -2)), anywhere) and np.all(np.isfinite(fused.mean))
-    assert uplink.saturated_share()["b"] == count / (RUNS * HORIZON * 2) and uplink.symbols_per_value() == 1
-    assert not any("fused/escape" in line for line in linked.failures())
-    assert 1 < linked.uplinks["escape"].symbols_per_value() < 5
-
-
-def test_statistics_count_what_the_record_shows(linked):
-    some = [hg.monte_carlo(LINKED, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk)["fused"] for chunk in (64, 256)]
-    for name in linked.uplinks:
-        a, b = (s[name].uplink for s in some)
-        assert np.array_equal(a.saturated, b.saturated) and np.array_equal(a.symbols, b.symbols)
-    found = some[0]
-    assert found["plain"].uplink is None
-    for name in linked.uplinks:
-        kept, counted = hg.simulation.error_statistics(linked, "fused", name).uplink, found[name].uplink
-        assert kept.nodes == counted.nodes
-        np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
-        np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
-
-
-def test_chunks_change_no_bit_of_links(linked):
-    other = hg.monte_carlo(LINKED, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
-    pairs = zip(leaves(linked), leaves(other), strict=True)
-    assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
-    for name, uplink in linked.uplinks.items():
-        assert np.array_equal(uplink.saturated, other.uplinks[name].saturated)
-
-
-def test_a_recording_goes_through_the_same_links(linked):
-    result = hg.run(LINKED, {name: z[3] for name, z in linked.measurements.items()}, INPUTS)
-    for name, uplink in linked.uplinks.items():
-        assert np.array_equal(result.uplinks[name].symbols, uplink.symbols[3])
-        np.testing.assert_allclose(
-            result.estimates["fused"][name].mean, linked.estimates["fused"][name].mean[3], rtol=0, atol=1e-9
-        )
-
-
-def test_quantizers_over_time_and_the_claim_of_a_static_one():
-    """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
-    each = hg.model.over_time([hg.fusion.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(5)])
-    network = hg.Network(PLANT, LINEAR, {"ci": hg.Fusion("linear", hg.CovarianceIntersection(), each)})
-    found = hg.monte_carlo(network, 5, 2000, 3, hg.Statistics(), INPUTS[:5])["fused"]["ci"]
-    assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
-    trace = np.trace(found.claimed(), axis1=1, axis2=2)
-    assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
-    with pytest.raises(ValueError, match="at most 5 steps"):
-        hg.monte_carlo(network, HORIZON, 2, 3, inputs=INPUTS)
-
-
 class Silent(hg.filters.AbstractFilter):
     """Gives the initial mean and claims nothing."""
 
@@ -256,22 +37,212 @@ class Silent(hg.filters.AbstractFilter):
         return hg.model.Estimate(jax.numpy.asarray(state), jax.numpy.full((2, 2), jax.numpy.nan), "none")
 
 
-def test_a_filter_that_claims_no_covariance_harms_no_other():
-    sensor = hg.LinearSensor([[1.0, 0.0]], 0.05)
-    filters = {"silent": Silent(), "linear": hg.linear_filter(PLANT, sensor, CHANNEL)}
-    nodes = {name: hg.Node(sensor, CHANNEL, filters) for name in ("p", "q")}
-    network = hg.Network(PLANT, nodes, {"mean": hg.Fusion("silent", hg.fusion.WeightedFusion([0.5, 0.5]))})
+def node(row, channel=CHANNEL):
+    sensor = hg.LinearSensor([row], 0.05)
+    filters = {
+        "relay_aware": hg.cubature_filter(PLANT, sensor, channel),
+        "linear": hg.linear_filter(PLANT, sensor, channel),
+        "silent": Silent(),
+    }
+    return hg.Node(sensor, channel, filters)
+
+
+NODES = {"b": node([1.0, 0.0]), "a": node([0.5, 1.0]), "direct": node([0.0, 1.0], hg.perfect())}
+DEAF = hg.Node(NODES["b"].sensor, hg.model.silent(), {"deaf": NODES["b"].filters["linear"]})
+STATIC = {
+    "b": hg.fusion.UniformQuantizer(32, 0.8),  # saturates now and then
+    "a": hg.fusion.UniformQuantizer(16, 12.0),
+    "direct": hg.fusion.UniformQuantizer(64, 10.0),
+}
+DOUBLED = [hg.fusion.UniformQuantizer(8 * 2 ** (k > 2), 12.0) for k in range(HORIZON)]
+FUSED = {
+    "plain": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5])),
+    "static": hg.Fusion("linear", hg.fusion.WeightedFusion([0.2, 0.3, 0.5]), STATIC),
+    "escape": hg.Fusion("linear", hg.CovarianceIntersection(), hg.fusion.EscapeQuantizer(9, 0.1, 0.6, 0.6, 1e-3)),
+    "by component": hg.Fusion(
+        "linear", hg.fusion.EqualIntersection(), hg.fusion.EscapeQuantizer(41, [3.0, 2.0], [0.6, 0.5], 0.0, 0.1)
+    ),
+    "over time": hg.Fusion("linear", hg.fusion.EqualIntersection(), hg.model.over_time(DOUBLED)),
+    "mean": hg.Fusion("silent", hg.fusion.WeightedFusion([0.2, 0.3, 0.5])),
+}
+LINKED = ["static", "escape", "by component", "over time"]
+NETWORK = hg.Network(PLANT, {**NODES, "silence": DEAF}, FUSED)
+
+
+@pytest.fixture(scope="module")
+def record():
+    return hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS)
+
+
+@pytest.fixture(scope="module")
+def statistics():
+    """Of many runs; chunks of at most one block a lane are one program."""
+    return hg.monte_carlo(NETWORK, HORIZON, 2048, 3, hg.Statistics(), INPUTS, chunk=256)
+
+
+def leaves(record):
+    return [record.truth, *record.measurements.values(), *jax.tree.leaves(record.estimates)]
+
+
+def test_shapes_and_order(record):
+    assert record.truth.shape == (RUNS, HORIZON, 2)
+    assert list(record.measurements) == ["b", "a", "direct", "silence"]
+    assert record.measurements["a"].shape == (RUNS, HORIZON, 1)
+    assert list(record.estimates["b"]) == ["relay_aware", "linear", "silent"]
+    assert all(isinstance(leaf, np.ndarray) and leaf.dtype == np.float64 for leaf in leaves(record))
+    assert all(line.startswith("fused/static") for line in record.failures())
+
+
+def test_chunks_change_no_bit(record):
+    other = hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, inputs=INPUTS, chunk=64)
+    pairs = zip(leaves(record), leaves(other), strict=True)
+    assert all(np.array_equal(a, b, equal_nan=True) for a, b in pairs)
+    for name, uplink in record.uplinks.items():
+        assert np.array_equal(uplink.saturated, other.uplinks[name].saturated)
+
+
+def test_fewer_runs_are_the_first_of_more_runs(record):
+    few = hg.monte_carlo(NETWORK, HORIZON, 5, 11, inputs=INPUTS)
+    assert np.array_equal(few.truth, record.truth[:5])
+    assert np.array_equal(few.measurements["b"], record.measurements["b"][:5])
+
+
+def test_another_node_and_links_change_nothing_else(record):
+    more = {"new": node([1.0, 1.0]), **NODES}
+    few = {name: hg.Node(n.sensor, n.channel, {"linear": n.filters["linear"]}) for name, n in more.items()}
+    other = hg.monte_carlo(hg.Network(PLANT, few), HORIZON, RUNS, 11, inputs=INPUTS)
+    assert np.array_equal(other.truth, record.truth) and other.uplinks == {} and other.failures() == []
+    assert list(record.uplinks) == LINKED
+    for name in NODES:
+        assert np.array_equal(other.measurements[name], record.measurements[name])
+        np.testing.assert_allclose(other.estimates[name]["linear"].mean, record.estimates[name]["linear"].mean)
+
+
+def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
+    measurements = {name: z[3].copy() for name, z in record.measurements.items()}
+    through = hg.run(NETWORK, measurements, INPUTS)
+    for name, uplink in record.uplinks.items():
+        assert np.array_equal(through.uplinks[name].symbols, uplink.symbols[3])
+        np.testing.assert_allclose(
+            through.estimates["fused"][name].mean, record.estimates["fused"][name].mean[3], rtol=0, atol=1e-9
+        )
+    measurements["a"][2] = np.nan
+    result = hg.run(NETWORK, measurements, INPUTS)
+    for name, part in NODES.items():
+        for label in ("relay_aware", "linear"):
+            stream = hg.Stream(part.filters[label])
+            for k in range(HORIZON):
+                estimate = stream.push(measurements[name][k], INPUTS[k])
+                together = result.estimates[name][label]
+                # The same arithmetic in another compilation: equal to rounding.
+                np.testing.assert_allclose(estimate.mean, together.mean[k], rtol=0, atol=1e-12)
+                np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
+
+
+def test_the_true_channel_makes_the_data_and_the_filter_believes_another(statistics):
+    (hearing, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
+    assert hearing < deaf - 4 * np.hypot(error, other)
+
+
+def test_a_lost_covariance_is_reported_with_its_step():
+    plant = hg.Plant(lambda x, u: x**3, 1e-3, [5.0], 1.0)  # leaves the range of numbers after a few steps
+    sensor = hg.LinearSensor([[1.0]], 1.0)
+    network = hg.Network(
+        plant, {"n": hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(plant, sensor, hg.perfect())})}
+    )
+    record = hg.run(network, {"n": np.full((12, 1), np.nan)})
+    (line,) = record.failures()
+    assert line.startswith("n/f: no valid covariance from step ")
+    step = int(line.split("step ")[1].split()[0])
+    assert 0 < step < 12 and np.all(np.isfinite(record.estimates["n"]["f"].mean[: step - 1]))
+
+
+def sent_step_by_step(fusion, record, run):
+    """What each node's quantizer delivers of its filter's means in one run, by a plain loop."""
+    delivered = []
+    for name in NODES:
+        quantizer = fusion.quantizer[name] if isinstance(fusion.quantizer, dict) else fusion.quantizer
+        state = quantizer.init(2)
+        for k in range(HORIZON):
+            state, sent = quantizer.step(state, record.estimates[name][fusion.filter].mean[run, k])
+            delivered.append(sent)
+    return [
+        np.stack([getattr(s, part) for s in delivered]).reshape(3, HORIZON, 2).swapaxes(0, 1)
+        for part in ("value", "error", "saturated", "symbols")
+    ]
+
+
+@pytest.mark.parametrize("name", ["static", "escape", "by component"])
+def test_quantizers_in_the_scan_are_quantizers_in_a_loop(record, name):
+    fusion, uplink = FUSED[name], record.uplinks[name]
+    for run in (0, 5):
+        value, error, saturated, symbols = sent_step_by_step(fusion, record, run)
+        np.testing.assert_array_equal(uplink.saturated[run], saturated)
+        np.testing.assert_array_equal(uplink.symbols[run], symbols)
+        k = int(np.flatnonzero(~saturated.any(axis=(1, 2)))[-1])
+        local = []
+        for i, node in enumerate(NODES):
+            p, d = record.estimates[node][fusion.filter].covariance[run, k], error[k, i]
+            s, r = d.sum(), np.sqrt(np.trace(p))
+            local.append(hg.model.Estimate(value[k, i], (1 + s / r) * p + (1 + r / s) * s * np.diag(d), "upper"))
+        outside, inside = hg.fusion.fuse(fusion.rule, local), record.estimates["fused"][name]
+        # The same arithmetic in another compilation; searched weights agree to the root of rounding.
+        np.testing.assert_allclose(inside.mean[run, k], outside.mean, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(inside.covariance[run, k], outside.covariance, rtol=0, atol=1e-7)
+
+
+def test_saturation_is_reported_and_nothing_is_claimed_there(record):
+    uplink, fused = record.uplinks["static"], record.estimates["fused"]["static"]
+    assert uplink.nodes == ("b", "a", "direct") and uplink.saturated.shape == (RUNS, HORIZON, 3, 2)
+    count = int(uplink.saturated[:, :, 0].sum())
+    assert count > 0 and not uplink.saturated[:, :, 1:].any()
+    lines = [line for line in record.failures() if line.startswith("fused/static")]
+    assert lines[1] == f"fused/static: the quantizer of node b saturated in {count} of {RUNS * HORIZON * 2} samples"
+    assert lines[0].startswith("fused/static: no valid covariance from step ")
+    anywhere = uplink.saturated.any(axis=(-1, -2))
+    assert np.array_equal(np.isnan(fused.covariance).all(axis=(-1, -2)), anywhere)
+    assert np.array_equal(np.isnan(fused.covariance).any(axis=(-1, -2)), anywhere) and np.all(np.isfinite(fused.mean))
+    assert uplink.saturated_share()["b"] == count / (RUNS * HORIZON * 2) and uplink.symbols_per_value() == 1
+    assert not any("fused/escape" in line for line in record.failures())
+    assert 1 < record.uplinks["escape"].symbols_per_value() < 5
+
+
+def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
+    some = [hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk) for chunk in (64, 256)]
+    for name in ("outer", "covariance", "nees", "count"):
+        assert np.array_equal(*(getattr(s["a"]["linear"], name) for s in some)), name
+    for name in record.uplinks:
+        a, b = (s["fused"][name].uplink for s in some)
+        assert np.array_equal(a.saturated, b.saturated) and np.array_equal(a.symbols, b.symbols)
+    found = some[0]["fused"]
+    assert found["plain"].uplink is None
+    for name in record.uplinks:
+        kept, counted = hg.simulation.error_statistics(record, "fused", name).uplink, found[name].uplink
+        assert kept.nodes == counted.nodes
+        np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
+        np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
+
+
+def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
+    """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
+    found = statistics["fused"]["over time"]
+    assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
+    trace = np.trace(found.claimed(), axis1=1, axis2=2)
+    assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
+    with pytest.raises(ValueError, match="at most 7 steps"):
+        hg.monte_carlo(NETWORK, HORIZON + 1, 2, 3, inputs=INPUTS)
+
+
+def test_a_filter_that_claims_no_covariance_harms_no_other(statistics):
     check_filter(Silent(), [0.0])
-    assert hg.monte_carlo(network, 4, 8, 0, inputs=INPUTS[:4]).failures() == []
-    found = hg.monte_carlo(network, 4, 200, 0, hg.Statistics(), INPUTS[:4])
-    silent, linear = found["p"]["silent"], found["p"]["linear"]
-    assert silent.claim == found["fused"]["mean"].claim == "none"
+    silent, linear = statistics["b"]["silent"], statistics["b"]["linear"]
+    assert silent.claim == statistics["fused"]["mean"].claim == "none"
     assert silent.rmse()[0] > linear.rmse()[0] and linear.nees_per_dimension()[0] == pytest.approx(1, abs=0.3)
     assert np.isnan(silent.nees_per_dimension()[0]) and np.isnan(silent.mean_trace())
     assert np.isnan(silent.worst_direction().ratio) and np.isnan(silent.worst_direction().z)
     assert hg.simulation.pool([silent, linear]).claim == "none"
     with pytest.raises(ValueError, match="got the claim 'none'"):
-        hg.Network(PLANT, nodes, {"ci": hg.Fusion("silent", hg.CovarianceIntersection())})
+        hg.Network(PLANT, NODES, {"ci": hg.Fusion("silent", hg.CovarianceIntersection())})
 
 
 @pytest.mark.parametrize(

@@ -78,17 +78,17 @@ def _drawn(channel: AbstractRandomAffine, seed: int, samples: int) -> tuple[np.n
     def two_steps(key: jax.Array) -> object:
         start = channel.init(jax.random.fold_in(key, 2))
         state, h = channel.draw(start, key)
-        return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1))
+        sampled = () if channel.remembers else channel.sample(key)
+        return start, state, h, *channel.draw(state, jax.random.fold_in(key, 1)), sampled
 
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(seed), samples)
-        start, state, h, following, later = jax.jit(jax.vmap(two_steps))(keys)
+        start, state, h, following, later, sampled = jax.jit(jax.vmap(two_steps))(keys)
         assert channel.remembers or start == (), f"init: expected () of a map that forgets, got {start}"
         shapes = [jax.tree.map(lambda leaf: (leaf.shape, str(leaf.dtype)), s) for s in (start, state, following)]
         assert shapes[0] == shapes[1] == shapes[2], f"draw: expected a state like init's {shapes[0]}, got {shapes[1]}"
-        if not channel.remembers:
-            sampled = jax.jit(jax.vmap(channel.sample))(keys)
-            assert np.array_equal(h, sampled, equal_nan=True), "draw: expected what sample draws from the same key"
+        same = channel.remembers or np.array_equal(h, sampled, equal_nan=True)
+        assert same, "draw: expected what sample draws from the same key"
     drawn = np.asarray(h)
     expected_shape = (samples, channel.outputs + 1, channel.inputs + 1)
     assert drawn.shape == expected_shape, f"draw: expected shape {expected_shape[1:]}, got {drawn.shape[1:]}"

@@ -1,8 +1,11 @@
 """The same filters in other units: every state, output, measurement and input multiplied by a factor of its own."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -21,10 +24,23 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.monomials import exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
+
+
+class InUnits(eqx.Module):
+    """A function of vectors, in other units: out f(x / into_1, ...). Functions in whatever units are one program."""
+
+    function: Callable[..., ArrayLike]
+    out: np.ndarray
+    into: tuple[np.ndarray, ...]
+
+    def __call__(self, *given: jax.Array) -> jax.Array:
+        return jnp.asarray(self.out) * jnp.asarray(
+            self.function(*(x / s for x, s in zip(given, self.into, strict=True)))
+        )
 
 
 class Units(NamedTuple):
@@ -111,10 +127,8 @@ def _plant(item: AnyPlant, units: Units) -> AnyPlant:
         matrix, entry = s[:, None] * item.matrix / s, s[:, None] * item.input_matrix / u
         return LinearPlant(matrix, _noise(item.noise, s), center, law, entry, **names)
     given = item.noise
-    noise = (
-        _noise(given, s) if isinstance(given, AbstractNoise) else lambda v: np.outer(s, s) * jnp.asarray(given(v / u))
-    )
-    return Plant(lambda x, v: s * item.transition(x / s, v / u), noise, center, law, **names)
+    noise = _noise(given, s) if isinstance(given, AbstractNoise) else InUnits(given, np.outer(s, s), (u,))
+    return Plant(InUnits(item.transition, s, (s, u)), noise, center, law, **names)
 
 
 def _sensor(item: AnySensor, units: Units) -> AnySensor:
@@ -123,7 +137,7 @@ def _sensor(item: AnySensor, units: Units) -> AnySensor:
     s, r = units.states, units.outputs
     if isinstance(item, LinearSensor):
         return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs, item.circular)
-    return Sensor(lambda x: r * item.measure(x / s), _noise(item.noise, r), item.outputs, item.circular)
+    return Sensor(InUnits(item.measure, r, (s,)), _noise(item.noise, r), item.outputs, item.circular)
 
 
 def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:

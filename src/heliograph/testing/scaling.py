@@ -48,7 +48,8 @@ def check_scaling(
     """
     check_count("steps", steps)
     random = np.random.default_rng(seed)
-    world = monte_carlo(network, steps, 1, seed, inputs=inputs)
+    deaf = {name: Node(node.sensor, node.channel, {}) for name, node in _nodes(network).items()}
+    world = monte_carlo(Network(network.plant, deaf), steps, 1, seed, inputs=inputs)
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
     for rows in z.values():
         rows[random.random(rows.shape) < MISSING] = np.nan
@@ -58,6 +59,14 @@ def check_scaling(
         for common in (False, True):
             worst = max(worst, _compared(network, z, u, plain, _drawn(network, random, common), common))
     return worst
+
+
+def _nodes(network: Network) -> dict[str, Node]:
+    """The nodes, all of which hear the plant themselves."""
+    found = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    if len(found) < len(network.nodes):
+        raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
+    return found
 
 
 def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
@@ -84,7 +93,7 @@ def _compared(
     units: dict[str, Units],
     common: bool,
 ) -> float:
-    nodes = {name: _node(name, network, units[name]) for name in network.names}
+    nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
     fused = {name: _fused(name, item, units[FUSED]) for name, item in network.fused.items()}
     scaled = Network(network.plant, nodes, fused)
     shared = units[FUSED].inputs
@@ -122,10 +131,7 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
     return np.asarray(result)
 
 
-def _node(name: str, network: Network, units: Units) -> Node:
-    node = network.nodes[name]
-    if not isinstance(node, Node):
-        raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
+def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
     if not channel.remembers:
         turned = Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
