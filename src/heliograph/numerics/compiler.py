@@ -13,7 +13,8 @@ R = TypeVar("R")
 
 # The newer way of generating code for a processor takes twice as long and makes code that is 7 % faster; the last level
 # of optimisation takes a third longer, and what it gains is not seen beside the spread of the measurements (3 %).
-OPTIONS: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
+GENERATION: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False}
+OPTIMIZATION: dict[str, bool | int] = {"xla_backend_optimization_level": 2}
 
 
 def large_program(function: Callable[P, R], donate: Literal["none", "all-except-first"] = "none") -> Callable[P, R]:
@@ -33,9 +34,14 @@ def large_program(function: Callable[P, R], donate: Literal["none", "all-except-
 
 @cache
 def understood() -> dict[str, bool | int]:
-    """The options, if this release of the compiler has them: they are not part of its promises."""
+    """The options, if this release of the compiler has them: they are not part of its promises.
+
+    Where JAX is told to disable most optimizations it takes none, so that it is not asked for the second level.
+    """
+    told: bool = jax.config.read("jax_disable_most_optimizations")  # type: ignore[no-untyped-call]
+    options = GENERATION | ({} if told else OPTIMIZATION)
     try:
-        jax.jit(lambda: jnp.zeros(()), compiler_options=OPTIONS)()
+        jax.jit(lambda: jnp.zeros(()), compiler_options=options)()
     except jax.errors.JaxRuntimeError:
         return {}
-    return OPTIONS
+    return options
