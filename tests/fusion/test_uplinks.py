@@ -80,7 +80,9 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     silent = {name: np.zeros((STEPS, 1)) for name in net.nodes}
     values = {f"node {i}": np.where(lost[:, [i]], np.nan, np.zeros((STEPS, N))) for i in range(2)}
     sent = {name: hg.simulation.SentReports(v, delay[:, i]) for i, (name, v) in enumerate(values.items())}
-    found = hg.run(net, silent, reports={"everything": sent}).estimates["fused"]["everything"]
+    zeros = dict.fromkeys(net.nodes, hg.simulation.SentReports(np.zeros((STEPS, N)), np.zeros(STEPS, dtype=int)))
+    reports = {name: sent if name == "everything" else zeros for name in net.fused}
+    found = hg.run(net, silent, reports=reports).estimates["fused"]["everything"]
     arrives = ~lost & (np.arange(STEPS)[:, None] + delay < STEPS)
     np.testing.assert_allclose(found.covariance[-1], stacked(arrives), rtol=1e-9)
 

@@ -1,6 +1,8 @@
 """A linear filter computed before any data: where nothing but its mean depends on what arrives."""
 
+from collections.abc import Hashable
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple, cast
 
 import equinox as eqx
@@ -234,6 +236,17 @@ def linearised_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array
 
 def is_linear_filter(item: AbstractFilter) -> bool:
     """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
+    leaves, tree = jax.tree.flatten(item)
+    return _plans_linearly(tree, tuple(map(_described, leaves)))
+
+
+def _described(leaf: Any) -> Hashable:
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf  # type: ignore[no-untyped-call]
+
+
+@lru_cache(maxsize=256)  # a network asks again and again, of filters whose numbers make no difference
+def _plans_linearly(tree: jax.tree_util.PyTreeDef, leaves: tuple[Hashable, ...]) -> bool:
+    item = jax.tree.unflatten(tree, leaves)
     planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)
     return isinstance(planned, PlannedFilter) and planned.want is None
 

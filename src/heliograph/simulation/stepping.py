@@ -172,26 +172,30 @@ class AllFilters(eqx.Module):
 
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """The filters with what does not depend on data computed before, where all data arrive."""
+    ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
+    central = filters.central if all(filters.complete) else {}
     with jax.enable_x64(True):
-        return cast(AllFilters, to_numpy(_plan(filters, jnp.asarray(u))))
+        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.retains, jnp.asarray(u)))
+    done = dict(zip(ahead, planned, strict=True))
+    alike = tuple(done.get(i, item) for i, item in enumerate(filters.alike))
+    result = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
+    return cast(AllFilters, to_numpy(result))
 
 
 @large_program
-def _plan(filters: AllFilters, u: jax.Array) -> AllFilters:
+def _plan(
+    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], retains: bool, u: jax.Array
+) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
+    """Of these filters alone: whatever a network's fusions are, it is one program."""
+
     def one(item: AbstractFilter, retains: bool) -> AbstractFilter:
         return planned_with_past(item, u) if retains else item.planned(u)
 
-    alike = tuple(
+    planned = tuple(
         replace(item, filters=over_all(partial(one, retains=item.retains), item.count * item.nodes)(item.filters))
-        if filters.complete[item.group]
-        else item
-        for item in filters.alike
+        for item in alike
     )
-    central = {
-        name: one(item, filters.retains) if all(filters.complete) else item for name, item in filters.central.items()
-    }
-    result: AllFilters = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, central))
-    return result
+    return planned, {name: one(item, retains) for name, item in central.items()}
 
 
 def plans(filters: AllFilters) -> bool:
