@@ -1,54 +1,96 @@
-"""Random networks for the soak: a few dozen structures, each filled with numbers of its own for every network.
+"""Random networks for the soak: three dozen structures, each filled with numbers of its own for every network.
 
 The structure decides what is compiled, the numbers decide what can go wrong: scales over twelve decades, parts without
-noise or variance, links that never or always deliver, states far from zero, components that say the same.
+noise or variance, links that never or always deliver, states far from zero, components that say the same. What a number
+would decide of the structure (a link that never delivers has no random gain) is therefore the structure's.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
 
-STRUCTURES = 48
+STRUCTURES = 36
 HORIZON = 5
 SINGULAR = 0.15  # share of the variances that are zero
+KINDS = "linear", "skewed", "nonlinear"
+WIRINGS = "hops", "relays", "dropouts", "direct link"
+LOSSES = "none", "whole", "each"
+NEVER_OR_ALWAYS = {("dropouts", 2, 0): 1.0, ("dropouts", 2, 1): 0.0, ("dropouts", 0, 2): 1.0}  # wiring, round, kind
+LOST_OR_NOT = {(3, 1): 1.0, (2, 2): 0.0, (0, 2): 0.0, (3, 2): 1.0}  # of the first link that loses; wiring, round
+
+
+class Structure(NamedTuple):
+    """What the networks of one number modulo STRUCTURES have in common."""
+
+    kind: str
+    states: int
+    laws: tuple[int, ...]  # of each output's gain
+    wiring: str
+    loses: str  # what the receiver is told to be lost: nothing, all outputs at once, each for itself
+    dropped: float | None  # how often a dropout delivers, None: anything between
+    arrives: float | None  # the same of the first loss that is told
+    nodes: int
+    own_prior: bool
+    remembers: bool
+    modal: bool
+
+    @property
+    def informed(self) -> bool:
+        """Whether fusion can know the joint covariance."""
+        return self.kind == "linear" and not self.remembers and not self.own_prior and 2 not in self.laws
+
+
+def structure(number: int) -> Structure:
+    """The kinds of plant and the wirings in all combinations, three rounds of them with what else there is."""
+    kind, wiring, round_ = number % 3, number // 3 % 4, number // 12
+    random = np.random.default_rng(number)
+    outputs, linear = int(random.integers(1, 3)), kind == 0
+    return Structure(
+        KINDS[kind],
+        int(random.integers(1, 4)),
+        tuple((wiring + 2 * round_ + kind + j) % 4 for j in range(outputs)),
+        WIRINGS[wiring],
+        LOSSES[(wiring + round_) % 3],
+        NEVER_OR_ALWAYS.get((WIRINGS[wiring], round_, kind)),
+        LOST_OR_NOT.get((wiring, round_)),
+        1 if round_ == 0 else 2,
+        linear and round_ == 2 and wiring % 2 == 1,
+        linear and (round_ + wiring) % 3 == 1,
+        linear and wiring != 1,
+    )
 
 
 def network(index: int, seed: int) -> hg.Network:
     """The network of this number: its structure is index mod STRUCTURES."""
-    shape = np.random.default_rng([seed, 0, index % STRUCTURES])
-    values = np.random.default_rng([seed, 1, index])
-    n, p, nodes = int(shape.integers(1, 4)), int(shape.integers(1, 3)), int(shape.integers(1, 3))
-    kind = index % 3
-    plant = [linear_plant, skewed_plant, nonlinear_plant][kind](n, values)
-    units = 10.0 ** values.uniform(-6, 6, size=p) if kind < 2 else np.ones(p)
-    laws = [int(shape.integers(4)) for _ in range(p)]
-    wiring, erased = int(shape.integers(4)), shape.random() < 0.3
-    own, remembers, modal = shape.random() < 0.3, shape.random() < 0.3, shape.random() < 0.4
+    s, values = structure(index % STRUCTURES), np.random.default_rng([seed, 1, index])
+    linear, outputs = s.kind != "nonlinear", len(s.laws)
+    plants = {"linear": linear_plant, "skewed": skewed_plant, "nonlinear": nonlinear_plant}
+    plant = plants[s.kind](s.states, values)
+    units = 10.0 ** values.uniform(-6, 6, size=outputs) if linear else np.ones(outputs)
     result = {}
-    for number in range(nodes):
-        sensor = (nonlinear_sensor if kind == 2 else linear_sensor)(plant, units, values)
-
-        def wire(sensor: Any = sensor) -> Any:
-            return wired(wiring, [hop(law, unit, values) for law, unit in zip(laws, units, strict=True)], units, values)
-
-        channel = wire()
-        if remembers and kind == 0:
-            channel = hg.gilbert_elliott(channel, wire(), *values.uniform(0.05, 0.9, size=2), f"sight{number}")
-        filters = (nonlinear_filters if kind == 2 else linear_filters)(plant, sensor, channel, n, own)
-        world = hg.erasure(channel, chance(values)) if erased else channel
-        if kind == 0:
-            filters |= told_filters(plant, sensor, world, modal)
+    for number in range(s.nodes):
+        sensor = (linear_sensor if linear else nonlinear_sensor)(plant, units, values)
+        one = wired(s, units, values)
+        arrivals = [chance(values) for _ in one]
+        arrivals[0] = arrivals[0] if s.arrives is None else s.arrives
+        channel, world = joined(s, one), lossy(s, one, arrivals)
+        if s.remembers:
+            other, rates = wired(s, units, values), (*values.uniform(0.05, 0.9, size=2), f"sight{number}")
+            channel = hg.gilbert_elliott(channel, joined(s, other), *rates)
+            world = hg.gilbert_elliott(world, lossy(s, other, arrivals), *rates)
+        filters = (linear_filters if linear else nonlinear_filters)(plant, sensor, channel, s)
+        if s.kind == "linear":
+            filters |= told_filters(plant, sensor, world, s.modal)
         result[f"node{number}"] = hg.Node(sensor, world, filters)
-    informed = kind == 0 and not remembers and not own and 2 not in laws
-    return hg.Network(plant, result, fused(result, "linear" if kind < 2 else "cubature", informed))
+    return hg.Network(plant, result, fused(result, "linear" if linear else "cubature", s.informed))
 
 
 def chance(values: np.random.Generator) -> float:
-    """A probability, sometimes 0 or 1."""
-    return float(values.choice([0.0, 1.0, values.uniform(0.1, 0.9)], p=[0.1, 0.1, 0.8]))
+    """A probability that is neither 0 nor 1."""
+    return float(values.uniform(0.1, 0.9))
 
 
 def variance(values: np.random.Generator, scale: Any = 1.0) -> Any:
@@ -135,25 +177,36 @@ def hop(law: int, unit: float, values: np.random.Generator) -> Any:
             return hg.hop(hg.Rayleigh(float(values.uniform(0.3, 1.5))), noise)
 
 
-def wired(wiring: int, hops: list[Any], units: np.ndarray, values: np.random.Generator) -> Any:
-    """As they are; through a relay; with losses that the receiver is not told of; with a direct link beside."""
-    each = hops
-    if wiring == 1:
+def wired(s: Structure, units: np.ndarray, values: np.random.Generator) -> list[Any]:
+    """Channels of one output each: a hop; two with a relay between; with losses that the receiver is not told of."""
+    each = [hop(law, unit, values) for law, unit in zip(s.laws, units, strict=True)]
+    if s.wiring == "relays":
         more = [hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), float(variance(values, np.array(u)))) for u in units]
-        each = [hg.amplify_and_forward([a, b]) for a, b in zip(hops, more, strict=True)]
-    if wiring == 2:
-        each = [hg.dropout(one, chance(values)) for one in hops]
-    whole = hg.parallel(each)
-    if wiring == 3:
-        direct = hg.parallel([hg.hop(1.0, float(variance(values, np.array(u)))) for u in units])
-        whole = hg.with_direct_link(whole, direct)
-    return whole
+        each = [hg.amplify_and_forward([a, b]) for a, b in zip(each, more, strict=True)]
+    if s.wiring == "dropouts":
+        each = [hg.dropout(one, chance(values) if s.dropped is None else s.dropped) for one in each]
+    if s.wiring == "direct link":
+        each += [hg.hop(1.0, float(variance(values, np.array(u)))) for u in units]
+    return each
 
 
-def linear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> dict[str, Any]:
+def joined(s: Structure, each: list[Any]) -> Any:
+    """One channel of all outputs; where there are direct links, they are the second half."""
+    whole = hg.parallel(each[: len(s.laws)])
+    return whole if s.wiring != "direct link" else hg.with_direct_link(whole, hg.parallel(each[len(s.laws) :]))
+
+
+def lossy(s: Structure, each: list[Any], arrivals: list[float]) -> Any:
+    """The channel with the losses that the receiver is told of."""
+    if s.loses == "each":
+        return joined(s, [hg.erasure(one, chance) for one, chance in zip(each, arrivals, strict=True)])
+    return hg.erasure(joined(s, each), arrivals[0]) if s.loses == "whole" else joined(s, each)
+
+
+def linear_filters(plant: Any, sensor: Any, channel: Any, s: Structure) -> dict[str, Any]:
     """Every filter of a linear model; polynomial ones where the lift is small."""
     zero_mean = hg.filters.ZeroMean()
-    prior = {"initial_covariance": np.asarray(plant.initial_covariance) * 2} if own else {}
+    prior = {"initial_covariance": np.asarray(plant.initial_covariance) * 2} if s.own_prior else {}
     filters = {
         "linear": hg.linear_filter(plant, sensor, channel),
         "cubature": hg.cubature_filter(plant, sensor, channel, **prior),
@@ -163,7 +216,7 @@ def linear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> 
         "open_loop": hg.filters.open_loop_filter(plant),
         "first_degree": hg.polynomial_filter(plant, sensor, channel, HORIZON, 1),
     }
-    if n * channel.outputs <= 2:
+    if s.states * channel.outputs <= 2:
         filters["quadratic"] = hg.polynomial_filter(plant, sensor, channel, HORIZON, 2)
     return filters
 
@@ -178,7 +231,7 @@ def told_filters(plant: Any, sensor: Any, world: Any, modal: bool) -> dict[str, 
     return filters
 
 
-def nonlinear_filters(plant: Any, sensor: Any, channel: Any, n: int, own: bool) -> dict[str, Any]:
+def nonlinear_filters(plant: Any, sensor: Any, channel: Any, s: Structure) -> dict[str, Any]:
     """Every filter of a nonlinear model."""
     moments = hg.filters.PolynomialMoments(2)
     return {

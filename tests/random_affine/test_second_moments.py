@@ -113,3 +113,34 @@ def test_a_gain_with_many_uncertain_atoms_uses_the_closed_form_programme():
     low, high = moment_interval(hg.hop(law, 0.5), 2)
     assert high[0, 0] == pytest.approx(law.worst(law.values**2), rel=1e-9)
     assert low[1, 1] == pytest.approx(-law.worst(-law.values), rel=1e-9)
+
+
+def corner_cases():
+    """Every kind of map that says what its corners are, some in the place of a part of another."""
+    uncertain, known = hg.hop(GAMMA, 0.3), hg.hop(hg.Rayleigh(1.0), 0.2)
+    lost = hg.dropout(uncertain, 0.7, 0.1)
+    many = hg.parallel([lost, hg.amplify_and_forward([uncertain, hg.hop(XI, 0.1)])])
+    series = hg.random_affine.Series([many, hg.hop(GAMMA, np.diag([0.1, 0.2]))])
+    return [
+        uncertain,
+        known,
+        hg.hop(hg.random_affine.GivenMoments([1.0, 2.0]), 0.1),
+        lost,
+        many,
+        series,
+        hg.erasure(known, 0.5),
+    ]
+
+
+@pytest.mark.parametrize("channel", corner_cases(), ids=lambda channel: type(channel).__name__)
+def test_moments_at_corners_are_those_of_the_extremes(channel):
+    """Their entries are sums of a few dozen terms of one size, in another order: equal to rounding."""
+    if channel.erases:
+        assert channel.corner_count() == len(channel.extremes())
+        return
+    for order in (1, 2):
+        expected = [one.moments(order).matrix for one in channel.extremes()]
+        found = channel.corner_moments(order)
+        assert len(found) == channel.corner_count()
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
+        np.testing.assert_allclose(channel.moments(2).lower(order), channel.moments(order).matrix, rtol=1e-13)

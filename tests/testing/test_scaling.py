@@ -53,6 +53,30 @@ def test_a_mixture():
     assert check_scaling(hg.Network(plant, {"node": hg.Node(sensor, channel, filters)})) <= 1
 
 
+def test_links_that_remember_and_losses_that_are_told():
+    """By mode and by what arrives; of a lost packet the moments of what would have come are compared."""
+    plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], np.diag([0.1, 0.02]), [1.0, -2.0], np.diag([1.0, 0.5]))
+    sensor = hg.LinearSensor([[1.0, 0.5]], 0.1)
+    good, bad = hg.hop(hg.Rayleigh(0.8), 0.1), hg.hop(0.3, 0.2)
+    channel = hg.gilbert_elliott(good, bad, 0.2, 0.4)
+    filters = {
+        "linear": hg.linear_filter(plant, sensor, channel),
+        "told": hg.filters.told_filter(plant, sensor, hg.erasure(good, 0.7)),
+        "imm": hg.filters.imm_filter(plant, sensor, channel),
+    }
+    nodes = {"mine": hg.Node(sensor, channel, filters), "lossy": hg.Node(sensor, hg.erasure(good, 0.7), filters)}
+    assert check_scaling(hg.Network(plant, nodes), steps=3) <= 1
+
+
+def test_a_flag_has_no_unit():
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    channel = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.hop(0.3, 0.2), 0.2, 0.4)
+    flagged = hg.filters.told_filter(plant, sensor, channel, np.eye(2))
+    node = hg.Node(sensor, hg.model.with_flag(channel), {"flagged": flagged})
+    with pytest.raises(ValueError, match="filter to rescale"):
+        check_scaling(hg.Network(plant, {"node": node}))
+
+
 def test_a_nonlinear_network_with_inputs_and_states_known_exactly():
     plant = hg.Plant(
         lambda x, u: jnp.stack([x[0] + u[0] * x[1], x[1] - u[0] * jnp.sin(x[0]), x[2]]),

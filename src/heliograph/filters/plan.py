@@ -1,6 +1,5 @@
 """A linear filter computed before any data: where nothing but its mean depends on what arrives."""
 
-from collections.abc import Hashable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, NamedTuple, cast
@@ -237,17 +236,21 @@ def linearised_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array
 def is_linear_filter(item: AbstractFilter) -> bool:
     """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
     leaves, tree = jax.tree.flatten(item)
-    return _plans_linearly(tree, tuple(map(_described, leaves)))
+    return _is_linear(tree, tuple(map(_shape, leaves)))
 
 
-def _described(leaf: Any) -> Hashable:
-    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf  # type: ignore[no-untyped-call]
+def _shape(leaf: Any) -> Any:
+    if not eqx.is_array(leaf):
+        return leaf
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # type: ignore[no-untyped-call]
 
 
-@lru_cache(maxsize=256)  # a network asks again and again, of filters whose numbers make no difference
-def _plans_linearly(tree: jax.tree_util.PyTreeDef, leaves: tuple[Hashable, ...]) -> bool:
-    item = jax.tree.unflatten(tree, leaves)
-    planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)
+@lru_cache(maxsize=1024)
+def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[Any, ...]) -> bool:
+    """What numbers have no part in, so that filters of one structure are traced once."""
+    with jax.enable_x64(True):
+        item = jax.tree.unflatten(tree, leaves)
+        planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)
     return isinstance(planned, PlannedFilter) and planned.want is None
 
 

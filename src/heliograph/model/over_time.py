@@ -67,7 +67,7 @@ def structure(item: object) -> Hashable:
     return _structure(*jax.tree.flatten(item))
 
 
-def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
+def _structure(leaves: Sequence[object], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 

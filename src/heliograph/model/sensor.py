@@ -13,6 +13,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
+from heliograph.numerics.kept import kept
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
@@ -109,6 +110,7 @@ def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, .
 AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
 
 
+@kept
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
     instance("sensor", sensor, AbstractSensor, "a sensor")

@@ -1,14 +1,14 @@
 """The atom of the algebra: one random gain times a matrix, plus noise."""
 
-from itertools import pairwise
-
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.traced import library, stacked
+from heliograph.numerics.kept import kept
+from heliograph.numerics.traced import library, placed, stacked
 from heliograph.random_affine.base import AbstractRandomAffine, Moments
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.monomials import (
@@ -54,21 +54,41 @@ class GainAndNoise(AbstractRandomAffine):
         )
         return jnp.concatenate([top, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
+    @property
+    def remembers(self) -> bool:
+        """It holds no map."""
+        return False
+
+    @kept
     def moments(self, order: int) -> Moments:
-        """E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)]."""
+        """sum_k E[g^k] B_k, with the `gain_coefficients`."""
+        gains = gain_moments(self.law, order)
+        basis = self.gain_coefficients(order)
+        return Moments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
+
+    @kept
+    def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
+        """B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], where |b| = k."""
         rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)
         refuse_if_too_large(rows, columns, f"moments of order {order}")
         deterministic = symmetric_power(homogeneous(self.matrix), order)  # rows (A y)^b, made homogeneous with 1
         row, column, rest, ways = sum_plan(self.outputs, order)
-        gains = gain_moments(self.law, order)[degrees(self.outputs, order)]
-        terms = ways * noise_vector(self.noise, order)[rest] * gains[column]
-        ends = np.searchsorted(row, np.arange(rows + 1))  # the terms of a row stand together
-        matrix = stacked([terms[a:b] @ deterministic[column[a:b]] for a, b in pairwise(ends)])
-        return Moments(matrix, self.outputs, self.inputs, order)
+        terms = (ways * noise_vector(self.noise, order)[rest])[:, None] * deterministic[column]
+        return placed((order + 1, rows, columns), (degrees(self.outputs, order)[column], row), terms)
 
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """One map for each extreme law of the gain."""
         return tuple(GainAndNoise(law, self.matrix, self.noise) for law in self.law.extremes())
+
+    def corner_count(self) -> int:
+        """Of the law."""
+        return len(self.law.corner_moments(0))
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
+        """The moments with E[g^k] of each extreme law."""
+        gains, basis = self.law.corner_moments(order), self.gain_coefficients(order)
+        result: jax.Array | np.ndarray = library(gains, basis).tensordot(gains, basis, axes=1)
+        return result
 
     def mean_gain(self) -> AbstractRandomAffine:
         """E[g] A y + n."""

@@ -1,6 +1,7 @@
 """What a random affine map z = G y + n is: a sampler and joint moments of one matrix H = [[G, n], [0, 1]]."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -10,8 +11,9 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, items, shown
+from heliograph.numerics.plain_methods import plain_methods
 from heliograph.numerics.readable import readable
-from heliograph.numerics.traced import is_traced
+from heliograph.numerics.traced import is_traced, stacked
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.monomials import exponents, monomials
 
@@ -35,15 +37,29 @@ class Moments(eqx.Module):
     @property
     def mean(self) -> Float[jax.Array | np.ndarray, "outputs+1 inputs+1"]:
         """E[H] of shape (outputs + 1, inputs + 1), read off the monomials z_i 1^(k-1)."""
-        rows = [i for i, powers in enumerate(exponents(self.outputs + 1, self.order)) if powers[-1] >= self.order - 1]
-        columns = [i for i, powers in enumerate(exponents(self.inputs + 1, self.order)) if powers[-1] >= self.order - 1]
-        return self.matrix[np.ix_(rows, columns)]
+        return self.lower(1)
+
+    def lower(self, order: int) -> Float[jax.Array | np.ndarray, "rows columns"]:
+        """E[Sym^order(H)] of a lower order, whose monomials are among these."""
+        matrix: jax.Array | np.ndarray = self.matrix[_among(self.outputs, self.inputs, self.order, order)]
+        return matrix
 
     def expect(self, y_moments: Float[jax.Array | np.ndarray, " columns"]) -> Float[jax.Array | np.ndarray, " rows"]:
         """E[mono_k(z)] from E[mono_k(y)], for y independent of the map."""
         return self.matrix @ y_moments
 
 
+@cache
+def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, ...]:
+    """Where monomials of degree `low` in (z, 1) and (y, 1) stand among those of degree `high`, times powers of 1."""
+    each = [
+        [i for i, powers in enumerate(exponents(size + 1, high)) if powers[-1] >= high - low]
+        for size in (outputs, inputs)
+    ]
+    return np.ix_(*each)
+
+
+@plain_methods
 @readable
 class AbstractRandomAffine(eqx.Module):
     """A random affine map z = G y + n, one at each step.
@@ -141,6 +157,10 @@ class AbstractRandomAffine(eqx.Module):
     def corner_count(self) -> int:
         """Number of maps that `extremes` lists."""
         return len(self.extremes())
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner rows columns"]:
+        """E[Sym^order(H)] of each of the `extremes`."""
+        return stacked([m.moments(order).matrix for m in self.extremes()])
 
     def mean_gain(self) -> "AbstractRandomAffine":
         """The map that trusts each mean gain as the truth; noises stay."""

@@ -9,10 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail
+from heliograph.numerics.kept import kept
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
@@ -27,6 +28,8 @@ from heliograph.random_affine.monomials import (
 )
 from heliograph.random_affine.noise import Gaussian, Matrix, Vector
 
+Corners = Float[jax.Array | np.ndarray, "corner rows columns"]
+
 
 class _Parts(AbstractRandomAffine):
     """What holds several maps: its state is the tuple of theirs, and all of them move at each draw."""
@@ -37,6 +40,11 @@ class _Parts(AbstractRandomAffine):
     def erases(self) -> bool:
         """Whether one of the maps does."""
         return any(m.erases for m in self.maps)
+
+    @property
+    def remembers(self) -> bool:
+        """Whether one of the maps does."""
+        return any(m.remembers for m in self.maps)
 
     def _init(self, key: jax.Array) -> PyTree[jax.Array]:
         """The maps' states."""
@@ -79,6 +87,7 @@ class Series(_Parts):
         then = _after if self.erases else jnp.matmul
         return state, reduce(lambda h, part: then(part, h), drawn)
 
+    @kept
     def moments(self, order: int) -> Moments:
         """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
@@ -89,6 +98,15 @@ class Series(_Parts):
     def extremes(self) -> tuple[AbstractRandomAffine, ...]:
         """All combinations of the parts' extremes: moments are linear in the law of each part."""
         return tuple(Series(parts) for parts in product(*(m.extremes() for m in self.maps)))
+
+    @kept
+    def corner_moments(self, order: int) -> Corners:
+        """Products of the parts' corners."""
+        first, *rest = (m.corner_moments(order) for m in self.maps)
+        for part in rest:
+            each = part @ first[:, None]
+            first = each.reshape(-1, *each.shape[2:])
+        return first
 
     def corner_count(self) -> int:
         """Product of the parts' counts."""
@@ -134,6 +152,7 @@ class Mixture(_Parts):
         state, drawn = self._draw_each(state, keys)
         return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
+    @kept
     def moments(self, order: int) -> Moments:
         """sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
@@ -150,9 +169,19 @@ class Mixture(_Parts):
             for parts in product(*(m.extremes() for m in self.maps))
         )
 
+    @kept
+    def corner_moments(self, order: int) -> Corners:
+        """The corners of the weights, with every combination of the maps' corners."""
+        parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
+        chosen = np.array(list(product(*(range(len(part)) for part in parts)))).T
+        combined = stacked([part[one] for part, one in zip(parts, chosen, strict=True)])
+        each = library(weights, combined).tensordot(weights, combined, axes=1)
+        result: Matrix = each.reshape(-1, *each.shape[2:])
+        return result
+
     def corner_count(self) -> int:
         """Extreme weights times the product of the maps' counts."""
-        return len(self.choice.extremes()) * prod(m.corner_count() for m in self.maps)
+        return len(self.choice.corners()) * prod(m.corner_count() for m in self.maps)
 
     def mean_gain(self) -> AbstractRandomAffine:
         """Deterministic mean gain, with the noise covariance that the mixture has about E[n]."""
@@ -190,11 +219,13 @@ class Stack(_Parts):
         rows = [h[:-1] for h in drawn]
         return state, jnp.concatenate([*rows, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
+    @kept
     def moments(self, order: int) -> Moments:
         """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
-        tables = [[m.moments(k).matrix if k else None for k in range(order + 1)] for m in self.maps]
+        each = [m.moments(order) for m in self.maps]
+        tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in each]
         rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
         return Moments(stacked(rows), self.outputs, self.inputs, order)
 

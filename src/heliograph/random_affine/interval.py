@@ -9,7 +9,7 @@ from heliograph.numerics.traced import library, placed, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Series, Stack
-from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.lift import Lift
 from heliograph.random_affine.monomials import count, exponents, position, product_table
 
@@ -31,8 +31,7 @@ def moment_interval(channel: AbstractRandomAffine, order: int) -> Interval:
     check_forgets("channel of a bound", channel)
     corners = _corner_count(channel)
     if corners is not None and corners <= CORNERS:
-        each = [extreme.moments(order).matrix for extreme in channel.extremes()]
-        matrices = stacked(each)
+        matrices = channel.corner_moments(order)
         return matrices.min(axis=0), matrices.max(axis=0)
     match channel:
         case Series():
@@ -67,24 +66,13 @@ def _multiply_matrices(second: Interval, first: Interval) -> Interval:
 
 def _atom_interval(channel: GainAndNoise, law: Discrete, order: int) -> Interval:
     """Moments are sum_k E[g^k] B_k with known B_k; each E[g^k] has its exact range from the closed-form LP."""
-    basis, ends = [], []
-    for k in range(order + 1):
-        basis.append(_gain_coefficient(channel, k, order))
-        ends.append((-law.worst(-(law.values**k)), law.worst(law.values**k)) if k else (1.0, 1.0))
+    basis = channel.gain_coefficients(order)
+    ends = [(-law.worst(-(law.values**k)), law.worst(law.values**k)) if k else (1.0, 1.0) for k in range(order + 1)]
     xp = library(basis)
     products = [
         (xp.minimum(b * lo, b * hi), xp.maximum(b * lo, b * hi)) for b, (lo, hi) in zip(basis, ends, strict=True)
     ]
     return sum(low for low, _ in products), sum(high for _, high in products)
-
-
-def _gain_coefficient(channel: GainAndNoise, k: int, order: int) -> Entries:
-    """Coefficient of g^k in the moments, a polynomial of degree `order` in a constant gain g, by interpolation."""
-    nodes = np.arange(order + 1, dtype=np.float64)
-    values = [GainAndNoise(Constant(g), channel.matrix, channel.noise).moments(order).matrix for g in nodes]
-    weights = np.linalg.inv(np.vander(nodes, increasing=True))[k]
-    result: Entries = sum(w * v for w, v in zip(weights, values, strict=True))
-    return result
 
 
 def _stack_interval(channel: Stack, order: int) -> Interval:

@@ -16,8 +16,10 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
+from heliograph.numerics.kept import kept
+from heliograph.numerics.plain_methods import plain_methods
 from heliograph.numerics.readable import readable
-from heliograph.numerics.traced import is_traced, library, plain, scipy_for
+from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
 
 Scalar = Float[jax.Array | np.ndarray, ""]
 Vector = Float[jax.Array | np.ndarray, " n"]
@@ -25,6 +27,7 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
+@plain_methods
 @readable
 class AbstractLaw(eqx.Module):
     """A law of a real random gain, independent over time.
@@ -43,6 +46,10 @@ class AbstractLaw(eqx.Module):
     def extremes(self) -> tuple["AbstractLaw", ...]:
         """Laws at the corners of what is possible; the law itself when it is known."""
         return (self,)
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
+        """E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        return stacked([stacked([law.moment(k) for k in range(order + 1)]) for law in self.extremes()])
 
     def mean_law(self) -> "Constant":
         """The law that a filter trusts which takes the mean gain as the truth."""
@@ -103,14 +110,28 @@ class Discrete(AbstractLaw):
         return total
 
     def extremes(self) -> tuple[AbstractLaw, ...]:
-        """Laws at all corners of the polytope: every probability but one at an end of its interval.
+        """Laws at all corners of the polytope.
+
+        Raises:
+            ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
+        """
+        return tuple(Discrete(self.values, corner) for corner in self.corners())
+
+    def corner_moments(self, order: int) -> Float[jax.Array | np.ndarray, "corner order+1"]:
+        """E[g^k], k = 0, ..., order, of each of the `extremes`."""
+        corners = self.corners()
+        return stacked([corners @ self.values**k for k in range(order + 1)]).T
+
+    @kept
+    def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
+        """Corners of the polytope of probabilities: each but one at an end of its interval.
 
         Raises:
             ValueError: more than CORNER_LIMIT uncertain atoms, whose corners are too many to list.
         """
         free = np.flatnonzero(self.radius > 0)
         if len(free) < 2:  # a single uncertain probability cannot move: the others hold the sum
-            return (Discrete(self.values, self.probabilities),)
+            return self.probabilities[None]
         if len(free) > CORNER_LIMIT:
             raise fail("uncertain probabilities of one gain", f"at most {CORNER_LIMIT}", len(free))
         low = np.maximum(self.probabilities - self.radius, 0.0)
@@ -125,7 +146,7 @@ class Discrete(AbstractLaw):
                 corner[slack] = 1.0 - corner.sum()
                 if low[slack] - 1e-12 <= corner[slack] <= high[slack] + 1e-12:
                     corners.add(tuple(np.round(np.clip(corner, 0.0, 1.0), 15)))
-        return tuple(Discrete(self.values, np.array(c) / sum(c)) for c in sorted(corners))
+        return np.array([np.array(c) / sum(c) for c in sorted(corners)])
 
 
 def bernoulli(probability: ArrayLike, radius: ArrayLike = 0.0) -> Discrete:

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from heliograph.numerics.kept import kept
 from heliograph.numerics.small_matrix import add, contract, diagonal
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
@@ -100,6 +101,7 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
     return False
 
 
+@kept
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """Worst cases over the polytope of probabilities: exact for a gain common to all components, else dominating.
 
@@ -113,19 +115,20 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     check_forgets("channel of a filter", channel)
     nominal = channel.moments(2)
     mean = nominal.mean[:-1]
-    if _is_known(channel):
+    known = _is_known(channel)
+    if known:
         spread, shift, power = _tensors(nominal, mean)
         parts = [QuadraticMap(t, np.zeros(t.shape)) for t in (spread, shift, power)]
     elif isinstance(channel, Stack):
         parts = _from_stack(channel)
     elif _few_corners(channel):
-        stacks = zip(*(_tensors(extreme.moments(2), mean) for extreme in channel.extremes()), strict=True)
+        corners = (Moments(one, nominal.outputs, nominal.inputs, 2) for one in channel.corner_moments(2))
+        stacks = zip(*(_tensors(one, mean) for one in corners), strict=True)
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
-    return SecondOrder(
-        mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], nominal_spread(channel), not _is_known(channel)
-    )
+    own = parts[0] if known else nominal_spread(channel)
+    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], own, not known)
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,11 +14,15 @@ from heliograph.filters.centre import Centre
 from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.linear import LinearFilter
 from heliograph.filters.mixture import Components, MixtureFilter
+from heliograph.filters.modal import Heard, ModalFilter
+from heliograph.filters.multiple_model import MultipleModelFilter
 from heliograph.filters.open_loop import OpenLoop
 from heliograph.filters.polynomial import PolynomialFilter
 from heliograph.filters.prediction import PredictionFilter
 from heliograph.filters.scheduled import LinearSystemFilter
 from heliograph.filters.sequential import SequentialFilter
+from heliograph.filters.told import Told, ToldFilter
+from heliograph.filters.uncertain import UncertainModalFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
@@ -28,6 +32,8 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.monomials import exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
 from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
+
+Modes = TypeVar("Modes", Told, Heard)  # a channel at one step, mode by mode
 
 
 class InUnits(eqx.Module):
@@ -85,6 +91,12 @@ def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
             assert isinstance(item.inner, LinearSystemFilter)
             inner = _system(item.inner, item.degree, units)
             return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
+        case ModalFilter() | UncertainModalFilter():
+            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
+        case ToldFilter(flagged=False) | MultipleModelFilter():
+            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
         case PredictionFilter():
             return PredictionFilter(_gaussian(rescaled(item.base, units)))
         case SequentialFilter():
@@ -148,8 +160,7 @@ def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTi
 
 def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
     """The description of z = Q G R^-1 y + Q n."""
-    q, r = units.received, np.append(units.outputs, 1.0)
-    factor = (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
+    q, (_, factor) = units.received, _of_channel(units)
 
     def scaled(part: QuadraticMap) -> QuadraticMap:
         return QuadraticMap(factor * part.center, factor * part.radius)
@@ -157,6 +168,20 @@ def rescaled_channel(item: SecondOrder, units: Units) -> SecondOrder:
     gain, offset = q[:, None] * item.mean_gain / units.outputs, q * item.offset
     spread, shift, power, nominal = map(scaled, (item.spread, item.shift, item.power, item.nominal))
     return SecondOrder(gain, offset, spread, shift, power, nominal, item.uncertain)
+
+
+def _of_channel(units: Units) -> tuple[Float[np.ndarray, "m p1"], Float[np.ndarray, "m m p1 p1"]]:
+    """Factors of (G, n) and of a tensor of second moments."""
+    q, r = units.received, np.append(units.outputs, 1.0)
+    return q[:, None] / r, (q[:, None] * q)[:, :, None, None] / (r[:, None] * r)
+
+
+def _by_mode(item: Modes | OverTime, units: Units) -> Modes | OverTime:
+    """The description of z = Q G R^-1 y + Q n for each mode."""
+    values: Modes = item.values if isinstance(item, OverTime) else item
+    of_mean, of_spread = _of_channel(units)
+    scaled: Modes = replace(values, mean=of_mean * values.mean, spread=of_spread * values.spread)
+    return OverTime(scaled) if isinstance(item, OverTime) else scaled
 
 
 def _components(item: Components | OverTime, units: Units) -> Components | OverTime:

@@ -9,6 +9,7 @@ from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.linear import LinearFilter
 from heliograph.filters.prediction import PredictionFilter
 from heliograph.filters.sequential import SequentialFilter
+from heliograph.fusion.informed import ScalarWeights
 from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import first
@@ -17,6 +18,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, second_order
+from heliograph.random_affine.told import outcomes
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
@@ -48,8 +50,7 @@ def check_scaling(
     """
     check_count("steps", steps)
     random = np.random.default_rng(seed)
-    deaf = {name: Node(node.sensor, node.channel, {}) for name, node in _nodes(network).items()}
-    world = monte_carlo(Network(network.plant, deaf), steps, 1, seed, inputs=inputs)
+    world = monte_carlo(_unheard(network), steps, 1, seed, inputs=inputs)
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
     for rows in z.values():
         rows[random.random(rows.shape) < MISSING] = np.nan
@@ -67,6 +68,13 @@ def _nodes(network: Network) -> dict[str, Node]:
     if len(found) < len(network.nodes):
         raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
     return found
+
+
+def _unheard(network: Network) -> Network:
+    """The network without its filters, of which what is measured does not depend, unless a sensor hears back."""
+    told = {name: node.told_by is not None for name, node in _nodes(network).items()}
+    nodes = {n: node if told[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
+    return Network(network.plant, nodes)
 
 
 def _drawn(network: Network, random: np.random.Generator, common: bool) -> dict[str, Units]:
@@ -133,9 +141,9 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
 
 def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
-    if not channel.remembers:
-        turned = Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
-        off = _apart(rescaled_channel(second_order(channel), units), second_order(turned))
+    for part in [] if channel.remembers else [one.map for one in outcomes(channel)]:
+        turned = Series([known(np.diag(1 / units.outputs)), part, known(np.diag(units.received))])
+        off = _apart(rescaled_channel(second_order(part), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
     return Node(node.sensor, node.channel, {f: rescaled(item, units) for f, item in node.filters.items()})
 
@@ -171,7 +179,7 @@ def _searches(network: Network, node: str, name: str) -> bool:
     item = network.fused[name]
     if isinstance(item, AbstractFilter):
         return _minimises(item)
-    if isinstance(item.rule, CovarianceIntersection | InverseCovarianceIntersection):
+    if isinstance(item.rule, CovarianceIntersection | InverseCovarianceIntersection | ScalarWeights):
         return True
     return any(_minimises(network.nodes[n].filters[item.filter]) for n in network.nodes_with(item.filter))
 

@@ -1,0 +1,46 @@
+"""What was worked out of an object that never changes, kept as long as the object lives."""
+
+from collections.abc import Callable, Hashable
+from functools import wraps
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from weakref import ref
+
+import jax
+import numpy as np
+
+from heliograph.numerics.traced import is_traced
+
+S = TypeVar("S")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def kept(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """The function, which works out but once what it finds of each object that is its first argument.
+
+    An object is known by itself, so that nothing is compared, and forgotten with it. What is found can no longer be
+    written to, since others have it too; what JAX traces is never kept.
+    """
+    found: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
+
+    @wraps(function)
+    def known(item: S, *rest: P.args, **named: P.kwargs) -> T:
+        place, asked = id(item), (rest, tuple(named.items()))
+        answers = found[place][1] if place in found else {}
+        if asked in answers:
+            return answers[asked]
+        result = function(item, *rest, **named)
+        if is_traced(result):
+            return result
+        for leaf in jax.tree.leaves(result):
+            _close(leaf)
+        answers[asked] = result
+        found.setdefault(place, (ref(item, lambda _: found.pop(place, None)), answers))
+        return result
+
+    return cast(Callable[Concatenate[S, P], T], known)
+
+
+def _close(leaf: Any) -> None:
+    if isinstance(leaf, np.ndarray):
+        leaf.setflags(write=False)
