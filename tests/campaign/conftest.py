@@ -1,12 +1,23 @@
+"""One campaign that ran undisturbed, for all modules of this folder, and what is compiled for its network."""
+
 import pytest
 
-from heliograph.campaign.run import run_campaign
-from tests.campaign.example import CHUNKS, contents, write
+from tests.conftest import forget
+
+
+@pytest.fixture(scope="package", autouse=True)
+def forget_compiled_programs():
+    """Only after the last of them."""
+    yield
+    forget()
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory):
     """The results of a campaign that ran undisturbed in one process."""
+    from heliograph.campaign.run import run_campaign  # not before tests/conftest.py has told JAX how to compile
+    from tests.campaign.example import CHUNKS, write
+
     folder = tmp_path_factory.mktemp("undisturbed")
     result = run_campaign(write(folder), folder / "out", workers=0)
     assert (result.already, result.computed, result.failures) == (0, CHUNKS, [])
@@ -15,4 +26,6 @@ def finished(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def expected(finished):
+    from tests.campaign.example import contents
+
     return contents(finished)

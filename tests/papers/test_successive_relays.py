@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.papers.successive_relays import run, setting
+from heliograph.papers.successive_relays import compute, run, setting
 from heliograph.papers.successive_relays.misprints import used_before_known
 from heliograph.papers.successive_relays.printed import by_filter, recursion
 from heliograph.papers.successive_relays.run import reproduce, results
@@ -28,6 +28,7 @@ def found(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduction")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "results", told)
+        patch.setattr(compute, "SWEEPS", 20)  # of a design that is drawn, and in no number tested here
         run.reproduce(out, runs=RUNS, seed=2)
     return kept[0], out / "successive-relays"
 

@@ -5,7 +5,7 @@ import json
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -117,9 +117,13 @@ def from_json(text: str) -> Campaign:
 
 def versions() -> dict[str, str]:
     """What decides about the store's bytes beside the campaign: packages, and how JAX is told to compute."""
-    packages = {name: version(name) for name in BITWISE}
     settings = {name: str(jax.config.values[name]) for name in SETTINGS}
-    return packages | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
+    return _packages() | {"XLA_FLAGS": os.environ.get("XLA_FLAGS", ""), "device": jax.default_backend()} | settings
+
+
+@cache
+def _packages() -> dict[str, str]:
+    return {name: version(name) for name in BITWISE}  # each read from a file: every job of a campaign asks
 
 
 @lru_cache(maxsize=8)

@@ -106,7 +106,8 @@ def homogeneous(matrix: Matrix) -> Matrix:
 
 def gain_moments(law: AbstractLaw, order: int) -> Vector:
     """E[g^k] for k = 0, ..., order."""
-    return stacked([law.moment(k) for k in range(order + 1)])
+    moment = law.moment  # of a module, whose methods are slow to look up
+    return stacked([moment(k) for k in range(order + 1)])
 
 
 def known(matrix: ArrayLike, offset: ArrayLike | None = None) -> GainAndNoise:

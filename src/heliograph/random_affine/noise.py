@@ -1,7 +1,7 @@
 """Laws of an additive noise vector: each samples itself and knows its joint moments E[n^a]."""
 
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, singledispatch
 
 import equinox as eqx
 import jax
@@ -195,7 +195,8 @@ class Shaped(AbstractNoise):
         for i, power in enumerate(powers):
             for _ in range(power):
                 polynomial = _times_linear(polynomial, self.matrix[i])
-        return sum(c * (self.source.moment(a) if any(a) else 1.0) for a, c in polynomial.items())
+        moment = self.source.moment
+        return sum(c * (moment(a) if any(a) else 1.0) for a, c in polynomial.items())
 
 
 def _times_linear(polynomial: dict[Exponents, Number], row: Vector) -> dict[Exponents, Number]:
@@ -235,6 +236,8 @@ def components(value: AbstractNoise | ArrayLike) -> int | None:
     return shape[0] if shape else None
 
 
+@singledispatch
 def noise_vector(noise: AbstractNoise, order: int) -> Vector:
     """E[mono_order(n)] of a noise law: all moments up to `order`, (C(dimension + order, order),)."""
-    return stacked([noise.moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])
+    moment = noise.moment  # of a module, whose methods are slow to look up
+    return stacked([moment(powers[:-1]) for powers in exponents(noise.dimension + 1, order)])

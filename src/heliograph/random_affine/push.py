@@ -21,6 +21,7 @@ from heliograph.random_affine.monomials import (
     Exponents,
     count,
     degrees,
+    exponents,
     position,
     product_table,
     sum_plan,
@@ -105,6 +106,18 @@ class Tabulated(AbstractNoise):
     def moment(self, powers: Exponents) -> Number:
         """Look E[n^a] up."""
         return plain(self.table[position(len(powers) + 1, self.order)[(*powers, self.order - sum(powers))]])
+
+
+@noise_vector.register
+def _(noise: Tabulated, order: int) -> Array1:
+    return noise.table[_lower(noise.dimension, order, noise.order)]
+
+
+@cache
+def _lower(dimension: int, order: int, above: int) -> np.ndarray:
+    """Where the monomials of total degree `order` in (n, 1) stand among those of degree `above`."""
+    places = position(dimension + 1, above)
+    return np.array([places[(*p[:-1], p[-1] + above - order)] for p in exponents(dimension + 1, order)])
 
 
 def second_moments(moments: Array1, variables: int, degree: int) -> Array2:

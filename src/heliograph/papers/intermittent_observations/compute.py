@@ -15,6 +15,7 @@ RUNS = 4000
 HORIZON, SETTLED = 100, 50  # steps of a run, and of them those before E P has settled
 PATTERNS = 17  # steps over which all patterns of losses are listed
 ITERATIONS = 150  # of the modified Riccati equation in two forms
+POINTS = 36  # of a curve
 DIGITS = 1e-7  # of a threshold that is searched on a network
 APART = 0.005  # how far from a threshold verdicts are asked for
 
@@ -198,7 +199,7 @@ def typical(arrival: float, runs: int, seed: int) -> float:
 
 def curves(example: Example) -> Curves:
     """Bounds over arrival probabilities, and E P where there is a quadrature for it."""
-    arrival = np.linspace(0.3, 1.0, 36)
+    arrival = np.linspace(0.3, 1.0, POINTS)
     upper, below, mean = [], [], []
     for p in arrival:
         judged, least = judge(example, setting.lossy(p)), lower(example, 1 - p, p)
@@ -211,7 +212,7 @@ def curves(example: Example) -> Curves:
 
 def burst_curve(fail: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Recovery, the bound on E P, and E P, of the scalar example; NaN where there is none."""
-    recover = np.linspace(0.3, 1.0, 36)
+    recover = np.linspace(0.3, 1.0, POINTS)
     judged = [judge(setting.SCALAR, setting.bursts(fail, r)) for r in recover]
     upper = np.array([float("nan") if j.bound is None else float(np.trace(j.bound)) for j in judged])
     pairs = zip(recover, upper, strict=True)

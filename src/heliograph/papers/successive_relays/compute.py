@@ -1,6 +1,7 @@
 """Every number of the reproduction: designs, steady states, certificates, misprints and the simulation."""
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from heliograph.papers.successive_relays.printed import MISPRINTS, by_filter, re
 from heliograph.relays.design import GainsByFilter
 
 RUNS = 20_000
+SWEEPS = 400  # of the design at the paper's power: its multipliers settle slowly
 STEADY = 1500  # steps after which a recursion is taken as settled: the plant forgets by 0.98 a step
 FILTERS = ("relay_1", "relay_2", "receiver")
 
@@ -64,7 +66,7 @@ def compute(runs: int = RUNS, seed: int = 0, advance: Callable[[str], None] = la
     advance("designing over the horizon")
     paper = hg.relays.own_error_design(network, setting.HORIZON)
     tuned = hg.relays.receiver_error_design(network, setting.HORIZON)
-    bounded = hg.relays.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power(), sweeps=400)
+    bounded = hg.relays.receiver_error_design(network, setting.HORIZON, power_limit=paper.total_power(), sweeps=SWEEPS)
     behind = hg.relays.receiver_behind_relays(network, paper.gains)
     advance("designing the steady state")
     states = steady(network)
@@ -135,6 +137,7 @@ def limits(paper: hg.relays.RelayDesign) -> dict[str, float]:
     return {**filtered, "nothing_heard": float(np.trace(covariance))}
 
 
+@cache
 def misprinted(name: str, process: float = setting.VARIANCE, sensor: float = setting.VARIANCE) -> Misprinted:
     """What a misprint does to the trace that is claimed, and to the true one, at k = 0 .. STEADY."""
     right, wrong = recursion("none", STEADY, process, sensor), recursion(name, STEADY, process, sensor)

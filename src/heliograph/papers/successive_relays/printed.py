@@ -3,6 +3,7 @@
 Everything at k - 1 unless marked; even k: relay 1 receives and relay 2 transmits, odd k the other way round.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ class Recursion(NamedTuple):
     remote_trace: np.ndarray  # (N + 1,)
 
 
+@cache  # every misprint is compared with the same right one
 def recursion(
     misprint: str, horizon: int, process: float = setting.VARIANCE, sensor: float = setting.VARIANCE
 ) -> Recursion:
