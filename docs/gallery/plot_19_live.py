@@ -15,11 +15,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.live.event import Event
-from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.lanes import Lanes
-from heliograph.serving.nowhere import Nowhere
-from heliograph.serving.replay import Link, lines, through
-from heliograph.serving.service import Service
+from heliograph.serving import Fleet, Lanes, Link, Nowhere, Options, Service, lines, through
 
 turn = 0.15 * np.array([[0.0, 1.0], [-1.0, 0.0]])  # an oscillation of some forty steps
 plant = hg.LinearPlant(np.eye(2) + turn, np.diag([0.01, 0.4]), [0.0, 3.0], 0.1 * np.eye(2), states=["x", "v"])
