@@ -3,7 +3,7 @@ Learning a link from what came through it
 =========================================
 
 Nobody has measured how a link fades, or how loud its receiver's noise is. What arrived tells it, without any
-knowledge of the true state: write `hg.free(start)` where a number is unknown, and `hg.fit` finds the numbers
+knowledge of the true state: write ``hg.free(start)`` where a number is unknown, and ``hg.fit`` finds the numbers
 under which the recording is most likely. Each comes with an interval: four times the recording, half the interval.
 """
 

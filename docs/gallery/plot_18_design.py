@@ -3,7 +3,7 @@ Where power belongs
 ===================
 
 Three sensors see a plant of two states. The first is heard directly, the other two through a relay each, which
-amplifies what it hears, noise included. How much should each of the five transmitters send? `hg.design` spreads a
+amplifies what it hears, noise included. How much should each of the five transmitters send? ``hg.design`` spreads a
 budget so that the best linear filter of all that is received has the least error; and says how much better any
 other spread could be.
 
