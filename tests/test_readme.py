@@ -1,5 +1,6 @@
 """Every command and every Python block of the README runs, in its order, with what `make demo` installs alone."""
 
+import json
 import re
 import runpy
 import shlex
@@ -19,6 +20,21 @@ BLOCK = re.compile(
     r"(?:<!-- (?P<role>file|after): (?P<file>\S+) -->\n)?```(?P<kind>python|sh)\n(?P<text>.*?)```", re.DOTALL
 )
 TESTS_ITSELF = ["make", "test"]
+DRIVEN = {
+    "relay_aware": "knows its relays",
+    "mean_gain": "trusts the mean gain",
+    "perfect_channel": "the same ranges without a relay",
+}
+FILTERPY = {"FilterPy, a loop": "FilterPy"}
+SPEEDS = {  # how a row begins: the comparison, and how the row calls its peers
+    "a Kalman step": ("kalman", {"cuthbert, vectorised": "cuthbert"} | FILTERPY),
+    "a cubature step": (
+        "cubature",
+        {"jax.numpy.linalg, vectorised": "`jax.numpy.linalg`", "FilterPy, mean gain only": "FilterPy"},
+    ),
+    "a step of multiple models": ("modes", FILTERPY),
+    "a step of smoothing": ("smoothing", {"cuthbert, vectorised": "cuthbert", "pykalman, a loop": "pykalman"}),
+}
 
 
 def recipe(target: str) -> str:
@@ -68,6 +84,33 @@ def test_all_of_it_runs_in_order(after_make_demo):
     assert commands == len(re.findall(r"^(?:make|heliograph|python) ", README, re.MULTILINE)) - 1  # make test
     for made in re.findall(r"(?:writes|--out) (?:\S+ )?(out/\S+|\S+\.parquet)", README):
         assert (after_make_demo / made.rstrip(".,`")).exists(), made
+    found = json.loads((after_make_demo / "out" / "demo" / "summary.json").read_text())
+    for filter_, title in DRIVEN.items():
+        error, claimed, nees = (
+            found[name][filter_] for name in ("position_rmse_m", "claimed_rmse_m", "nees_per_dimension")
+        )
+        row = f"| {title} | {error:.2f} m | {claimed:.2f} m | {shown(nees)} |"
+        assert row.replace("*", "") in README.replace("*", ""), f"README lacks: {row}"
+
+
+def shown(number: float) -> str:
+    """Three digits at most, as tables have them."""
+    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+
+
+def test_its_speeds_are_those_that_were_measured():
+    """Each number in nanoseconds of the rows that `make bench` shows."""
+    measured = json.loads((ROOT / "benchmarks" / "results.json").read_text())
+    rows = {row.split(" | ")[0]: row for row in README.splitlines() if row.endswith("| `make bench` |")}
+    assert len(rows) == 1 + len(SPEEDS)
+    for begin, (name, peers) in SPEEDS.items():
+        (row,) = (row for title, row in rows.items() if title.startswith(f"| {begin}"))
+        found = measured["comparisons"][name]
+        assert f"| {found['ours']['best']:,.0f} ns |" in row, row
+        for peer, title in peers.items():
+            assert f"{title} {found['peers'][peer]['best']:,.0f} ns" in row, row
+    design = measured["alone"]["network_design"]["values"]["two hops, 20 sensors, 30 starts"]
+    assert f"| {design / 1000:.2f} s |" in next(row for title, row in rows.items() if "powers" in title)
 
 
 def run(words: list[str]) -> int:

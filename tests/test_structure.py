@@ -86,9 +86,10 @@ def _raises(function) -> bool:
     return any(isinstance(node, ast.Raise) for node in ast.walk(tree))
 
 
-ROOMS = [name for name in heliograph.__all__ if inspect.ismodule(getattr(heliograph, name))]
-PUBLIC = [("heliograph", name) for name in heliograph.__all__ if name not in ROOMS] + [
-    (f"heliograph.{room}", name) for room in ROOMS for name in getattr(heliograph, room).__all__
+HALL = [name for name in heliograph.__all__ if not inspect.ismodule(getattr(heliograph, name))]
+ROOMS = sorted(stub.parent.name for stub in SOURCE.glob("*/__init__.pyi"))
+PUBLIC = [("heliograph", name) for name in HALL] + [
+    (f"heliograph.{room}", name) for room in ROOMS for name in import_module(f"heliograph.{room}").__all__
 ]
 
 

@@ -25,8 +25,9 @@ def rooms() -> Iterator[tuple[str, str, list[str]]]:
     folder = Path(heliograph.__file__).parent
     modules = [name for name in heliograph.__all__ if inspect.ismodule(getattr(heliograph, name))]
     ordered = sorted(modules, key=lambda name: listed(folder / "__init__.pyi").index(name))
+    own = sorted({stub.parent.name for stub in folder.glob("*/__init__.pyi")} - set(ordered))  # imported by their names
     yield "heliograph", summary(heliograph), [n for n in listed(folder / "__init__.pyi") if n not in modules]
-    for name in ordered:
+    for name in [*ordered, *own]:
         names = listed(folder / name / "__init__.pyi")
         if names:
             yield f"heliograph.{name}", summary(import_module(f"heliograph.{name}")), names
@@ -73,7 +74,8 @@ def index() -> str:
 =========
 
 Every public name, at the one place it is imported from. What the first hour needs stands in ``heliograph`` itself
-(``import heliograph as hg``); everything else is reached through its room, as ``hg.filters.imm_filter``. A list of all
+(``import heliograph as hg``); everything else is reached through its room, as ``hg.filters.imm_filter``. What keeps
+filters running needs the extra ``live`` and is imported, as ``from heliograph.serving import Service``. A list of all
 names on one page: :doc:`/names`. Words and letters: :doc:`/notation`.
 
 .. list-table::

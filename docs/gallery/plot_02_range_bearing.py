@@ -4,7 +4,7 @@ A robot seen by range and bearing
 
 A station measures how far away a robot is, and in which direction. West of the station the direction
 jumps from +180 to -180 degrees. A filter that takes bearings for ordinary numbers reads this jump as a
-turn of the whole world and loses the robot. Saying which outputs are angles is enough: `circular`.
+turn of the whole world and loses the robot. Saying which outputs are angles is enough: ``circular``.
 """
 
 import jax.numpy as jnp

@@ -4,7 +4,7 @@ Many settings: a campaign
 
 How does the error depend on the fading and on the losses? A campaign simulates one network in many
 settings and keeps everything in one labelled store. It can be interrupted at any moment and started again.
-From the command line it is `heliograph sweep campaign.toml --out results`; here the same in Python.
+From the command line it is ``heliograph sweep campaign.toml --out results``; here the same in Python.
 """
 
 import tempfile
@@ -42,7 +42,7 @@ done = hg.campaign.run_campaign(campaign, folder / "results", workers=0)
 print(done.computed, "parts computed,", len(done.failures), "failed")
 
 # %%
-# The results are an `xarray.Dataset`, with the settings as coordinates.
+# The results are an ``xarray.Dataset``, with the settings as coordinates.
 
 results = hg.campaign.open_results(folder / "results")
 error = results.error.sel(node="remote", filter="linear", state="level")

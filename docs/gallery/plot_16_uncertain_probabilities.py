@@ -2,7 +2,7 @@
 Probabilities that are only roughly known
 =========================================
 
-Nobody knows to the last digit how often a relay uses which gain. With a `radius`, each probability may be off
+Nobody knows to the last digit how often a relay uses which gain. With a ``radius``, each probability may be off
 by that much. The filter then claims an *upper* bound: it holds for every law that is possible. The picture
 shows the bound, and the true error for the laws at the corners of what is possible.
 """

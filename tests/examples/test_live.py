@@ -17,8 +17,8 @@ from heliograph.examples.live.killed import TOPIC, _reads, _send, _told, killed,
 from heliograph.examples.live.mower import read_drive
 from heliograph.examples.live.server import Server
 from heliograph.examples.live.speed import PLANTS, many
-from heliograph.serving.address import address
 from heliograph.serving.nats import Nats
+from heliograph.serving.url import address
 
 
 def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):

@@ -1,10 +1,11 @@
 """Messages through real brokers: in order, acknowledged after the commit, and again if they were not."""
 
 import asyncio
+import contextlib
 import logging
 import shutil
 import subprocess
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 
 import pytest
 
@@ -16,12 +17,13 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.examples.live.server import Server
-from heliograph.serving.address import Address, address
+from heliograph.serving.contract import check_transport
 from heliograph.serving.mqtt import Mqtt
 from heliograph.serving.nats import Nats
 from heliograph.serving.output import Output
 from heliograph.serving.partition import Part, part_of, word
 from heliograph.serving.transport import TakenOverError, Transport
+from heliograph.serving.url import Address, address
 
 
 @pytest.fixture(scope="module")
@@ -59,8 +61,10 @@ async def silent(transport: Transport, seconds: float = 0.3) -> bool:
 async def sent(where: Address, bodies: list[bytes], plant: str = "a") -> None:
     client = await nats.connect(f"nats://{where.host}:{where.port}")
     stream = client.jetstream(timeout=60)
-    await asyncio.gather(*[await stream.publish_async(f"{where.topic}.in.{word(plant)}", body) for body in bodies])
-    await client.close()
+    try:
+        await asyncio.gather(*[await stream.publish_async(f"{where.topic}.in.{word(plant)}", body) for body in bodies])
+    finally:
+        await client.close()
 
 
 def published(where: Address, bodies: list[bytes], below: str = "a") -> None:
@@ -289,6 +293,64 @@ def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatc
     finally:
         server.kill()
     assert "trying again" in caplog.text and "s3cret" not in caplog.text
+
+
+class OverNats:
+    """A service through JetStream, and the sensor and the reader on the other side."""
+
+    def __init__(self, server: Server):
+        self.where, self.url = at(server, "nats", "contract"), f"nats://127.0.0.1:{server.nats}"
+
+    def transport(self) -> Transport:
+        return Nats(self.where)
+
+    async def send(self, bodies: Sequence[bytes]) -> None:
+        try:
+            await sent(self.where, list(bodies))
+        except nats.js.errors.NoStreamResponseError:  # no service was there yet
+            return
+
+    async def told(self) -> list[bytes]:
+        client = await nats.connect(self.url)
+        reader = await client.jetstream().subscribe("contract.out.*.*", ordered_consumer=True)
+        found = []
+        with contextlib.suppress(nats.errors.TimeoutError):
+            while True:
+                found.append((await reader.next_msg(0.5)).data)
+        await client.close()
+        return found
+
+
+class OverMqtt:
+    """The same through MQTT."""
+
+    def __init__(self, server: Server):
+        self.where, self.heard = at(server, "mqtt", "contract"), list[bytes]()
+        self.reader = Client(CallbackAPIVersion.VERSION2)
+        self.reader.on_message = lambda client, data, message: self.heard.append(message.payload)
+        self.reader.connect(self.where.host, self.where.port)
+        self.reader.subscribe("contract/out/#", 1)
+        self.reader.loop_start()
+
+    def transport(self) -> Transport:
+        return Mqtt(self.where)
+
+    async def send(self, bodies: Sequence[bytes]) -> None:
+        await asyncio.to_thread(published, self.where, list(bodies))
+
+    async def told(self) -> list[bytes]:
+        return list(self.heard)
+
+
+def test_jetstream_keeps_the_contract_and_sends_again_in_order(server: Server):
+    assert check_transport(OverNats(server))
+
+
+def test_mqtt_keeps_the_contract(server: Server):
+    broker = OverMqtt(server)
+    check_transport(broker)  # this server sends what is new first
+    broker.reader.disconnect()
+    broker.reader.loop_stop()
 
 
 @pytest.mark.parametrize("kind", ["nats", "mqtt"])

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.serving.identity import identity
 from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.service import Service
 from heliograph.serving.store import Store
+from heliograph.serving.whose import identity
 from tests.serving.worlds import fleet, lines, messages, moving, stepping
 
 

@@ -1,7 +1,7 @@
 """The only way anything varies in time: an `OverTime` marker, and `at` that reads a step."""
 
 from collections.abc import Hashable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -67,7 +67,7 @@ def structure(item: object) -> Hashable:
     return _structure(*jax.tree.flatten(item))
 
 
-def _structure(leaves: Sequence[object], tree: Hashable) -> Hashable:
+def _structure(leaves: Sequence[Any], tree: Hashable) -> Hashable:
     return tree, tuple(("array", leaf.shape) if eqx.is_array(leaf) else leaf for leaf in leaves)
 
 

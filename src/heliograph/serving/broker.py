@@ -1,8 +1,8 @@
 """The transport of a broker."""
 
-from heliograph.serving.address import Address
 from heliograph.serving.partition import WHOLE, Part
 from heliograph.serving.transport import Transport
+from heliograph.serving.url import Address
 
 
 def connected(address: Address, part: Part = WHOLE) -> Transport:

@@ -19,7 +19,9 @@ FAR = 10_000  # steps that an event may be after the newest one: each of them ha
 
 
 class Options(NamedTuple):
-    """`window`: how late an event may be; `ahead`: how much later than its arrival its time may be; `leap`: how much
+    """What a fleet takes, and how much it holds.
+
+    `window`: how late an event may be; `ahead`: how much later than its arrival its time may be; `leap`: how much
     later than what arrived before; `capacity`: rows that a plant holds at most.
     """
 
@@ -39,7 +41,7 @@ class Settled(NamedTuple):
 
 
 class Fleet:
-    """Events are taken one after another, and `settle` steps what they left to be done.
+    """Plants of one network: events are taken one after another, and `settle` steps what they left to be done.
 
     Estimates are those of a `Timeline` for each plant, with the same verdicts; the order of what is final is that
     of time in each plant. Which plants share a fleet, and how events are cut into batches, changes no bit.

@@ -9,11 +9,11 @@ from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage,
 from paho.mqtt.enums import CallbackAPIVersion
 from paho.mqtt.reasoncodes import ReasonCode
 
-from heliograph.serving.address import Address
 from heliograph.serving.output import Output
 from heliograph.serving.partition import WHOLE, Part, word
 from heliograph.serving.retry import LOG, LONGEST
 from heliograph.serving.transport import Batch
+from heliograph.serving.url import Address
 
 MOST = 1000  # messages of a batch
 HELD = 4 * MOST  # messages that wait here; the broker waits with what comes then
@@ -103,12 +103,14 @@ class _Reader(_Connection):
         self.start()
 
     async def receive(self) -> Batch:
-        await self._came.wait()
-        with self.room:
-            batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
-            if not self._held:
-                self._came.clear()
-            self.room.notify_all()
+        batch = list[tuple[int, MQTTMessage]]()
+        while not batch:  # the word that one came may come after the batch that took it
+            await self._came.wait()
+            with self.room:
+                batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
+                if not self._held:
+                    self._came.clear()
+                self.room.notify_all()
 
         async def acknowledge() -> None:
             for connection, message in batch:

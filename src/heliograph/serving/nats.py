@@ -23,11 +23,11 @@ from nats.js.api import (
 from nats.js.errors import NotFoundError
 
 from heliograph.numerics.check import fail
-from heliograph.serving.address import Address
 from heliograph.serving.output import Output
 from heliograph.serving.partition import WHOLE, Part, word
 from heliograph.serving.retry import Retry, still_wanted
 from heliograph.serving.transport import Batch, TakenOverError
+from heliograph.serving.url import Address
 
 MOST = 1000  # messages of a batch
 WAIT = 5.0  # seconds that one request for messages stays open

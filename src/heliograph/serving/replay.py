@@ -18,8 +18,10 @@ DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where
 
 
 class Link(NamedTuple):
-    """What may happen to a message: lost with probability `loss`, in runs of `run` on average; on its way for a time
-    with the exponential law of mean `delay`; heard twice with probability `duplicates`.
+    """What may happen to a message on its way.
+
+    It is lost with probability `loss`, in runs of `run` on average; on its way for a time with the exponential law of
+    mean `delay`; heard twice with probability `duplicates`.
     """
 
     loss: float = 0.0

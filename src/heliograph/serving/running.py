@@ -10,10 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.address import Address
 from heliograph.serving.broker import connected
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.identity import identity
 from heliograph.serving.keeping import Keeps
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
@@ -22,6 +20,8 @@ from heliograph.serving.partition import Part
 from heliograph.serving.pipe import Pipe
 from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
+from heliograph.serving.url import Address
+from heliograph.serving.whose import identity
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing

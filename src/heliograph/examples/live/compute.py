@@ -15,11 +15,11 @@ from heliograph.examples.live.mower import PLANT, network, read_drive
 from heliograph.examples.live.server import Server
 from heliograph.examples.live.speed import in_memory, many, through
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.identity import identity
 from heliograph.serving.kept import plant_from
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Link
 from heliograph.serving.store import Store
+from heliograph.serving.whose import identity
 
 KILLS = 3
 MESSAGES = 20_000  # for the speed

@@ -11,16 +11,16 @@ from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.examples.live.server import Server
-from heliograph.serving.address import Address, address
 from heliograph.serving.broker import connected
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.identity import identity
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
 from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
 from heliograph.serving.store import Store
+from heliograph.serving.url import Address, address
+from heliograph.serving.whose import identity
 
 PLANTS = 100  # mowers on the same drive, each a little after the one before
 BATCH = 1000  # lines that are taken together from memory

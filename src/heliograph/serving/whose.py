@@ -5,5 +5,5 @@ from heliograph.serving.fleet import Fleet
 
 
 def identity(fleet: Fleet) -> Identity:
-    """That of the network and of the fleet's options."""
+    """What a store has to be of, to go on with this fleet: its network, its compiled program and its options."""
     return network_identity(fleet.network, fleet.lanes.program(), fleet.options._asdict())

@@ -1,0 +1,65 @@
+"""Public names of the room, which needs the extra `live`; the package loads them when first used."""
+
+from .lanes import (
+    Lanes as Lanes,
+)
+from .fleet import (
+    Fleet as Fleet,
+    Options as Options,
+)
+from .service import (
+    Service as Service,
+)
+from .message import (
+    Message as Message,
+    read_message as read_message,
+)
+from .output import (
+    Estimates as Estimates,
+    Output as Output,
+    Refused as Refused,
+    Told as Told,
+)
+from .nowhere import (
+    Nowhere as Nowhere,
+)
+from .store import (
+    Store as Store,
+)
+from .whose import (
+    identity as identity,
+)
+from .transport import (
+    Batch as Batch,
+    Transport as Transport,
+)
+from .pipe import (
+    Pipe as Pipe,
+)
+from .url import (
+    Address as Address,
+    address as address,
+)
+from .broker import (
+    connected as connected,
+)
+from .partition import (
+    Part as Part,
+    part_of as part_of,
+    word as word,
+)
+from .loop import (
+    keep_running as keep_running,
+    serve_until as serve_until,
+)
+from .contract import (
+    Broker as Broker,
+    check_transport as check_transport,
+)
+from .replay import (
+    Link as Link,
+    along as along,
+    lines as lines,
+    recorded as recorded,
+    through as through,
+)
