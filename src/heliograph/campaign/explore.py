@@ -61,8 +61,8 @@ def explore_page(campaign: Campaign, scores: Sequence[Score]) -> str:
 
 MEANING = (
     "**rmse**: root of the mean over runs and steps of the squared error summed over the state.",
-    "**nees_per_dimension**: squared error in units of the claimed covariance, per dimension; 1 is honest, above 1 is "
-    "too sure.",
+    "**nees_per_dimension**: squared error in units of the claimed covariance, per dimension; 1 where that is right, "
+    "above is too sure.",
     "**rmse_error**, **nees_error**: one standard error, from the scatter between runs. Only finite runs count.",
     "**claim**: what the filter says of its covariance, `exact`, `upper`, `nominal` or `none`.",
 )

@@ -72,8 +72,9 @@ def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
     caption = (
         "**RMSE**: root of the mean over runs and steps of the squared error summed over the state. **NEES / dim**: "
-        "squared error in units of the claimed covariance, per dimension; 1 is honest, above 1 is too sure. **±**: one "
-        f"standard error of the number before it, from the scatter between runs. Only finite runs count.{more}"
+        "squared error in units of the claimed covariance, per dimension; 1 where that is right, above 1 is too sure. "
+        "**±**: one standard error of the number before it, from the scatter between runs. Only finite runs "
+        f"count.{more}"
     )
     return Table(["setting", *score_headers(campaign)], rows, caption)
 

@@ -194,8 +194,8 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
     headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
     caption = (
         f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
-        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 is honest. "
-        "**Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
+        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
+        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
     )
     blocks: list[Table | Picture] = [Table(headers, rows, caption)]
     if "innovations" in drawings:
