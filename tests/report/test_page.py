@@ -62,7 +62,7 @@ def test_nothing_is_wider_than_its_window(fits, tmp_path) -> None:
         KeyFigures([KeyFigure(name, "−1,234.567 m", "x" * 60, "#123456")] * 5),
         Table(["filter", *("mean squared error",) * 5], [[name, *(number,) * 5]] * 3, "caption " * 40),
         Table(["state", "a", "b"], [["x", "1", "2"]], "caption " * 40),
-        Table(["name", "words", "more"], [["row", "several words " * 20, formula]], wordy=True),
+        Table(["name", "words", "more"], [["row", "several words " * 20, formula[:60]]], wordy=True),
         Statements([Judged(formula, "Theorem 3", formula, formula, verdict) for verdict in VERDICTS]),
         Picture(drawing.encode(), "a wide picture", "caption " * 20),
         Points([formula]),

@@ -123,6 +123,16 @@ def label_right(axes: Axes, ends: Mapping[str, tuple[float, str]], gap: float = 
         axes.text(1.015, height, name, transform=axes.transAxes, va="center", color=ends[name][1], fontsize=9)
 
 
+def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
+    """Name the curves of `axes` above all panels, where none of them is."""
+    handles, names = axes.get_legend_handles_labels()
+    own = axes.get_legend()
+    if own is not None:
+        own.remove()
+    if names:
+        figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns), frameon=False)
+
+
 @matplotlib.rc_context(STYLE)
 def png(figure: Figure, dots_per_inch: int = 150) -> bytes:
     """The figure as PNG."""
