@@ -61,10 +61,10 @@ def forget():
 
 
 @pytest.fixture(scope="session")
-def fits():
+def fits(tmp_path_factory):
     """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
     from tests.widths import Widths
 
-    widths = Widths()
+    widths = Widths(tmp_path_factory.mktemp("pages") / "page.html")
     yield widths
     widths.close()

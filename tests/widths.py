@@ -29,13 +29,17 @@ def wrong(browser: Browser, page: str) -> list[str]:
 class Widths:
     """Measures pages in a process of its own, which forks without the threads of this one; without a browser, none."""
 
-    def __init__(self) -> None:
+    def __init__(self, text: Path) -> None:
+        self.text = text  # where a page that is no file is put
         self.process: subprocess.Popen[str] | None = None
 
-    def __call__(self, page: Path) -> None:
-        """Fail if something on a page is wider than its window."""
+    def __call__(self, page: Path | str) -> None:
+        """Fail if something on a page, a file or its text, is wider than its window."""
         if program() is None:
             return
+        if isinstance(page, str):
+            self.text.write_text(page, encoding="utf-8")
+            page = self.text
         assert page.is_file()
         if self.process is None:
             command = [sys.executable, __file__]

@@ -152,7 +152,7 @@ def test_verdicts_follow_the_evidence(found):
     assert len(seen) == len(statements(found))
 
 
-def test_every_file_is_there(folder, found):
+def test_every_file_is_there(folder, found, fits):
     names = {path.name for path in folder.iterdir()}
     figures = ("scalar", "coupled", "bursts", "patterns", "rounding")
     assert names == {"summary.json", "report.html", "curves.npz"} | {
@@ -163,3 +163,4 @@ def test_every_file_is_there(folder, found):
         assert np.isnan(curves["coupled.upper"][curves["coupled.arrival"] < 0.471]).all()
         assert np.isfinite(curves["coupled.upper"][curves["coupled.arrival"] > 0.48]).all()
     assert "Run it again" in (folder / "report.html").read_text()
+    fits(folder / "report.html")

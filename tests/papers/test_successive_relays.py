@@ -130,7 +130,8 @@ def test_an_order_in_which_everything_is_known_when_used():
     assert used_before_known([covariances, gains]) == 1
 
 
-def test_the_folder_holds_record_figures_and_report(folder):
+def test_the_folder_holds_record_figures_and_report(folder, fits):
+    fits(folder / "report.html")
     report = (folder / "report.html").read_text()
     assert "does not give the printed matrix" in report and "http" not in report.replace("http://www.w3.org", "")
     for state in (*(f"fig{2 + i}_{s}" for i, s in enumerate(setting.STATES)), "fig5_traces", "tuned"):

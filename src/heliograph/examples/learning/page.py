@@ -78,20 +78,22 @@ def learning_page(coverage: Mapping[str, Coverage], drawings: Mapping[str, bytes
     counted = sorted({one.recordings for one in coverage.values()})
     caption = (
         f"Percent of {', '.join(map(str, counted))} recordings a row, less those in which a number ran to a limit "
-        "(last column). Two standard errors are about 1.8 at 600 recordings."
+        "(last column). Two standard errors are about 1.8 at 600 recordings. **Intervals**: from the curvature of the "
+        "likelihood (hessian), or from the spread of the scores: as if these were white, and with their long-run "
+        "variance by Bartlett's weights or by cosines."
     )
     return Page(
         kicker="Heliograph example",
-        title="Learning a link, and how well it is known",
+        title=f"95 % intervals that cover {naive:.0f} %, and others that cover {honest:.0f} %",
         lead=(
-            "Behind a random gain the data are not Gaussian, and the curvature of the likelihood says too little: of "
-            f"its 95 % intervals {naive:.0f} % hold the variance of a gain that is large now and then. Intervals from "
-            f"the scores' own long-run spread hold it in {honest:.0f} %."
+            "Behind a random gain the data are not Gaussian, and intervals from the curvature of the likelihood are "
+            f"too short: {naive:.0f} % of the 95 % intervals hold the variance of a gain that is large now and then. "
+            f"Of the intervals from the scores' own long-run spread {honest:.0f} % hold it."
         ),
         sections=[
             Section("What intervals cover", [KeyFigures(keys), picture]),
             Section("The whole table", [Table(_headers(), _cells(coverage), caption)]),
-            Section("Again", [Text(_AGAIN), Code("heliograph example learning --out out")]),
+            Section("Run it again", [Text(_AGAIN), Code("heliograph example learning --out out")]),
         ],
         footer="All numbers: summary.json.",
     )

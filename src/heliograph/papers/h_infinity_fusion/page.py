@@ -18,13 +18,15 @@ from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, P
 def page(result: Reproduction, statements: Sequence[Statement], pictures: Mapping[str, bytes]) -> Page:
     """The report; `pictures` holds each figure as SVG."""
     second, node = result.discriminating, result.nodes[0]
+    times = setting.LEVELS[0] / node.without_measurements
     kalman = second.worst["ekf_statistics"].level
     return Page(
         kicker="Reproduction: quantized H∞ fusion over amplify-and-forward relays",
-        title=f"Guaranteed: a level of {setting.LEVELS[0]:g}. Without measurements: {node.without_measurements:.3f}",
+        title=f"A guarantee {times:.0f} times weaker than that of hearing nothing",
         lead=(
-            "The paper's inequalities are right. But its example guarantees H∞ levels far above what no measurement at "
-            "all attains, its growth constant is false, and its quantizer saturates in "
+            f"The paper's inequalities are right. But its example guarantees node 1 an H∞ level of "
+            f"{setting.LEVELS[0]:g} where, by its own growth constant, {node.without_measurements:.3f} holds without "
+            "any measurement; that constant is false; and its quantizer saturates in "
             f"{100 * result.saturated('dynamic'):.0f} % of the samples. In an example that tells filters apart, H∞ "
             f"design guarantees node {NODE} a level of {second.designs['horizon'][NODE].level:.2f} where a Kalman "
             f"filter can be driven to {kalman:.2f}, at the price of larger errors under white noise."
