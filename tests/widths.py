@@ -15,14 +15,16 @@ INSIDE = """[...document.querySelectorAll('body *')].filter(part => part.scrollW
 
 
 def wrong(browser: Browser, page: str) -> list[str]:
-    """What is wrong with a page."""
+    """What is wrong with a page, a file or what a server on this machine tells."""
+    served = page.startswith("http://127.0.0.1:")
+    own = ("file:", "data:", page) if served else ("file:", "data:")
     found = []
     for width in WIDTHS:
-        seen = browser.open(Path(page).resolve().as_uri(), width)
+        seen = browser.open(page if served else Path(page).resolve().as_uri(), width)
         inside = browser.call("Runtime.evaluate", expression=INSIDE, returnByValue=True)["result"]["value"]
         found += [f"at {width}: {told}" for told in [*inside, *seen.errors]]
         found += [f"at {width}: the page is {seen.width} wide"] if seen.width > width else []
-        found += [f"fetches {address}" for address in seen.requests if not address.startswith(("file:", "data:"))]
+        found += [f"fetches {address}" for address in seen.requests if not address.startswith(own)]
     return found
 
 
@@ -34,13 +36,12 @@ class Widths:
         self.process: subprocess.Popen[str] | None = None
 
     def __call__(self, page: Path | str) -> None:
-        """Fail if something on a page, a file or its text, is wider than its window."""
+        """Fail if something on a page, a file, its text or an address, is wider than its window."""
         if program() is None:
             return
-        if isinstance(page, str):
+        if isinstance(page, str) and not page.startswith("http:"):
             self.text.write_text(page, encoding="utf-8")
             page = self.text
-        assert page.is_file()
         if self.process is None:
             command = [sys.executable, __file__]
             self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
