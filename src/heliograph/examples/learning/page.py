@@ -38,10 +38,10 @@ def labelled(key: str) -> str:
 
 @matplotlib.rc_context(STYLE)
 def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
-    """What intervals cover by parameter and method; nominal is a line."""
+    """What intervals cover by parameter and method; a line at 95 %."""
     keys = list(coverage)
     names = [name for name in PARAMETERS if any(name in one.covered["cosines"] for one in coverage.values())]
-    figure = Figure(figsize=(WIDTH, 1.0 + 0.34 * len(keys)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.0 + 0.4 * len(keys)), layout="constrained")
     grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for axes, name in zip(grid, names, strict=True):
         axes.axvline(95, color=INK, linewidth=0.8)
@@ -53,7 +53,7 @@ def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
             axes.scatter(*zip(*places, strict=True), s=26, color=COLOURS[method], marker=shape, label=method, zorder=3)
         axes.set(xlim=(35, 103), xticks=[50, 95])
         axes.set_title(PARAMETERS[name].replace(" ", "\n"), fontsize=9)
-        axes.set_yticks(range(len(keys)), [labelled(key) for key in keys])
+        axes.set_yticks(range(len(keys)), [",\n".join(labelled(key).rsplit(", ", 1)) for key in keys])
     grid[0].invert_yaxis()
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return {"coverage": figure}
