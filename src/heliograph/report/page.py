@@ -177,6 +177,6 @@ def environment() -> Environment:
 
 def rich(text: str) -> Markup:
     """Escape a text, then set `**strong**` and backquoted code."""
-    safe = re.sub(r"(?<=\d) (?=%|± )", "\u00a0", str(escape(text)))  # a number stays with what belongs to it
+    safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))  # a number stays with what belongs to it
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
     return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))

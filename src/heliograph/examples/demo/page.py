@@ -157,7 +157,7 @@ def _designed(designs: Mapping[str, Design]) -> Section:
         "knows the relays, each a mean over all seeds (the draws of the three differ)."
     )
     headers = ("what is sent", "sensor (m²)", "relay (m²)", "RMSE (m)", "claimed (m)")
-    return Section("The same relays, told less", [Text([text]), Table(headers, rows, caption)])
+    return Section("The same relays, sending less", [Text([text]), Table(headers, rows, caption)])
 
 
 def _origin(outcome: Outcome) -> Section:
