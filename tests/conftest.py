@@ -58,3 +58,13 @@ def forget():
         gc.collect()
         if hasattr(ctypes.CDLL(None), "malloc_trim"):  # glibc keeps what is freed
             ctypes.CDLL(None).malloc_trim(0)
+
+
+@pytest.fixture(scope="session")
+def fits(tmp_path_factory):
+    """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
+    from tests.widths import Widths
+
+    widths = Widths(tmp_path_factory.mktemp("pages") / "page.html")
+    yield widths
+    widths.close()

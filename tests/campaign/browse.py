@@ -60,6 +60,13 @@ def check(browser: Browser, page: Path, node: str) -> None:
     ask("document.querySelector('#values fieldset input').click()")  # the first gain away
     ask(DRAWN % 4)
     assert ask(ROWS) == 8
+    ask(CHOOSE % ("table", "1"))  # step by step: a panel for each state, and time below
+    ask(DRAWN % 5)
+    assert ask(TITLES) == ["state: x", "state: y"] and ask(ROWS) == 8
+    assert ask("document.getElementById('x').value") == "time"
+    ask(CHOOSE % ("y", "claimed"))  # which has no standard error
+    ask(DRAWN % 6)
+    assert ask("document.documentElement.scrollWidth") <= 420
     assert ask(SEEN % ".static") == "none" and ask(SEEN % "#explore") == "block"
     browser.call("Emulation.setEmulatedMedia", media="print")
     assert ask(SEEN % ".static") == "block" and ask(SEEN % "#explore") == "none"

@@ -102,7 +102,7 @@ def test_words_make_no_axis(tmp_path, finished):
     assert labels == ["gain = 0.5, kind = one", "gain = 0.5, kind = two"]
 
 
-def test_the_page_says_what_failed(tmp_path, finished):
+def test_the_page_says_what_failed(tmp_path, finished, fits):
     entry = {
         "setting": 3,
         "parameters": {"gain": 0.7},
@@ -111,5 +111,6 @@ def test_the_page_says_what_failed(tmp_path, finished):
         "command": "heliograph sweep x",
     }
     html = campaign_page(write(tmp_path), read_summary(finished / "summary.csv"), [entry]).html()
+    fits(html)
     for text in ("What failed", "RuntimeError: &lt;bad&gt; luck", "heliograph sweep x", "runs 64 to 99"):
         assert text in html

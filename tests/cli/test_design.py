@@ -51,7 +51,8 @@ def told(folder):
     return json.loads((folder / "out" / "design" / "summary.json").read_text())
 
 
-def test_the_page_tells_the_design(folder, told):
+def test_the_page_tells_the_design(folder, told, fits):
+    fits(folder / "out" / "design" / "report.html")
     found = hg.design(hg.files.load_network(str(folder / "yard.py")), budget=2.0)
     assert told["error"] == pytest.approx(found.error, rel=1e-12)
     assert told["total"] == pytest.approx(2.0, rel=1e-9)

@@ -72,7 +72,8 @@ def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
     assert one["gain"] == pytest.approx(gain, rel=1e-9)
 
 
-def test_the_page_says_what_was_learned(folder):
+def test_the_page_says_what_was_learned(folder, fits):
+    fits(folder / "out" / "report.html")
     page = (folder / "out" / "report.html").read_text()
     for words in ("hop noise", "plant noise", "Before and after", "Do the laws fit", "fitted_network.py"):
         assert words in page

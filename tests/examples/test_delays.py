@@ -38,9 +38,10 @@ def test_the_summary(outcome, monkeypatch):
     assert found["past_states_claim"] == 0.6
 
 
-def test_the_page_shows_every_figure_and_filter(outcome):
+def test_the_page_shows_every_figure_and_filter(outcome, fits):
     pytest.importorskip("jinja2")
     figures = page.delay_figures(outcome)
     html = page.delay_page(outcome, {name: b"<svg/>" for name in figures}).html()
+    fits(html)
     assert html.count("data:image/svg+xml") == len(figures) == 3
     assert all(label in html for label, _ in (*page.LATE.values(), *page.CLOCKS.values()))

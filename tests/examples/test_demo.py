@@ -17,6 +17,7 @@ from heliograph.examples.demo.twin import Design, channel_less
 from heliograph.files.recording import read_recording as read_measurements
 from heliograph.learning import describe
 from heliograph.model.estimate import Estimate
+from tests.widths import Widths
 
 PLAZA2 = robot.DRIVES["plaza2"]
 
@@ -230,7 +231,8 @@ def _parquet(path: Path) -> dict[str, np.ndarray]:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-def test_report_stands_alone(folder: Path) -> None:
+def test_report_stands_alone(folder: Path, fits: Widths) -> None:
+    fits(folder / "report.html")
     html = (folder / "report.html").read_text(encoding="utf-8")
     assert not re.search(r"https?:|<script|<link|@import|url\(", html)
     assert all(source.startswith("data:") for source in re.findall(r'src="([^"]*)"', html))

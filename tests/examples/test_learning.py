@@ -79,11 +79,12 @@ def drive_numbers():
     return {"direct": one, "relayed": each}
 
 
-def test_the_recorded_drive_stands_in_summary_and_page(coverage):
+def test_the_recorded_drive_stands_in_summary_and_page(coverage, fits):
     pytest.importorskip("jinja2")
     told = run.results(run.Outcome(coverage, drive_numbers()))
     assert told.summary["plaza"] == drive_numbers() and "coverage" in told.summary
     html = told.page({name: b"<svg/>" for name in told.figures}).html()
+    fits(html)
     for words in ("On a recorded drive", "relayed, mean", "0.85", "1.30", "0.310"):
         assert words in html
 

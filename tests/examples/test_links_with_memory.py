@@ -48,9 +48,10 @@ def test_the_summary(outcome):
     assert found["curve"] == {"lambda": [0.0, 0.5, 0.9], "ratio": [1.0, 1.5, 1.9]}
 
 
-def test_the_page_shows_every_figure_and_filter(outcome):
+def test_the_page_shows_every_figure_and_filter(outcome, fits):
     pytest.importorskip("jinja2")
     figures = page.memory_figures(outcome)
     html = page.memory_page(outcome, {name: b"<svg/>" for name in figures}).html()
+    fits(html)
     assert html.count("data:image/svg+xml") == len(figures) == 3
     assert all(label in html for label, _ in page.ROWS.values())

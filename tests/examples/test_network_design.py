@@ -12,7 +12,7 @@ from heliograph.examples.network_design.published import Circuit, packets
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory):
+def told(tmp_path_factory, fits):
     """Fewer cases than the example's; what other tests compute (the demonstration) and a long descent stand in."""
     out = tmp_path_factory.mktemp("out")
     designs = {
@@ -28,6 +28,7 @@ def told(tmp_path_factory):
         patch.setattr(compute, "circuit", lambda: Circuit(2.0, 1.5, 0.75))
         run.example(out)
     folder = out / "network-design"
+    fits(folder / "report.html")
     return json.loads((folder / "summary.json").read_text()), (folder / "report.html").read_text()
 
 

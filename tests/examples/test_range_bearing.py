@@ -19,7 +19,7 @@ def few(network: hg.Network) -> hg.Network:
     return hg.Network(network.plant, nodes)
 
 
-def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path, monkeypatch):
+def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path, monkeypatch, fits):
     for name, value in {"RUNS": 64, "FADING_RUNS": 192}.items():
         monkeypatch.setattr(compute, name, value)
     monkeypatch.setattr(compute, "passing", lambda *which, **how: few(passing(*which, **how)))
@@ -37,3 +37,4 @@ def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path
         assert max(farther) < 1.5 * min(farther)  # rules differ in the closest tenth alone
     assert closest["extended"][0] > 2 * closest["four_points"][0]
     assert {"across.svg", "closest.svg", "report.html"} <= {p.name for p in (tmp_path / "range-bearing").iterdir()}
+    fits(tmp_path / "range-bearing" / "report.html")

@@ -16,11 +16,12 @@ RELAYS = {"0": (5.2417, 5.2899), "1": (2.6024, 2.5493), "2": (1.9132, 1.8996), "
 
 
 @pytest.fixture(scope="module")
-def summary(tmp_path_factory):
+def summary(tmp_path_factory, fits):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compute, "RUNS", 400)
         out = tmp_path_factory.mktemp("example")
         example(out, 0)
+    fits(out / "smoothing" / "report.html")
     assert {"report.html", "errors.svg", "deviations.svg"} <= {p.name for p in (out / "smoothing").iterdir()}
     return json.loads((out / "smoothing" / "summary.json").read_text())
 

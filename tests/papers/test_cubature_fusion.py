@@ -159,7 +159,7 @@ def result():
     return compute.Reproduction(made_up(PRINTED, names, fused, 40), made_up(STRONG, names, fused, 100), early, 64, 0)
 
 
-def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch):
+def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch, fits):
     monkeypatch.setattr(run, "reproduction", lambda runs, seed, tell: result)
     run.reproduce(tmp_path, 64)
     folder = tmp_path / "cubature-fusion"
@@ -179,6 +179,7 @@ def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch):
         assert len(list(folder.glob(f"fig{number:02d}_*.png"))) == 1
     assert "<svg" not in (folder / "report.html").read_text().lower().replace("data:image/svg", "")
     assert not [p for p in tmp_path.iterdir() if p != folder]
+    fits(folder / "report.html")
 
 
 def test_the_record_is_labelled_and_agrees_with_the_statistics(result, tmp_path):

@@ -119,7 +119,7 @@ def test_outage_covariances_are_the_oracles():
     np.testing.assert_allclose(printed.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)
 
 
-def test_every_file_is_there_and_the_record_can_be_read(folder):
+def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     names = {path.name for path in folder.iterdir()}
     figures = {"fig1_x1", "fig2_x2", "fig3_covariance_x1", "fig4_covariance_x2", "fig5_mse_x1", "fig6_mse_x2", "outage"}
     assert names == {"summary.json", "report.html", "record.nc"} | {f"{f}.{e}" for f in figures for e in ("png", "svg")}
@@ -128,6 +128,7 @@ def test_every_file_is_there_and_the_record_can_be_read(folder):
         assert record["covariance"].sel(design="cubic").shape == (101, 4, 4)
         assert record["mean_squared_error"].sel(filter="mixture", state="x1").shape == (100,)
     assert "holds" in (folder / "report.html").read_text()
+    fits(folder / "report.html")
 
 
 def test_claims_say_what_holds(numbers):

@@ -103,19 +103,19 @@ VERDICTS = [
     ("the estimates track", both("steady_over_nothing_heard", 0.2, 0.3)),
     ("the state is estimated", both("over_the_floor", 1.9, 2.1)),
     ("behind the paper's relays", {"holds": {"largest_gain": 0.04}, "fails": {"largest_gain": 0.1}}),
-    ("L_1", both("largest_entry", 0.0, 0.1)),
-    ("Xi_i <= mbar_k I", {"holds": {"growth": 0.9, "obeyed": 1}, "holds_vacuously": {"growth": 1.1, "obeyed": 1},
+    ("L₁", both("largest_entry", 0.0, 0.1)),
+    ("Ξᵢ ≤ m̄ₖ I", {"holds": {"growth": 0.9, "obeyed": 1}, "holds_vacuously": {"growth": 1.1, "obeyed": 1},
                           "fails": {"obeyed": 0}}),
-    ("Xi_i >= m_k I", IF_MET),
-    ("P_k >= p_k I", IF_MET),
+    ("Ξᵢ ≥ mₖ I", IF_MET),
+    ("Pₖ ≥ pₖ I", IF_MET),
     ("uniform bounds", both("assumptions_missed", 0, 1)),
     ("errors are bounded", both("assumptions_missed", 0, 1)),
-    ("P_k <= cov x_k", both("least_slack", 0.0, -0.1)),
-    ("mbar = ", ABOVE), ("p = alpha", UNDER), ("m = rho", UNDER), ("o I", UNDER), ("w~", UNDER),
+    ("Pₖ ≤ cov xₖ", both("least_slack", 0.0, -0.1)),
+    ("m̄ = ", ABOVE), ("p = α", UNDER), ("m = ρ", UNDER), ("o I", UNDER), ("w̃", UNDER),
     ("the factor", {"holds": {"printed": 1.0, "needed": 0.9}, "fails": {"printed": 1.0, "needed": 1.1}}),
     ("the algorithm", both("used_before_known", 0, 1)),
     ("notation", both("formulas_not_as_meant", 0, 1)),
-    *[(start, MISPRINT) for start in ("Pi_k", "Xi_i in", "variance", "first bracket", "last term")],
+    *[(start, MISPRINT) for start in ("Πₖ", "Ξᵢ in", "variance", "first bracket", "last term")],
     ("L = 0.5 H", both("largest_difference", 5e-5, 0.1)),
     ("second capacitor", both("largest_difference", 5e-5, 0.1)),
 ]  # fmt: skip
@@ -131,7 +131,8 @@ def test_an_order_in_which_everything_is_known_when_used():
     assert used_before_known([covariances, gains]) == 1
 
 
-def test_the_folder_holds_record_figures_and_report(folder):
+def test_the_folder_holds_record_figures_and_report(folder, fits):
+    fits(folder / "report.html")
     report = (folder / "report.html").read_text()
     assert "does not give the printed matrix" in report and "http" not in report.replace("http://www.w3.org", "")
     for state in (*(f"fig{2 + i}_{s}" for i, s in enumerate(setting.STATES)), "fig5_traces", "tuned"):

@@ -1,13 +1,16 @@
 from importlib.resources import files
 
 from heliograph.report.page import (
+    VERDICTS,
     Code,
+    Judged,
     KeyFigure,
     KeyFigures,
     Page,
     Picture,
     Points,
     Section,
+    Statements,
     Table,
     Text,
     rich,
@@ -27,16 +30,47 @@ def test_every_block_reaches_the_page_escaped() -> None:
         Table(["name", "words"], [["row <5>", "several words"]], wordy=True),
         Picture(b"<svg/>", 'seen "6"', "caption <6>"),
         Code("code <7>"),
+        Statements([Judged("said <10>", "(1)", "", "so", "holds"), Judged("said <9>", "(2)", "x", "not so", "fails")]),
     ]
     html = Page("kicker", "title <0>", "lead <0>", [Section("section <0>", blocks)], "footer <8>").html()
     for expected in ("title", "lead", "section"):
         assert f"{expected} &lt;0&gt;" in html
     for number, word in enumerate(("text", "point", "note", "caption", "row", "caption", "code", "footer"), 1):
         assert f"{word} &lt;{number}&gt;" in html
-    assert '<th scope="row"><span class="dot" style="--c: #abcdef"></span>row &lt;4&gt;</th><td>7</td>' in html
+    assert (
+        '<th scope="row"><span class="dot" style="--c: #abcdef"></span>row &lt;4&gt;</th><td data-header="value">7</td>'
+        in html
+    )
     assert 'src="data:image/svg+xml;base64,PHN2Zy8+"' in html
     assert "seen &#34;6&#34;" in html
-    assert html.count('class="wordy"') == 1
+    assert html.count('class="table wordy"') == 1
+    assert '<li class="fails">' in html and html.index("said &lt;9&gt;") < html.index("said &lt;10&gt;")
+
+
+def test_a_few_short_columns_stay_a_table_on_a_phone() -> None:
+    assert Table(["filter", "RMSE (m)", "NEES / dim"], [["perfect_channel", "0.328", "1.19"]]).narrow
+    assert not Table(["filter", "claimed"], [["x" * 40, "1.0"]]).narrow
+    assert not Table(["filter", "claimed"], [["a", "b"]], wordy=True).narrow
+
+
+def test_nothing_is_wider_than_its_window(fits, tmp_path) -> None:
+    """Blocks at their worst: ten columns of numbers, long names, long words, long commands."""
+    number, name = "0.0886312 ± 0.0025412", "a rather long name of a filter that somebody gave it"
+    formula = "m̄ₖ₊₁=(1+β₁)(1+ε)σ²max(Φ)m̄ₖ+" * 4
+    drawing = '<svg xmlns="http://www.w3.org/2000/svg" width="2000" height="100"/>'
+    blocks = [
+        KeyFigures([KeyFigure(name, "−1,234.567 m", "x" * 60, "#123456")] * 5),
+        Table(["filter", *("mean squared error",) * 5], [[name, *(number,) * 5]] * 3, "caption " * 40),
+        Table(["state", "a", "b"], [["x", "1", "2"]], "caption " * 40),
+        Table(["name", "words", "more"], [["row", "several words " * 20, formula[:60]]], wordy=True),
+        Statements([Judged(formula, "Theorem 3", formula, formula, verdict) for verdict in VERDICTS]),
+        Picture(drawing.encode(), "a wide picture", "caption " * 20),
+        Points([formula]),
+        Code("heliograph reproduce successive-relays --out out " + "--runs 20000 " * 10 + "x" * 200),
+    ]
+    page = tmp_path / "page.html"
+    page.write_text(Page("kicker " * 10, formula, formula, [Section(formula, blocks)], formula).html())
+    fits(page)
 
 
 def test_template_is_part_of_the_package() -> None:

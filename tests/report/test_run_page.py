@@ -59,10 +59,11 @@ def test_what_is_doubtful_is_said_and_no_more(health):
     assert not any("a/good" in line or "left" in line for line in lines)
 
 
-def test_the_page_holds_every_number_and_names_do_not_act_in_it(health):
+def test_the_page_holds_every_number_and_names_do_not_act_in_it(health, fits):
     figures = run_figures(health)
     assert list(figures) == ["estimates_0", "innovations", "links"]
     page = run_page(health, BAD, dict.fromkeys(figures, b"<svg/>")).html()
+    fits(page)
     assert "a/sure" in page and "98.7%" in page and "</h2>\x1b" not in page and "&lt;/h2&gt;\\x1b" in page
     summary = json.loads(json.dumps(run_summary(health)))
     assert summary["rows"] == STEPS and summary["links"][BAD]["right"] == {"arrived": 1 - 4 / STEPS, "longest_gap": 4}

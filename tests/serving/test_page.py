@@ -149,8 +149,9 @@ def test_a_page_of_elsewhere_that_takes_our_name_does_not_get_in():
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser here")
-def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside():
+def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside(fits):
     async def look(url: str) -> None:
+        await asyncio.to_thread(fits, f"{url}/")
         arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--timeout=4000", "--dump-dom", url]
         browser = await asyncio.create_subprocess_exec("chromium", *arguments, stdout=-1, stderr=-3)
         text = (await browser.communicate())[0].decode()

@@ -1,11 +1,16 @@
-"""A campaign's scores as one page in which axes, settings, nodes and filters are chosen."""
+"""A campaign's scores as one page in which states, steps, axes, settings, nodes and filters are chosen."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import groupby
 from pathlib import Path
+from typing import TypeAlias
 
-from heliograph.campaign.page import pictures, score_table
+import numpy as np
+
+from heliograph.campaign.detail import Detail, details
+from heliograph.campaign.page import finding, pictures, score_table
 from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.store import STORE, parameter_values, stored_campaign
 from heliograph.campaign.summary import SUMMARY, Score, read_summary
@@ -14,10 +19,18 @@ from heliograph.report.explore_page import STATIC, Explored, Quantity, Value, ex
 from heliograph.report.page import Page, Points, Section
 
 EXPLORE = "explore.html"
-ROWS = 20_000  # on the page: about 2 MB, which a browser still filters at once
+ROWS = 20_000  # of each table on the page: about 2 MB, which a browser still filters at once
+STEPS = 50  # at which errors over time are told
 DIGITS = 6  # of a number on the page
-FIELDS = ("claim", "rmse", "rmse_error", "nees_per_dimension", "nees_error", "finite_runs")
-QUANTITIES = (Quantity("rmse", "RMSE", "rmse_error"), Quantity("nees_per_dimension", "NEES / dim", "nees_error", 1.0))
+ALL = "all together"  # states
+NAMES = ("node", "filter", "state")
+SCORED = ("claim", "rmse", "rmse_error", "nees_per_dimension", "nees_error", "finite_runs")
+OVER_TIME = ("claim", "rmse", "rmse_error", "claimed", "nees_per_dimension", "nees_error", "finite_runs")
+RMSE = Quantity("rmse", "RMSE", "rmse_error")
+CLAIMED = Quantity("claimed", "claimed standard deviation")
+NEES = Quantity("nees_per_dimension", "NEES / dim", "nees_error", 1.0)
+
+Look: TypeAlias = Callable[[Sequence[int], Sequence[int]], list[Detail]]  # into the store: settings, steps
 
 
 def explore_results(results: str | Path, out: str | Path) -> Path:
@@ -34,21 +47,25 @@ def explore_results(results: str | Path, out: str | Path) -> Path:
     campaign, scores = stored_campaign(folder / STORE), read_summary(folder / SUMMARY)
     if not scores:
         raise fail(f"results folder {folder}", "at least one score", "none yet")
-    text = explore_page(campaign, scores)
+    text = explore_page(campaign, scores, partial(details, folder / STORE, campaign))
     place.mkdir(parents=True, exist_ok=True)
     path = place / EXPLORE
     path.write_text(text, encoding="utf-8")
     return path
 
 
-def explore_page(campaign: Campaign, scores: Sequence[Score]) -> str:
-    """The page as HTML. Whole settings are on it, the first that have together at most ROWS rows."""
+def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None = None) -> str:
+    """The page as HTML. Whole settings are on it, the first that have together at most ROWS rows in each table.
+
+    `look` finds single states, over all steps and at some of them; without it the page has neither.
+    """
     shown = _first(scores)
     settings = len({score.setting for score in shown})
     page = Page(
         kicker="Explore a campaign",
-        title=f"{len(campaign.settings)} settings, {campaign.runs} runs each",
-        lead=f"{Path(campaign.path).name}: {campaign.horizon} steps; {_told(settings, campaign, shown, scores)}",
+        title=finding(scores),
+        lead=f"{Path(campaign.path).name}: {len(campaign.settings)} settings, {campaign.runs} runs each of "
+        f"{campaign.horizon} steps; {_told(settings, campaign, shown, scores)} A case is a node in a setting.",
         sections=[
             Section("Results", pictures(campaign, scores), STATIC),
             Section("All scores", [score_table(campaign, scores)], STATIC),
@@ -56,15 +73,17 @@ def explore_page(campaign: Campaign, scores: Sequence[Score]) -> str:
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
-    return explore_html(page, _explored(campaign, shown))
+    return explore_html(page, _tables(campaign, shown, look))
 
 
 MEANING = (
-    "**rmse**: root of the mean over runs and steps of the squared error summed over the state.",
-    "**nees_per_dimension**: squared error in units of the claimed covariance, per dimension; 1 is honest, above 1 is "
-    "too sure.",
+    "**rmse**: root of the mean of the squared error over runs, and over steps unless they are told apart; of all "
+    "states together that of its sum over them.",
+    "**claimed**: root of the mean variance that the filter claims.",
+    "**nees_per_dimension**: squared error in units of the claimed covariance, per dimension; 1 where that is right, "
+    "above 1 is too sure.",
     "**rmse_error**, **nees_error**: one standard error, from the scatter between runs. Only finite runs count.",
-    "**claim**: what the filter says of its covariance, `exact`, `upper`, `nominal` or `none`.",
+    "**claim**: what the filter says of its covariance: `exact`, an `upper` bound, `nominal` (no guarantee) or `none`.",
 )
 
 
@@ -87,20 +106,52 @@ def _first(scores: Sequence[Score]) -> list[Score]:
     return shown
 
 
-def _explored(campaign: Campaign, scores: Sequence[Score]) -> Explored:
-    parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
-    columns: dict[str, list[Value]] = {
-        "setting": [score.setting for score in scores],
-        **{name: [_value(values[score.setting]) for score in scores] for name, values in parameters.items()},
-        "node": [score.node for score in scores],
-        "filter": [score.filter for score in scores],
-        **{name: [_value(getattr(score, name)) for score in scores] for name in FIELDS},
-    }
-    x = _axis(columns, list(parameters))
+def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> list[Explored]:
+    """Scores over all steps, of single states too where there are several; then single states over time."""
+    scored = [
+        Detail(s.setting, s.node, s.filter, s.claim, ALL, 0, s.rmse, s.rmse_error, math.nan, s.nees_per_dimension,
+               s.nees_error, s.finite_runs)
+        for s in scores
+    ]  # fmt: skip
+    if look is None:
+        return [_scored(campaign, scored)]
+    settings = list(dict.fromkeys(score.setting for score in scores))
+    steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
+    found = look(settings[:1], steps)
+    found += look(settings[1 : ROWS // max(len(found), 1)], steps)
+    if len({one.state for one in found}) > 1:
+        scored += [one for one in found if not one.step]
+    return [_scored(campaign, scored), _over_time(campaign, [one for one in found if one.step])]
+
+
+def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    columns, parameters = _columns(campaign, rows, SCORED), list(campaign.parameters)
+    x = _axis(columns, parameters)
     panel = next((name for name in ("node", *parameters) if name != x and len(set(columns[name])) > 1), "")
     whole = {"setting", "node", "filter", x, panel, *(parameters if x == "setting" else ())} - {""}
-    dimensions = ["setting", *parameters, "node", "filter"]
-    return Explored(columns, dimensions, QUANTITIES, x, panel, "filter", sorted(whole), "setting")
+    dimensions = ["setting", *parameters, *NAMES]
+    return Explored(
+        "all steps together", columns, dimensions, (RMSE, NEES), x, panel, "filter", sorted(whole), "setting"
+    )
+
+
+def _over_time(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
+    steps = {"time": [one.step for one in rows]}
+    columns = steps | _columns(campaign, rows, OVER_TIME)
+    dimensions = ["time", "setting", *campaign.parameters, *NAMES]
+    whole = ["filter", "setting", "state", "time"]
+    return Explored(
+        "step by step", columns, dimensions, (RMSE, CLAIMED, NEES), "time", "state", "filter", whole, "setting"
+    )
+
+
+def _columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) -> dict[str, list[Value]]:
+    parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
+    return {
+        "setting": [one.setting for one in rows],
+        **{name: [_value(values[one.setting]) for one in rows] for name, values in parameters.items()},
+        **{name: [_value(getattr(one, name)) for one in rows] for name in (*NAMES, *fields)},
+    }
 
 
 def _axis(columns: dict[str, list[Value]], parameters: Sequence[str]) -> str:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from textwrap import fill
 
 import matplotlib
 import numpy as np
@@ -16,6 +17,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, ST
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER, MUTED)
 PANELS, SETTINGS, PARAMETERS = 6, 20, 3  # more than that is in the table
+TITLE = 26  # characters in a line above a panel
 LOGARITHMIC = 8.0  # ratio of the largest to the smallest value from which an axis is logarithmic
 
 
@@ -80,7 +82,7 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
             y, error = _columns(own, quantity)
             label = in_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
-        axes.set_title(in_figure(title))
+        axes.set_title(fill(in_figure(title), TITLE))
     drawn = [score for part in shown.values() for score in part]
     _scale(grid[0], [values[score.setting] for score in drawn], "x")
     figure.supxlabel(in_figure(parameter), fontsize=10, color=INK)

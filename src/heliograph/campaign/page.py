@@ -1,5 +1,7 @@
 """The report of a campaign: one self-contained page."""
 
+import math
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,6 +10,7 @@ from heliograph.campaign.figures import PANELS, campaign_figures
 from heliograph.campaign.plan import BITWISE, Campaign
 from heliograph.campaign.show import score_headers, score_row
 from heliograph.campaign.summary import SUMMARY, Score
+from heliograph.disk.quoting import visible
 from heliograph.report.figures import svg
 from heliograph.report.page import Block, Code, Page, Picture, Points, Section, Table, Text
 
@@ -29,9 +32,10 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
     there = sum({score.setting: score.runs for score in scores}.values())
     return Page(
         kicker="Heliograph campaign",
-        title=f"{len(campaign.settings)} settings, {campaign.runs} runs each",
-        lead=f"{name}: {there} of {len(campaign.settings) * campaign.runs} runs of {campaign.horizon} steps are "
-        f"there. {_failed(failures)}",
+        title=finding(scores),
+        lead=f"{name}: {len(campaign.settings)} settings, {campaign.runs} runs each of {campaign.horizon} steps; "
+        f"{there} of {len(campaign.settings) * campaign.runs} runs are there. {_failed(failures)} A case "
+        "is a node in a setting.",
         sections=[
             *([_failures(failures)] if failures else []),
             Section("Results", pictures(campaign, scores)),
@@ -41,6 +45,23 @@ def campaign_page(campaign: Campaign, scores: Sequence[Score], failures: Sequenc
         ],
         footer=", ".join(f"{package} {campaign.versions[package]}" for package in BITWISE),
     )
+
+
+def finding(scores: Sequence[Score]) -> str:
+    """Which filter has the least error, and how often; of a single filter, between what its error lies."""
+    cases: dict[tuple[int, str], list[Score]] = {}
+    for score in scores:
+        if math.isfinite(score.rmse):
+            cases.setdefault((score.setting, score.node), []).append(score)
+    if not cases:
+        return "No run is there yet"
+    compared = [case for case in cases.values() if len(case) > 1]
+    if not compared:
+        errors = sorted(score.rmse for case in cases.values() for score in case)
+        return f"RMSE from {errors[0]:.3g} to {errors[-1]:.3g}"
+    wins = Counter(min(case, key=lambda score: score.rmse).filter for case in compared)
+    name, count = wins.most_common(1)[0]
+    return f"“{visible(name)}” has the least error in {count} of {len(compared)} cases"
 
 
 def _failed(failures: Sequence[Entry]) -> str:
@@ -72,8 +93,9 @@ def score_table(campaign: Campaign, scores: Sequence[Score]) -> Table:
     more = f" The first {ROWS} rows of {len(scores)}." if len(scores) > ROWS else ""
     caption = (
         "**RMSE**: root of the mean over runs and steps of the squared error summed over the state. **NEES / dim**: "
-        "squared error in units of the claimed covariance, per dimension; 1 is honest, above 1 is too sure. **±**: one "
-        f"standard error of the number before it, from the scatter between runs. Only finite runs count.{more}"
+        "squared error in units of the claimed covariance, per dimension; 1 where that is right, above 1 is too sure. "
+        "**±**: one standard error of the number before it, from the scatter between runs. Only finite runs "
+        f"count.{more}"
     )
     return Table(["setting", *score_headers(campaign)], rows, caption)
 

@@ -147,7 +147,7 @@ def page(found: DesignResults, drawings: Mapping[str, bytes]) -> Page:
         sections.append(_map(found.map, drawings))
     return Page(
         kicker="Heliograph design",
-        title="Who should send how much",
+        title=_finding(found),
         lead=(
             f"The network {visible(found.reference)} has the error {design.present:.4g} and sends "
             f"{sum(found.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
@@ -155,6 +155,14 @@ def page(found: DesignResults, drawings: Mapping[str, bytes]) -> Page:
         ),
         sections=[*sections, _more(found), _rerun()],
     )
+
+
+def _finding(found: DesignResults) -> str:
+    design, before = found.design, sum(found.before.values())
+    changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
+               for what, now, then in (("error", design.error, design.present), ("power", design.total, before))
+               if then > 0 and abs(now - then) > 1e-3 * then]  # fmt: skip
+    return f"By design: {' with '.join(changed)}" if changed else "No design is better than the network as it is"
 
 
 def _result(found: DesignResults) -> Section:

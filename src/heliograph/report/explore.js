@@ -3,31 +3,48 @@
   const PANELS = 12, CURVES = 120, ROWS = 200, LOGARITHMIC = 8;  // more than that is not drawn, and the page says so
   const COLOURS = ["#0072b2", "#d55e00", "#009e73", "#b05c92", "#e69f00", "#66727f"];
   const DASHES = ["solid", "dashed", "dotted"];
-  const data = JSON.parse(document.getElementById("data").textContent);
-  const {columns, dimensions} = data;
-  const size = columns[dimensions[0]].length;
+  const tables = JSON.parse(document.getElementById("data").textContent);
   const at = id => document.getElementById(id);
   const show = value => value === null ? "–" : typeof value === "number" ? String(Number(value.toPrecision(4))) : String(value);
   const plain = value => show(value).replace(/\$\$|\\[[(]/g, found => found[0] + "\u200b" + found[1]);  // no formula
   const make = (name, text = "") => { const made = document.createElement(name); made.textContent = text; return made; };
-  const values = Object.fromEntries(dimensions.map(name => {
-    const found = [...new Set(columns[name])];
-    return [name, found.every(value => typeof value === "number") ? found.sort((a, b) => a - b) : found];
-  }));
+  const parted = name => name.replaceAll("_", "_\u200b");  // where a line may end
+  let data, columns, dimensions, size, values, chosen, sorted;  // of the table that is looked at
   const numeric = name => values[name].every(value => typeof value === "number");
-  const chosen = Object.fromEntries(dimensions.map(name =>
-    [name, new Set(data.whole.includes(name) ? values[name] : values[name].slice(0, 1))]));
-  let sorted = {name: null, down: false}, views = null, wanted = 0, drawing = Promise.resolve();
+  let views = null, wanted = 0, drawing = Promise.resolve();
 
-  function options(id, names, labels, first) {
-    names.forEach((name, i) => at(id).append(new Option(labels[i], name, name === first, name === first)));
-    at(id).addEventListener("change", () => { if (id !== "y") widen(id); scales(); boxes(); draw(); });
+  function use(table) {
+    data = table;
+    ({columns, dimensions} = data);
+    size = columns[dimensions[0]].length;
+    values = Object.fromEntries(dimensions.map(name => {
+      const found = [...new Set(columns[name])];
+      return [name, found.every(value => typeof value === "number") ? found.sort((a, b) => a - b) : found];
+    }));
+    chosen = Object.fromEntries(dimensions.map(name =>
+      [name, new Set(data.whole.includes(name) ? values[name] : values[name].slice(0, 1))]));
+    sorted = {name: null, down: false};
+    const ordered = dimensions.filter(name => name !== data.unordered);
+    options("y", data.quantities.map(one => one.name), data.quantities.map(one => one.label), data.quantities[0].name);
+    options("x", dimensions, dimensions, data.x);
+    options("panel", ["", ...ordered], ["nothing", ...ordered], data.panel);
+    options("colour", ordered, ordered, data.colour);
+    scales();
+    boxes();
+    draw();
   }
 
-  // What is along an axis, in panels or colours is wanted whole.
+  function options(id, names, labels, first) {
+    at(id).replaceChildren(...names.map((name, i) => new Option(labels[i], name, name === first, name === first)));
+    at(id).dataset.was = first;
+  }
+
+  // What is along an axis, in panels or colours is wanted whole; a long axis that is left, at its end alone.
   function widen(id) {
-    const name = at(id).value;
+    const name = at(id).value, {was} = at(id).dataset;
+    at(id).dataset.was = name;
     if (name && chosen[name].size < 2) chosen[name] = new Set(values[name]);
+    if (was && free(was) && values[was].length > PANELS) chosen[was] = new Set(values[was].slice(-1));
     if (name === data.unordered) dimensions.filter(free).forEach(other => chosen[other] = new Set(values[other]));
   }
   const free = name => ![at("x").value, at("panel").value, at("colour").value].includes(name);
@@ -69,7 +86,12 @@
     }));
   }
 
-  const wide = found => found.length > 2 && Math.min(...found) > 0 && Math.max(...found) > LOGARITHMIC * Math.min(...found);
+  // Far apart, and rather by equal factors than by equal steps.
+  function wide(found) {
+    const low = found[0], high = found[found.length - 1], middle = found[Math.floor(found.length / 2)];
+    const off = place => Math.abs(Math.log(middle / place));
+    return found.length > 2 && low > 0 && high > LOGARITHMIC * low && off(Math.sqrt(low * high)) < off((low + high) / 2);
+  }
   function scales() {
     const y = columns[at("y").value].filter(value => value !== null), x = at("x").value;
     at("logy").checked = y.length > 2 && y.every(v => v > 0) && y.reduce((a, b) => Math.max(a, b)) > LOGARITHMIC * y.reduce((a, b) => Math.min(a, b));
@@ -134,7 +156,7 @@
   function ranges(rows) {
     const {name, error, level} = quantity();
     const found = rows.filter(i => columns[name][i] !== null);
-    const ends = [-2, 2].flatMap(times => found.map(i => columns[name][i] + times * (columns[error][i] ?? 0)));
+    const ends = [-2, 2].flatMap(times => found.map(i => columns[name][i] + times * (columns[error]?.[i] ?? 0)));
     const y = [...ends, ...found.map(i => columns[name][i]), ...(level === null ? [] : [level])];
     return {
       x_range: range(rows.map(across), at("logx").checked),
@@ -169,10 +191,10 @@
     const points = [];
     for (const rows of curves) {
       const sorted = rows.filter(i => columns[name][i] !== null).sort((a, b) => across(a) - across(b));
-      const y = sorted.map(i => columns[name][i]), half = sorted.map(i => 2 * (columns[error][i] ?? 0));
+      const y = sorted.map(i => columns[name][i]), half = sorted.map(i => 2 * (columns[error]?.[i] ?? 0));
       const floor = at("logy").checked ? (value, i) => Math.max(value, y[i] / 1e3) : value => value;
       const shown = {x: sorted.map(across), y, low: y.map((value, i) => floor(value - half[i], i)), high: y.map((value, i) => value + half[i])};
-      tips.forEach((tip, j) => shown[`tip${j}`] = sorted.map(i => tip === label ? `${show(columns[name][i])} ± ${show(columns[error][i])}` :
+      tips.forEach((tip, j) => shown[`tip${j}`] = sorted.map(i => tip === label ? show(columns[name][i]) + (error ? ` ± ${show(columns[error][i])}` : "") :
         tip === "finite runs" ? show(columns.finite_runs[i]) : show(columns[tip][i])));
       const source = new Bokeh.ColumnDataSource({data: shown}), {color, dash} = style(at("colour").value, columns[at("colour").value][rows[0]]);
       plot.segment({field: "x"}, {field: "low"}, {field: "x"}, {field: "high"}, {source, line_color: color});
@@ -186,7 +208,7 @@
   function table(rows) {
     const names = Object.keys(columns);
     at("heads").replaceChildren(...names.map(name => {
-      const head = make("th"), button = make("button", name + (sorted.name === name ? (sorted.down ? " ▾" : " ▴") : ""));
+      const head = make("th"), button = make("button", parted(name) + (sorted.name === name ? (sorted.down ? " ▾" : " ▴") : ""));
       button.type = "button";
       button.addEventListener("click", () => { sorted = {name, down: sorted.name === name && !sorted.down}; table(selected()); });
       head.append(button);
@@ -199,21 +221,23 @@
     at("rows").textContent = (rows.length > ROWS ? `The first ${ROWS} of ` : "") + `${rows.length} rows, of ${size} altogether. A header sorts.`;
     at("cells").replaceChildren(...rows.slice(0, ROWS).map(i => {
       const line = make("tr");
-      line.append(...names.map(name => make("td", show(columns[name][i]))));
+      line.append(...names.map(name => {
+        const cell = make("td", show(columns[name][i]));
+        cell.dataset.header = parted(name);
+        return cell;
+      }));
       return line;
     }));
   }
 
-  options("y", data.quantities.map(one => one.name), data.quantities.map(one => one.label), data.quantities[0].name);
-  options("x", dimensions, dimensions, data.x);
-  const ordered = dimensions.filter(name => name !== data.unordered);
-  options("panel", ["", ...ordered], ["nothing", ...ordered], data.panel);
-  options("colour", ordered, ordered, data.colour);
+  options("table", tables.map((_, i) => String(i)), tables.map(one => one.name), "0");
+  at("table").parentElement.hidden = tables.length < 2;
+  at("table").addEventListener("change", () => use(tables[at("table").value]));
+  for (const id of ["x", "y", "panel", "colour"])
+    at(id).addEventListener("change", () => { if (id !== "y") widen(id); scales(); boxes(); draw(); });
   for (const id of ["logx", "logy"]) at(id).addEventListener("change", draw);
   at("again").addEventListener("click", draw);
   at("explore").hidden = false;
   document.documentElement.classList.add("drawn");
-  scales();
-  boxes();
-  draw();
+  use(tables[0]);
 })();

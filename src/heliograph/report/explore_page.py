@@ -21,19 +21,20 @@ class Quantity:
 
     name: str
     label: str
-    error: str
+    error: str = ""
     level: float | None = None
 
 
 @dataclass(frozen=True)
 class Explored:
-    """A table by columns, and what is drawn of it.
+    """A table by columns, and what is drawn of it. `name` is what tells it from the others on the page.
 
     dimensions: columns that tell the rows apart, in the order in which they are offered; `x`, `panel` and `colour` are
     those of the first view. whole: the dimensions of which all values are in the first view; of the others, the first.
     unordered: a dimension whose neighbours have nothing to do with each other: points along it are not connected.
     """
 
+    name: str
     columns: Mapping[str, Sequence[Value]]
     dimensions: Sequence[str]
     quantities: Sequence[Quantity]
@@ -44,13 +45,13 @@ class Explored:
     unordered: str
 
 
-def explore_html(page: Page, table: Explored) -> str:
-    """The page with a table to explore before its sections, as HTML that loads nothing from anywhere.
+def explore_html(page: Page, tables: Sequence[Explored]) -> str:
+    """The page with tables to explore before its sections, as HTML that loads nothing from anywhere.
 
     Raises:
         ModuleNotFoundError: the extra `explore` is not installed.
     """
-    data = json.dumps(asdict(table), ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    data = json.dumps([asdict(table) for table in tables], ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     return (
         environment()
         .get_template("explore.html.j2")

@@ -14,7 +14,7 @@ from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
 from heliograph.learning.losses import Losses
 from heliograph.learning.solution import Row
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 MOST = 40  # numbers, filters and nodes that are drawn; tables hold all
@@ -93,7 +93,7 @@ def _correlations(tested: list[Change]) -> Figure:
         axes.set_title(in_figure(f"{one.node}/{one.filter}"))
         axes.set_ylabel("correlation")
         axes.set_xticks(lags)
-    grid[0].legend(loc="upper right", ncols=2)
+    legend_above(figure, grid[0])
     grid[-1].set_xlabel("rows apart")
     return figure
 
@@ -107,7 +107,7 @@ def _pits(heard: list[Uniformity]) -> Figure:
         count = len(values)
         low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
         axes.hist(values, np.linspace(0, 1, BINS + 1), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
-        axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0)
+        axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
         axes.set_title(in_figure(one.node))
         axes.set_ylabel("density")
@@ -119,18 +119,39 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
     """The report; `drawings` holds each figure as SVG."""
     return Page(
         kicker="Heliograph fit",
-        title=visible(learned.network),
-        lead=f"What {visible(learned.measurements)} says of the numbers that are free in the network.",
+        title=_finding(learned),
+        lead=_lead(learned),
         sections=[
             Section("At a glance", _glance(learned)),
             Section("What was learned", _table(learned, drawings)),
-            Section("What else there is to say", _words(learned)),
+            Section("What to keep in mind", _words(learned)),
             *_before_and_after(learned, drawings),
             *_losses(learned),
             Section("Use it", [Code("heliograph run DIR/fitted_network.py --measurements data.csv --report report"),
                                Text(["DIR is this folder: `fitted_network.py` loads the numbers of `fitted.json`."])]),
         ],
     )  # fmt: skip
+
+
+def _finding(learned: Learned) -> str:
+    rows = learned.found.rows()
+    return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
+
+
+def _lead(learned: Learned) -> str:
+    """Whether the filters foretell more of what was held out."""
+    whence = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
+    told = [(one, one.gain) for one in learned.changes if one.gain is not None]
+    if not told:
+        return whence
+    one, gain = told[0]
+    error = 1.96 * gain.standard_error
+    what = "better" if gain.difference > error else "worse" if gain.difference < -error else "neither better nor worse"
+    return (
+        f"On the {learned.held_out:,} rows after these, which it was not given, the filter "
+        f"{visible(f'{one.node}/{one.filter}')} predicts {what} with the learned numbers than with those before: its "
+        f"log-likelihood changes by {gain.difference:+.3f} ± {error:.3f} a row. {whence}"
+    )
 
 
 def _glance(learned: Learned) -> list[KeyFigures]:
@@ -154,21 +175,22 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
         for row in learned.found.table
     ]
     caption = (
-        "95 % intervals by cosines, which allow for scores that are correlated over time. Of two forms the "
-        "**conditional** one counts, which is sharper; the **linear** one holds whatever the laws of the gains."
+        "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). **Form**: "
+        "of the likelihood; the **conditional** one is sharper and counts where there is one, the **linear** one needs "
+        "no more than second moments."
     )
     picture = Picture(
         drawings["estimates"],
         "Each number with its interval and its start, on a scale of its own.",
         "Estimates with their intervals (blue: the form that counts, grey: the other), from the starts (triangles). "
-        "A cross: not told by the data.",
+        "A cross: the data do not determine it.",
     )
     return [picture, Table(["number", "start", "estimate", "95 %", "form"], rows, caption)]
 
 
 def _interval(row: Row) -> str:
     if not row.identified:
-        return "not told"
+        return "not determined"
     if row.boundary:
         return f"below {row.high:.3g}" if row.high > row.estimate else f"above {row.low:.3g}"
     return f"{row.low:.4g} to {row.high:.4g}"
@@ -194,8 +216,8 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
     headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
     caption = (
         f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
-        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 is honest. "
-        "**Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
+        "its 95 % interval. **Size**: mean square of the innovations in units of what the filter claims; 1 where that "
+        "is right. **Correlation**: of innovations one row apart; 0 where the filter uses all that it hears."
     )
     blocks: list[Table | Picture] = [Table(headers, rows, caption)]
     if "innovations" in drawings:
@@ -209,7 +231,11 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
             "too much spread; high at the ends: too little."
         )
         kinds = {one.by_law for one in learned.uniform}
-        how = "Laws of gains count in full." if kinds == {True} else "Gaussians of the filters stand for some laws."
+        how = (
+            "The laws of the gains are used in full."
+            if kinds == {True}
+            else "Some laws of gains are replaced by Gaussians."
+        )
         sections.append(Section("Do the laws fit", [Picture(drawings["pits"], text, text), Text([how])]))
     return sections
 
@@ -225,8 +251,9 @@ def _losses(learned: Learned) -> list[Section]:
             best = "best" if name == found.best else ""
             rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
     caption = (
-        "Laws of the losses that the receiver is told of, with 95 % intervals, and what each foretells of the last "
-        "third of the rows: log-likelihood per packet more than independent losses. `hg.learning.learn_losses` makes a "
+        "Laws of the losses that the receiver is told of, with 95 % intervals, and what each predicts of the last "
+        "third of the rows: log-likelihood per packet, less that of independent losses. `hg.learning.learn_losses` "
+        "makes a "
         "channel of them."
     )
     table = Table(["lost", "law", "numbers", "gain", ""], rows, caption, wordy=True)

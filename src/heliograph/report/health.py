@@ -81,11 +81,11 @@ def _doubts(one: Listening) -> Iterator[str]:
     name, test = f"{one.node}/{one.filter}", one.test
     if test.power > 1 + SURE * test.power_error:
         yield (
-            f"{name} is too sure: what it did not expect is {test.power:.2f} times what it claims (squared); "
+            f"{name} is too sure: the mean square of its innovations is {test.power:.2f} times what it claims; "
             "the model leaves something out"
         )
     elif test.power < 1 - SURE * test.power_error:
-        yield f"{name} is too cautious: what it did not expect is {test.power:.2f} times what it claims (squared)"
+        yield f"{name} is too cautious: the mean square of its innovations is {test.power:.2f} times what it claims"
     if test.found:
         yield (
             f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
+PHONE, GAP = 46, 3  # characters that a row has room for in a window of 420 px; those that space between cells takes
+VERDICTS = {"fails": "fails", "holds_vacuously": "true but empty", "holds": "holds"}
+
 
 @dataclass(frozen=True)
 class Text:
@@ -47,7 +50,8 @@ class KeyFigures:
 class Table:
     """Rows of cells under headers; the first column names the row, with a dot in its colour if `colours` are given.
 
-    Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines.
+    Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines. On a phone
+    each row becomes a block, unless the table is `narrow`.
     """
 
     headers: Sequence[str]
@@ -56,6 +60,56 @@ class Table:
     colours: Sequence[str] | None = None
     wordy: bool = False
     kind: str = "table"
+
+    @property
+    def narrow(self) -> bool:
+        """Whether its columns fit beside each other in the window of a phone."""
+        longest = [
+            max(cell, *map(len, header.split()), 0) for cell, header in zip(self._cells, self.headers, strict=True)
+        ]
+        return not self.wordy and sum(longest) + GAP * len(longest) <= PHONE
+
+    @property
+    def room(self) -> int:
+        """Characters that a cell has room for where a row is a block."""
+        return PHONE if self.wordy else max([9, *self._cells[1:]])
+
+    @property
+    def _cells(self) -> list[int]:
+        """Length of the longest cell of each column."""
+        return [max((len(row[i]) for row in self.rows), default=0) for i in range(len(self.headers))]
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A statement and where it stands, what is printed there if that says more, what was found, and the verdict.
+
+    `verdict` is one of VERDICTS.
+    """
+
+    text: str
+    source: str
+    printed: str
+    found: str
+    verdict: str
+
+    @property
+    def word(self) -> str:
+        """The verdict in words."""
+        return VERDICTS[self.verdict]
+
+
+@dataclass(frozen=True)
+class Statements:
+    """Statements with their verdicts, each of which is seen at any width; those that fail first."""
+
+    statements: Sequence[Judged]
+    kind: str = "statements"
+
+    @property
+    def judged(self) -> list[Judged]:
+        """By verdict, else in their own order."""
+        return sorted(self.statements, key=lambda one: list(VERDICTS).index(one.verdict))
 
 
 @dataclass(frozen=True)
@@ -81,7 +135,7 @@ class Code:
     kind: str = "code"
 
 
-Block = Text | Points | KeyFigures | Table | Picture | Code
+Block = Text | Points | KeyFigures | Table | Statements | Picture | Code
 
 
 @dataclass(frozen=True)
@@ -123,6 +177,6 @@ def environment() -> Environment:
 
 def rich(text: str) -> Markup:
     """Escape a text, then set `**strong**` and backquoted code."""
-    safe = str(escape(text))
+    safe = re.sub(r"(?<=\d) (?=%|± |m\b|s\b)", "\u00a0", str(escape(text)))  # a number stays with what belongs to it
     safe = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", safe)
     return Markup(re.sub(r"`(.+?)`", r"<code>\1</code>", safe))

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH
+from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
@@ -54,6 +54,7 @@ def _estimates(health: Health, record: Record, node: str) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.8 + 1.7 * len(record.states)), layout="constrained")
     grid = figure.subplots(len(record.states), 1, squeeze=False, sharex=True)[:, 0]
     record.plot(node, list(record.estimates[node])[: len(COLOURS)], axes=list(grid), sigmas=BAND)
+    legend_above(figure, grid[0])
     _time_axis(health, grid[-1])
     return figure
 
@@ -81,8 +82,9 @@ def _links(health: Health) -> Figure:
     axes = figure.subplots()
     for row, link in enumerate(links):
         lost = health.record.time[~link.arrived]
-        axes.plot(health.record.time[link.arrived], np.full(link.arrived.sum(), row), "|", color=BLUE, markersize=5)
-        axes.plot(lost, np.full(len(lost), row), "|", color=VERMILION, markersize=9)
+        came = health.record.time[link.arrived]
+        axes.plot(came, np.full(len(came), row - 0.2), "|", color=BLUE, markersize=6, alpha=0.6)
+        axes.plot(lost, np.full(len(lost), row + 0.2), "|", color=VERMILION, markersize=6, alpha=0.6)
     names = [in_figure(f"{link.node}: {link.component} ({link.share:.0%})") for link in links]
     axes.set_yticks(range(len(links)), names)
     axes.set_ylim(len(links) - 0.5, -0.5)
@@ -102,19 +104,24 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     arrived = np.mean([link.share for link in health.links]) if health.links else np.nan
     keys = [
         KeyFigure("rows", f"{len(record.time):,}", _span(record.time), BLUE),
-        KeyFigure("arrived", f"{arrived:.1%}", f"of what {len(record.measurements)} nodes could hear", GREEN),
+        KeyFigure(
+            "arrived", f"{arrived:.1%}", f"of what {_counted(len(record.measurements), 'node')} could hear", GREEN
+        ),
         KeyFigure("warnings", f"{len(doubts)}", "see below" if doubts else "nothing to remark", VERMILION),
     ]
     estimates = [
         Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
-                f"{visible(node)}: estimates with bands of {BAND:g} claimed deviations on each side{added}.")
+                f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each side{added}.")
         for kind, each, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
         for i, node in enumerate([] if each is None else _nodes(each))
     ]  # fmt: skip
     return Page(
         kicker="Heliograph run",
-        title=visible(network),
-        lead="What the network's filters made of the recording, and whether the recording agrees with the network.",
+        title=f"{_counted(len(doubts), 'doubt')} about the network"
+        if doubts
+        else "The recording agrees with the network",
+        lead=f"The filters of `{visible(network)}` ran over {len(record.time):,} rows, {_span(record.time)}. "
+        + _agreement(health, doubts),
         sections=[
             Section("At a glance", [KeyFigures(keys), *_warned(doubts)]),
             Section("Estimates", estimates),
@@ -122,6 +129,18 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
             Section("Links", _health(health, drawings)),
         ],
     )
+
+
+def _agreement(health: Health, doubts: list[str]) -> str:
+    if doubts:
+        return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
+    tested = any(one.test is not None for one in health.filters)
+    found = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
+    return f"Nothing is lost that the network says cannot be lost, and {found}."
+
+
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _span(time: np.ndarray) -> str:
@@ -152,14 +171,15 @@ def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table |
                 ]
             )
     caption = (
-        "**Size**: mean square of what the filter did not expect, in units of what it claims (the normalised "
-        "innovation squared per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
+        "**Size**: mean square of the innovations in units of what the filter claims (normalised innovation squared "
+        "per dimension): 1 where the claim holds, above 1 too sure. **Correlation** of innovations "
         "one row apart: 0 where the filter uses all that it hears. Both with 95 % intervals; **p**: probability of "
         "such a correlation if there were none."
     )
     text = "An innovation is what arrived less what the filter expected. The tests need no true state."
     picture = [Picture(drawings["innovations"], "Innovations over time in claimed deviations",
-                       f"Innovations in claimed deviations, one colour a component; 5 of 100 may lie beyond ±{BAND:g}.")
+                       f"Innovations in claimed standard deviations, one colour a component; 5 of 100 may lie beyond "
+                       f"±{BAND:g}.")
                ] if "innovations" in drawings else []  # fmt: skip
     return [Text([text]), Table(["filter", "claim", "size", "correlation", "p"], rows, caption), *picture]
 
@@ -171,8 +191,8 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
         told = "may be lost" if link.loses else "never lost"
         name = visible(f"{link.node}: {link.component}")
         rows.append([name, f"{link.share:.1%}", str(link.longest_gap), told, mean, deviation])
-    headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "deviation"]
-    caption = "When each component arrived; red: it did not."
+    headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
+    caption = "When each component arrived (blue, above) and when it did not (red, below)."
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
     return [Table(headers, rows), *picture]
 

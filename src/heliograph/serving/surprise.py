@@ -53,7 +53,7 @@ class Surprise:
         if self.numbers < FEWEST:
             return None
         if self.ratio > high:
-            return f"what it did not expect is {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
+            return f"its squared innovations are {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
         if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
-            return f"what it did not expect is {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
+            return f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
         return None

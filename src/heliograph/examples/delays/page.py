@@ -12,10 +12,10 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, VERMILION
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 
 LATE = {  # filter: how it is called, and its colour
-    "as_current": ("late, taken as current", VERMILION),
-    "untold": ("late, not told", BLUE),
-    "told": ("late, told", GREEN),
-    "constant": ("late by one step", PURPLE),
+    "as_current": ("taken as current", VERMILION),
+    "untold": ("delays not told", BLUE),
+    "told": ("delays told", GREEN),
+    "constant": ("all one step late", PURPLE),
     "none": ("not late", INK),
 }
 CLOCKS = {
@@ -57,7 +57,7 @@ def _offsets(found: Mapping[str, Mapping[str, Score]]) -> list[Curve]:
 
 def short(name: str) -> str:
     """A name at a curve's end."""
-    return LATE[name][0].removeprefix("late, ")
+    return LATE[name][0]
 
 
 def known(score: Score) -> np.ndarray:
@@ -82,15 +82,16 @@ def delay_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     """The report; `drawings` holds each figure as SVG."""
     late, wrong = outcome.delays, outcome.clocks["moving"]["ignored"]["position"]
     mistake, best = late["as_current"], late["untold"]
+    claimed = mistake.mean(mistake.claimed)
     return Page(
         kicker="Heliograph example",
-        title="Late data and wrong clocks",
+        title=f"Late data taken as current: {error(mistake) / claimed:.1f} times the claimed variance",
         lead=(
-            "Values late by up to two steps, taken as current: a filter claims a variance of "
-            f"{mistake.mean(mistake.claimed):.3f} and has {error(mistake):.3f}. The best linear filter that is told no "
-            "delay claims and has "
-            f"{error(best):.3f}; told each delay, {error(late['told']):.3f}. A clock that is half a second "
-            f"wrong, and trusted, makes {np.sqrt(wrong.true[-1]):.2f} of a claimed {np.sqrt(wrong.claimed[-1]):.2f}."
+            "Measurements come up to two steps late. A filter that takes them as current has an error variance of "
+            f"{error(mistake):.3f} and computes {claimed:.3f}. The best linear filter that knows "
+            f"only how often they are late has {error(best):.3f} and says so; one that is told each delay has "
+            f"{error(late['told']):.3f}. A clock that is trusted and half a second wrong makes the position error "
+            f"{np.sqrt(wrong.true[-1]):.2f} where {np.sqrt(wrong.claimed[-1]):.2f} is claimed."
         ),
         sections=[_late(outcome, drawings), _clocks(outcome, drawings), _traps(outcome, drawings)],
         footer="All numbers: summary.json.",
@@ -107,10 +108,16 @@ def _late(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         [label, s.claim, f"{s.mean(s.claimed):.4f}", f"{s.mean(s.true):.4f} ± {s.true_se:.4f}", before(s)]
         for label, s in ((LATE[name][0], late[name]) for name in LATE)
     ]
-    caption = f"Variance of the position, means over the second half of the steps; {RUNS['delays']:,} runs."
-    headers = ["filter", "claim", "claimed", "mean square error", "before data"]
+    caption = (
+        f"Variance of the position, means over the second half of the steps; {RUNS['delays']:,} runs. **Claim**: "
+        "`exact` where the filter's own covariance is that of its errors, `nominal` where nothing is guaranteed."
+    )
+    headers = ["filter", "claim", "claimed", "mean square error", "known before data"]
     colours = [colour for _, colour in LATE.values()]
-    text = "Above what filters claim, below what they are wrong by, before any data where their gains depend on none."
+    text = (
+        "Above, the variance that each filter claims; below, its mean square error, computed before any data where no "
+        "gain depends on them."
+    )
     alternative = (
         "Claimed variance and mean square error over time; only the filter that takes late as current differs."
     )
@@ -124,7 +131,7 @@ def before(score: Score) -> str:
 
 
 def _clocks(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
-    caption = f"Root mean squares at the last step and what is claimed; {RUNS['clocks']:,} runs."
+    caption = f"Root mean square errors at the last step, and what the filter claims; {RUNS['clocks']:,} runs."
     headers = ["situation", "filter", "position", "offset in s", "drift"]
     rows = [
         [label, CLOCKS[name][0], *(cell(score[part]) for part in ("position", "offset", "drift"))]
@@ -143,9 +150,9 @@ def cell(score: Score) -> str:
 
 def _traps(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     text = (
-        "At rest no time is told from another, and a node alone may be shifted in time with all that it saw. A filter "
-        "that linearises anew at each step finds an offset there, and claims to know it. The one that asks whether it "
-        "can be observed keeps what was known before."
+        "A clock's offset cannot be observed while nothing moves, nor where no other clock is right. A filter that "
+        "linearises anew at each step finds an offset all the same, and claims to know it. The filter that first "
+        "checks whether the offset can be observed keeps what it knew before."
     )
     alternative = (
         "Offset errors and claims at rest and without a true clock: the plain claim falls, the error does not."

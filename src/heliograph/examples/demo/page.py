@@ -61,7 +61,7 @@ def demo_page(outcome: Outcome, designs: Mapping[str, Design], drawings: Mapping
     aware, mean = (outcome.trials[0].scores[name] for name in SHOWN[:2])
     return Page(
         kicker="Heliograph demonstration",
-        title="Knowing the relay is worth more than trusting its mean gain",
+        title=f"Knowing the relay: {aware.position_rmse_m:.1f} m off instead of {mean.position_rmse_m:.1f} m",
         lead=(
             f"A robot mower drove {outcome.recording.odometry[:, 0].sum():.0f} m past four radio beacons. Its recorded "
             "ranges reach a remote filter through a relay that amplifies by a factor nobody knows at the time. The "
@@ -101,8 +101,8 @@ def _result(outcome: Outcome) -> Section:
         f"Position error over {len(outcome.recording.time)} rows, relay seed {seed}; the last two columns span "
         f"{len(outcome.trials)} seeds of the relay ({seed} to {outcome.trials[-1].seed}). **RMSE**: root mean square "
         "distance from the truth. **Claimed**: the same by the filter's own covariance. **NEES / dim**: squared error "
-        "in units of the claimed covariance, per dimension; 1 is honest, above 1 is too sure, below 1 too cautious. "
-        "**In 95 % ellipse**: share of rows where the truth lies inside the claimed 95 % ellipse."
+        "in units of the claimed covariance, per dimension; 1 where it is right, above 1 is too sure, below 1 too "
+        "cautious. **In 95 % ellipse**: share of rows where the truth lies inside the claimed 95 % ellipse."
     )
     rows = [[LABELS[row[0]], *row[1:]] for row in table_rows(outcome)]
     return Section(
@@ -126,9 +126,9 @@ def _honesty(drawings: Mapping[str, bytes], outcome: Outcome) -> Section:
             Picture(
                 drawings["errors"],
                 "Position errors in x and y of three filters over time, each with its claimed band.",
-                "Error in x and in y (line) and the filter's own claim of two standard deviations (band). An honest "
-                "filter's line stays in its band about 95 % of the time. The mean-gain band is so narrow that its "
-                "line hides it.",
+                "Error in x and in y (line) and the filter's own claim of two standard deviations (band). If the "
+                "claim is right, the line stays in its band about 95 % of the time. The mean-gain band is so narrow "
+                "that its line hides it.",
             ),
             Picture(
                 drawings["consistency"],
@@ -149,17 +149,16 @@ def _designed(designs: Mapping[str, Design]) -> Section:
     text = (
         "Where the robot starts is known, so that the ranges there are too. A sensor that takes them off before it "
         "sends, and a receiver that adds them back, lose nothing; but what is sent is smaller, and a gain that varies "
-        "at random multiplies only that. The same relays then need "
-        f"1/{plain.power / less.power:.0f} of the power for {less.rmse / plain.rmse:.0%} of the error, and "
-        f"1/{plain.power / least.power:.0f} of it for {least.rmse / plain.rmse:.0%}: what hurt was not too little "
-        "power, but that the gains vary."
+        f"at random multiplies only that. The same relays then need 1/{plain.power / less.power:.0f} of the power for "
+        f"{less.rmse / plain.rmse:.0%} of the error, and 1/{plain.power / least.power:.0f} of it for "
+        f"{least.rmse / plain.rmse:.0%}: what hurt was not too little power, but that the gains vary."
     )
     caption = (
         "Mean square of what a beacon's sensor and its relay send for a row, and the position error of the filter that "
         "knows the relays, each a mean over all seeds (the draws of the three differ)."
     )
     headers = ("what is sent", "sensor (m²)", "relay (m²)", "RMSE (m)", "claimed (m)")
-    return Section("The same relays, told less", [Text([text]), Table(headers, rows, caption)])
+    return Section("The same relays, sending less", [Text([text]), Table(headers, rows, caption)])
 
 
 def _origin(outcome: Outcome) -> Section:
@@ -169,9 +168,8 @@ def _origin(outcome: Outcome) -> Section:
         [
             Points([
                 f"**Recorded:** {np.count_nonzero(~np.isnan(recording.ranges))} ranges to four beacons, one beacon at "
-                "a time, "
-                f"{recording.time[-1] - recording.start:.0f} s; the distance travelled and the gyro's turn in between; "
-                "and the true path, used for scoring, for the first pose"
+                f"a time, {recording.time[-1] - recording.start:.0f} s; the distance travelled and the gyro's turn in "
+                "between; and the true path, used for scoring, for the first pose"
                 + (" and for the constants below." if _in_sample(outcome) else "; the constants below are not from "
                    "it, but for the gyro's rate at rest.")
                 + (" Stretches without a range keep the rows of the odometry." if len(recording.time)

@@ -62,12 +62,14 @@ def late_data_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     """The report; `drawings` holds each figure as SVG."""
     scores = outcome.point.scores
     lead = (
-        f"Every fourth packet or so arrives after a newer one. A filter that takes each as current is off by "
-        f"{scores['used_as_current'].rmse:.1f} m; one that puts it where it belongs and replays what came after, by "
-        f"{scores['rewound'].rmse:.2f} m. Who can wait two seconds has {scores['lag_2s'].rmse:.2f} m."
+        f"{100 * outcome.network.out_of_order:.0f} % of the packets arrive after a newer one. A filter that takes each "
+        f"as current is off by {scores['used_as_current'].rmse:.1f} m; one that puts it where it belongs and replays "
+        f"what came after, by {scores['rewound'].rmse:.2f} m. Waiting two seconds leaves {scores['lag_2s'].rmse:.2f} m."
     )
+    right, wrong = scores["rewound"].rmse, scores["used_as_current"].rmse
+    title = f"Late packets put where they belong: {right:.2f} m off, not {wrong:.1f} m"
     sections = [_network(outcome), _point(outcome, drawings), _mower(outcome, drawings), _again(outcome)]
-    return Page("Heliograph example", "Data that come late", lead, sections, SOURCE)
+    return Page("Heliograph example", title, lead, sections, SOURCE)
 
 
 def _network(outcome: Outcome) -> Section:
@@ -119,7 +121,7 @@ def _point(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     caption = (
         f"A point pushed at random; each packet sent between {BEGIN:g} and {BEGIN + DURATION:g} s holds its position "
         f"with an error of 0.5 m on each axis. {RUNS} paths, judged every second. **NEES / dim**: squared error in "
-        f"units of the claimed covariance; honest is 1. Rewound over {WINDOW:g} s: {_verdicts(found)}."
+        f"units of the claimed covariance; 1 where that is right. Rewound over {WINDOW:g} s: {_verdicts(found)}."
     )
     picture = Picture(
         drawings["point"],
@@ -132,11 +134,11 @@ def _point(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
 def _mower(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     found = outcome.mower
     text = (
-        "The demonstration's mower, its recorded ranges and odometry. The k-th range of a beacon has the fate of the "
-        "k-th packet of one of the four nodes that were heard most: its delay, or its loss. Odometry is the robot's "
-        "own and comes at once. What is seen here is recorded, plant and network alike."
+        "The demonstration's mower, its recorded ranges and odometry. The k-th range of a beacon is delayed or lost "
+        "as the k-th packet of one of the four nodes that were heard most. Odometry is the robot's own and comes at "
+        "once. Both are recordings, the drive and the network."
         if outcome.trace is not None
-        else "The demonstration's mower, its recorded ranges and odometry; each range has the fate of a packet."
+        else "The demonstration's mower, its recorded ranges and odometry; each range is late or lost as a packet is."
     )
     caption = f"{outcome.unheard} ranges never came; of the others, rewound: {_verdicts(found)}."
     chart = Picture(

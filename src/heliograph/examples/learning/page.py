@@ -38,10 +38,10 @@ def labelled(key: str) -> str:
 
 @matplotlib.rc_context(STYLE)
 def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
-    """What intervals cover by parameter and method; nominal is a line."""
+    """What intervals cover by parameter and method; a line at 95 %."""
     keys = list(coverage)
     names = [name for name in PARAMETERS if any(name in one.covered["cosines"] for one in coverage.values())]
-    figure = Figure(figsize=(WIDTH, 1.0 + 0.34 * len(keys)), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 1.0 + 0.4 * len(keys)), layout="constrained")
     grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for axes, name in zip(grid, names, strict=True):
         axes.axvline(95, color=INK, linewidth=0.8)
@@ -53,7 +53,7 @@ def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
             axes.scatter(*zip(*places, strict=True), s=26, color=COLOURS[method], marker=shape, label=method, zorder=3)
         axes.set(xlim=(35, 103), xticks=[50, 95])
         axes.set_title(PARAMETERS[name].replace(" ", "\n"), fontsize=9)
-        axes.set_yticks(range(len(keys)), [labelled(key) for key in keys])
+        axes.set_yticks(range(len(keys)), [",\n".join(labelled(key).rsplit(", ", 1)) for key in keys])
     grid[0].invert_yaxis()
     figure.legend(*grid[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, frameon=False)
     return {"coverage": figure}
@@ -78,20 +78,22 @@ def learning_page(coverage: Mapping[str, Coverage], drawings: Mapping[str, bytes
     counted = sorted({one.recordings for one in coverage.values()})
     caption = (
         f"Percent of {', '.join(map(str, counted))} recordings a row, less those in which a number ran to a limit "
-        "(last column). Two standard errors are about 1.8 at 600 recordings."
+        "(last column). Two standard errors are about 1.8 at 600 recordings. **Intervals**: from the curvature of the "
+        "likelihood (hessian), or from the spread of the scores: as if these were white, and with their long-run "
+        "variance by Bartlett's weights or by cosines."
     )
     return Page(
         kicker="Heliograph example",
-        title="Learning a link, and how well it is known",
+        title=f"95 % intervals that cover {naive:.0f} %, and others that cover {honest:.0f} %",
         lead=(
-            "Behind a random gain the data are not Gaussian, and the curvature of the likelihood says too little: of "
-            f"its 95 % intervals {naive:.0f} % hold the variance of a gain that is large now and then. Intervals from "
-            f"the scores' own long-run spread hold it in {honest:.0f} %."
+            "Behind a random gain the data are not Gaussian, and intervals from the curvature of the likelihood are "
+            f"too short: {naive:.0f} % of the 95 % intervals hold the variance of a gain that is large now and then. "
+            f"Of the intervals from the scores' own long-run spread {honest:.0f} % hold it."
         ),
         sections=[
             Section("What intervals cover", [KeyFigures(keys), picture]),
             Section("The whole table", [Table(_headers(), _cells(coverage), caption)]),
-            Section("Again", [Text(_AGAIN), Code("heliograph example learning --out out")]),
+            Section("Run it again", [Text(_AGAIN), Code("heliograph example learning --out out")]),
         ],
         footer="All numbers: summary.json.",
     )

@@ -62,11 +62,12 @@ def memory_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     none, exact = e1["memoryless"], e1["exact"]
     return Page(
         kicker="Heliograph example",
-        title="Links that remember",
+        title=f"Taking a slow fade for a fast one: {none.true / none.claimed:.1f} times the claimed variance",
         lead=(
-            "A gain that stays at 0.2 or at 1 for some twenty steps. A filter that assumes a new gain at each step "
-            f"claims a variance of {none.claimed:.3f} and has {none.true:.3f}; the best linear filter that knows the "
-            f"chain claims and has {exact.claimed:.3f}. All of this was known before any data."
+            "The gain of a link stays at 0.2 or at 1 for some twenty steps. A filter that assumes a new gain at each "
+            f"step has an error variance of {none.true:.3f} and claims {none.claimed:.3f}; the best linear filter that "
+            f"knows how long the gain stays has {exact.claimed:.3f} and says so. These numbers are computed before any "
+            "data."
         ),
         sections=[
             _bursts(outcome, drawings),
@@ -86,13 +87,13 @@ def _bursts(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         for n in ("memoryless", "exact", "gpb2")
     ]
     caption = (
-        f"Means over steps 101 to 300; {RUNS['e1']:,} runs, fewer of the particles. What is known before data comes "
-        "from moments alone."
+        f"Means over steps 101 to 300; {RUNS['e1']:,} runs, fewer of the particles. **Claim**: `exact` "
+        "where the filter's own covariance is that of its errors, `nominal` where nothing is guaranteed."
     )
     picture = Picture(
         drawings["claims"],
         "Claimed variance and mean square error over time of three filters; without memory they differ.",
-        "Above what filters claim, below what they are wrong by.",
+        "Above, the variance that each filter claims; below, its mean square error.",
     )
     return Section("Fading in bursts", [KeyFigures(keys), Table(HEADERS, rows(e1), caption, COLOURS), picture])
 
@@ -108,7 +109,18 @@ def _worth(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         "Mean square error over time, lower the more is told.",
         "Linear filters, told nothing, the mode one step late, or the mode.",
     )
-    return Section("What telling is worth", [Table(headers, cells, "Linear filters; every claim is exact."), picture])
+    return Section(
+        "What it helps to be told",
+        [
+            Table(
+                headers,
+                cells,
+                "Linear filters, whose covariance is that of their errors. **Mode**: which of its two gains the link "
+                "has.",
+            ),
+            picture,
+        ],
+    )
 
 
 def _wrong(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
@@ -119,9 +131,9 @@ def _wrong(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         "The same two levels, as often each; the filter assumes none of the correlation.",
     )
     text = (
-        f"Data tell, too: in one recording of 10,000 steps the filter's innovations have a correlation of "
+        f"Data show it too: in one recording of 10,000 steps the filter's innovations have a correlation of "
         f"{found.correlation[0]:.2f} ± {found.standard_error[0]:.2f} at lag 1 and {found.correlation[1]:.2f} at lag 2, "
-        f"and those before foretell {100 * found.predictable:.0f} % of their variance."
+        f"and earlier ones predict {100 * found.predictable:.0f} % of their variance."
     )
     return Section("How wrong a filter without memory is", [picture, Text([text])])
 
@@ -136,10 +148,11 @@ def _drift(outcome: Outcome) -> Section:
 
 def _again(shadow: Mapping[str, float]) -> Section:
     points = [
-        f"Two sensors in **one shadow**: the best linear filter has {shadow['shared']:.4f}. A filter for two shadows "
-        f"claims {shadow['separate_claimed']:.4f}, and has {shadow['separate_true']:.4f}: one sensor alone is as good.",
+        f"Two sensors whose links fade together: the best linear filter has {shadow['shared']:.4f}. A filter that "
+        f"takes the fades for independent claims {shadow['separate_claimed']:.4f} and has "
+        f"{shadow['separate_true']:.4f}.",
     ]
     return Section(
-        "One shadow, and how to run this again",
+        "Two links that fade together, and how to run this again",
         [Points(points), Code("heliograph example links-with-memory --out out")],
     )

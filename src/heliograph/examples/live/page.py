@@ -26,12 +26,17 @@ def live_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
         f"{outcome.messages:,} messages of a drive went through a broker to a service that was killed {outcome.kills} "
         f"times with -9. Its {len(outcome.killed):,} final estimates are {same} as those of a service left alone."
     )
-    return Page("Heliograph example", "A service that is killed", lead, [_service(outcome, drawings), _speed(outcome)])
+    return Page(
+        "Heliograph example",
+        f"Killed {outcome.kills} times, and every final estimate is {same}",
+        lead,
+        [_service(outcome, drawings), _speed(outcome)],
+    )
 
 
 def _service(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     keys = [
-        KeyFigure("lost", f"{outcome.lost}", "of the messages that are used when nothing happens", VERMILION),
+        KeyFigure("lost", f"{outcome.lost}", "of the messages that an undisturbed service uses", VERMILION),
         KeyFigure("counted twice", f"{outcome.counted_twice}", f"{outcome.again} estimates were told again", GREEN),
         KeyFigure("position", f"{outcome.rmse:.2f} m", "root mean square error of final estimates", BLUE),
     ]
@@ -45,7 +50,11 @@ def _service(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     text = (
         f"The live page as a browser drew it: {', '.join(shown)}." if shown else "No browser was here to draw the page."
     )
-    picture = Picture(drawings["map"], "The mower's path with four beacons, and the true one.", "As it was told, live.")
+    picture = Picture(
+        drawings["map"],
+        "The mower's path with four beacons, and the true one.",
+        "Final estimates, as the service told them.",
+    )
     return Section("Killed and started again", [KeyFigures(keys), Points(points), picture, Text([text]), Code(COMMAND)])
 
 

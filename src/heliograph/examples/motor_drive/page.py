@@ -118,14 +118,15 @@ def motor_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     nees = {case: number(scores[FUSED].nees[0]) for case, scores in outcome.scores["stated"].items()}
     return Page(
         kicker="Heliograph example",
-        title="Flux and speed of a simulated motor drive, heard through relays",
+        title=f"A motor's speed through two fading relays: known to {percent(fused, 'speed')} of rated",
         lead=(
             "A drive simulator that this project did not write makes the truth; the filters know a model of it. "
             f"Through two fading relays the fused filter finds the speed to {percent(fused, 'speed')} and the flux to "
-            f"{percent(fused, 'flux')} of rated; a filter that trusts the mean gain has "
-            f"{mean.rmse['speed'] / fused.rmse['speed']:.1f} times its error of the speed. Its NEES per dimension is "
-            f"{nees['own_model']} on truth drawn from its own model, {nees['load']} on the simulator, "
-            f"{nees['dead_time']} if the inverter has a dead time of 2 µs, and {nees['euler']} with Euler's rule."
+            f"{percent(fused, 'flux')} of rated; a filter that takes each gain for its mean has "
+            f"{mean.rmse['speed'] / fused.rmse['speed']:.1f} times its error of the speed. Its NEES per dimension (1 "
+            f"where the claimed covariance is right) is {nees['own_model']} on truth drawn from its own model, "
+            f"{nees['load']} on the simulator, {nees['dead_time']} if the inverter has a dead time of 2 µs, and "
+            f"{nees['euler']} with Euler's rule."
         ),
         sections=[_result(outcome, drawings), _why(outcome, drawings), _origin(), _limits(outcome), _rerun()],
         footer="Simulator: gym-electric-motor, its squirrel-cage induction motor with default parameters.",

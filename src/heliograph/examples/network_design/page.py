@@ -96,10 +96,12 @@ def design_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     ]  # fmt: skip
     return Page(
         kicker="Heliograph example",
-        title="How much power, how many relays, where, and who sends when",
+        title=f"Sharing power by design saves {1 - two.least.total / min(outcome.two_hops):.0%} of it",
         lead=(
-            "Every number here is a design beside a certificate: the gap of a convex problem, or a bound below which "
-            "nothing can be, whatever is tried."
+            f"Six sensors behind relays need {two.least.total:.3g} units of power in all for the error that "
+            f"{min(outcome.two_hops):g} units give when all transmit alike. How much power, how many relays, where "
+            "they stand and who sends when is chosen here, each time beside a proof of how much better any other "
+            "choice could be at most."
         ),
         sections=[
             Section("What designing saves", [KeyFigures(keys)]),
@@ -118,12 +120,12 @@ def _six(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     rows += [_row("two hops", total, one) for total, one in outcome.two_hops.items()]
     caption = (
         "Steady error (trace) of the best linear filter, with all transmitters equal and with the best powers found; "
-        "**not below**: proven; **power**: the least that was found for the error of equal powers."
+        "**not below**: proven for every choice; **power**: the least that was found for the error of equal powers."
     )
     words = [
-        "Six sensors of three states share a total power. Heard directly the problem is convex, and the certificate is "
-        "a gap. Behind relays it is not: what a weak path tells grows with the square of its power at first, so that "
-        "some paths are best silent, and a bound by concave envelopes stands beside."
+        "Six sensors of three states share a total power. Heard directly, the problem is convex and is solved to a "
+        "proven gap. Behind relays it is not convex: what a weak path tells grows with the square of its power at "
+        "first, so that some paths are best silent; concave envelopes prove below which error nothing can be."
     ]
     return Section(
         "Six sensors",

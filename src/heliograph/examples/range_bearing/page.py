@@ -32,7 +32,7 @@ RULES = {
 
 def range_bearing_figures(outcome: Outcome) -> dict[str, Figure]:
     """One run across the cut, and errors behind the fading relay by how close the target passes."""
-    named = {"across": ("with angles", BLUE), "on_a_line": ("numbers on a line", VERMILION)}
+    named = {"across": ("with angles", BLUE), "on_a_line": ("plain numbers", VERMILION)}
     drawn = [Curve(*named[case], outcome.paths[case]) for case in named]
     curves = [
         Curve(label, colour, outcome.tails[name].rmse)
@@ -53,20 +53,22 @@ def range_bearing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
     coarse, fine = outcome.tails["cubature"], outcome.tails[list(outcome.tails)[-1]]
     lead = (
         "A bearing of 3.1 and one of -3.1 are 0.08 apart, not 6.2. Filters that are told which numbers are angles are "
-        f"as good where bearings cross pi as elsewhere: {own.rmse:.2f} m, with an honest claim. As numbers "
-        f"on a line the same bearings put them off by up to {max(s.largest for s in line.values()):,.0f} m."
+        f"as good where bearings cross ±π as elsewhere: {own.rmse:.2f} m, and the claimed covariance is right. As "
+        f"plain numbers the same bearings put them off by up to {max(s.largest for s in line.values()):,.0f} m."
     )
+    title = f"Bearings that cross ±π: {own.rmse:.2f} m off as angles, {lost.rmse:.1f} m as plain numbers"
     sections = [
-        Section("Across the cut", [
+        Section("Across ±π", [
             KeyFigures([
                 KeyFigure("with angles", f"{own.rmse:.2f} m", _claim(own), BLUE),
-                KeyFigure("on a line", f"{lost.rmse:.2f} m", _claim(lost), VERMILION),
+                KeyFigure("plain numbers", f"{lost.rmse:.2f} m", _claim(lost), VERMILION),
             ]),
-            Table(["filter", "elsewhere", "NEES", "across", "NEES", "on a line", "NEES"], _rows(outcome),
-                  f"{RUNS:,} runs: error of the place (m, RMS) and NEES per dimension (honest: 1) with its standard "
-                  "error, east of the station, west of it where bearings cross pi, and there without angles."),
-            Picture(pictures["across"], "One path twice: with angles on the true one, as numbers on a line far off.",
-                    "The run in which numbers on a line do worst; both filters hear the same."),
+            Table(["filter", "elsewhere", "NEES", "across ±π", "NEES", "plain numbers", "NEES"], _rows(outcome),
+                  f"{RUNS:,} runs: error of the place (m, RMS) and NEES per dimension (squared error in units of "
+                  "the claimed covariance; 1 where that is right) with its standard error, east of the station, west "
+                  "of it where bearings cross ±π, and there without angles."),
+            Picture(pictures["across"], "One path twice: with angles on the true one, with plain numbers far off.",
+                    "The run in which plain numbers do worst; both filters hear the same."),
         ]),
         Section("Close by, behind a relay that fades", [
             Text(["Here a target passes a station. Its range comes through two hops that fade (Rayleigh), which leaves "
@@ -95,7 +97,7 @@ def range_bearing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
             ]),
         ]),
     ]  # fmt: skip
-    return Page("Heliograph example", "Bearings: around the circle, and close by", lead, sections)
+    return Page("Heliograph example", title, lead, sections)
 
 
 def _claim(score: Score) -> str:

@@ -19,10 +19,10 @@ def smoothing_figures(outcome: Outcome) -> dict[str, Figure]:
     """Deviations over time, and the errors of one run."""
     clock = np.arange(1, len(outcome.filtered) + 1)
     curves = [Curve("filter", MUTED, _deviation(outcome.filtered))]
-    curves += [Curve(f"lag {lag}", COLOURS[lag], _deviation(outcome.lagged[lag])) for lag in SHOWN_LAGS]
+    curves += [Curve(f"{lag} later", COLOURS[lag], _deviation(outcome.lagged[lag])) for lag in SHOWN_LAGS]
     curves.append(Curve("all data", BLUE, _deviation(outcome.smoothed)))
     return {
-        "deviations": curves_over_time(clock, [Panel("deviation of the place", curves)]),
+        "deviations": curves_over_time(clock, [Panel("standard deviation", curves)]),
         "errors": _errors(outcome.run),
     }
 
@@ -55,34 +55,42 @@ def smoothing_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
     sections = [
         Section("A moving point behind two fading hops", [
             KeyFigures([
-                KeyFigure("filter", f"{filtered[at]:.3f}", f"deviation at step {LAG_STEP}", MUTED),
+                KeyFigure("filter", f"{filtered[at]:.3f}", f"standard deviation at step {LAG_STEP}", MUTED),
                 KeyFigure("smoother", f"{smoothed[at]:.3f}", "given all 100 steps", BLUE),
             ]),
-            Picture(pictures["deviations"], "Deviation of the place over time by lag", "Claimed before any data."),
-            Table(["lag", "variance of the filter's"], lags, f"Variance of the place at step {LAG_STEP}."),
-            Picture(pictures["errors"], "Errors of one run, filtered and smoothed, within two claimed deviations",
-                    "Errors of one run, and two claimed deviations."),
-            Table(["", "RMSE", "NEES per dimension"], measured, f"{RUNS} simulated runs; 1 if the claim is exact."),
+            Picture(pictures["deviations"], "Standard deviation of the place over time by lag",
+                    "Standard deviation of the error, computed before any data. **Lag**: steps that are waited."),
+            Table(["steps waited", "variance, of the filter's"], lags, f"Variance of the place at step {LAG_STEP}."),
+            Picture(pictures["errors"], "Errors of one run, filtered and smoothed, within two standard deviations",
+                    "Errors of one run (line) within two computed standard deviations (band)."),
+            Table(["", "RMSE", "NEES per dimension"], measured,
+                  f"{RUNS} simulated runs. **NEES per dimension**: squared error in units of the computed covariance, "
+                  "with its 95 % interval; 1 where the covariance is right."),
         ]),
         Section("A receiver behind relays that take turns", [
             Text(["The relays filter and forward; the receiver estimates the state and what the relays do not know."]),
-            Table(["lag", "even steps", "odd steps"], relays, "Trace of the error covariance once settled."),
+            Table(["steps waited", "even steps", "odd steps"], relays,
+                  "Trace of the error covariance in the long run."),
         ]),
         Section("A filter that should not be smoothed", [
             Text([
-                "An extended filter of a pendulum. Where the swing is large it loses its way and does not know; later "
-                "data make it surer, not better. Its own innovations tell."
+                "An extended Kalman filter of a pendulum. Where the swing is large the filter is far off and does not "
+                "know it; later data make it surer, not better. A test of its innovations for whiteness warns of it."
             ]),
             Table(
-                ["swing", "angle error", "smoothed", "NEES", "smoothed", "warned"], swings, f"{RUNS} runs of each."
+                ["swing", "angle error", "smoothed", "NEES", "NEES, smoothed", "warned"], swings,
+                f"{RUNS} runs of each; errors are root mean squares in radians."
             ),
         ]),
     ]  # fmt: skip
     lead = (
-        "An estimate of an earlier state improves while data still come. Behind random gains the best linear smoother "
-        "is exact, and known before any data: nothing but second moments has a part in it."
+        f"Behind two fading hops the place of a moving point is known to {filtered[at]:.2f} at step {LAG_STEP} by the "
+        f"data so far, and to {smoothed[at]:.2f} once all {len(filtered)} steps are in: data that come later tell of "
+        "an earlier state too. For linear smoothers these numbers are exact, and known before any data, since nothing "
+        "but second moments of the random gains has a part in them."
     )
-    return Page("Heliograph example", "What waiting is worth", lead, sections)
+    cut = 100 * (1 - smoothed[at] / filtered[at])
+    return Page("Heliograph example", f"Waiting for later data takes {cut:.0f} % off the error", lead, sections)
 
 
 def _deviation(covariance: np.ndarray) -> np.ndarray:

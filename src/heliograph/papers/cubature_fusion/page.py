@@ -7,10 +7,14 @@ from heliograph.papers.cubature_fusion.pictures import COLOURS, label
 from heliograph.papers.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
 from heliograph.papers.cubature_fusion.statements import BETTER, METHOD, OURS, THEOREM
 from heliograph.papers.statement import Statement
+from heliograph.papers.verdicts import verdict_blocks
 from heliograph.report.page import Block, Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 
 HEADERS = ("filter", "RMSE", "mean trace", "worst ratio", "z")
-VERDICTS = {"holds": "holds", "holds_vacuously": "vacuous", "fails": "fails"}
+NAMES = {
+    "open_loop": "no measurements", "ci_optimal": "fused, optimal weights", "ci_equal": "fused, equal weights",
+    "ci_printed": "fused, the paper's filters", "ci_open_loop": "fused, no measurements",
+}  # fmt: skip
 LITERAL = ("step_four_gain", "mixed_cross", "central_moment", "raw_moment")
 
 
@@ -25,18 +29,17 @@ def page(result: Reproduction, statements: Sequence[Statement], pictures: Mappin
         title=f"A tighter bound cuts the error by {cut:.0f} %, where measurements matter at all",
         lead=(
             "The published filter guards against channel gains that nobody knows exactly. On its own example the "
-            "signal drowns in noise, and the filter does no better than one without measurements. Where the signal "
-            "is strong, "
-            f"its bound is costly: an RMSE of {printed:.4f}, against {polytope:.4f} with the exact worst case in its "
-            f"place, {fused:.4f} with four nodes fused, and {mean:.4f} for a filter that trusts the mean gain."
+            "signal drowns in noise, and the filter does no better than one without measurements. Where the signal is "
+            f"strong, its bound is costly: an RMSE of {printed:.4f}, against {polytope:.4f} with the exact worst case "
+            f"in its place, {fused:.4f} with four nodes fused, and {mean:.4f} for a filter that trusts the mean gain."
         ),
         sections=[
             _reach(strong, pictures),
+            *_statements(statements),
+            _notes(result),
             _table(strong, "All filters, strong scenario"),
             _table(result.printed, "All filters, printed example"),
             *_figures(result, pictures),
-            *_statements(statements),
-            _notes(result),
             Section("Run it again", [_command(result)]),
         ],
         footer="Every number is in summary.json; errors and claims over time are in record.nc.",
@@ -53,7 +56,7 @@ def _reach(o: Outcome, pictures: Mapping[str, bytes]) -> Section:
     papers = o.pooled(METHOD).rmse()[0]
     for name in BETTER:
         rmse, error = o.pooled(name).rmse()
-        rows.append([name.replace("_", " "), f"{rmse:.4f} ± {error:.4f}", f"{100 * (rmse / papers - 1):+.0f} %"])
+        rows.append([_named(name), f"{rmse:.4f} ± {error:.4f}", f"{100 * (rmse / papers - 1):+.0f} %"])
     caption = f"RMSE in the strong scenario, {o.runs:,} runs, ± one standard error, against the paper's bound."
     return Section("The result", [
         KeyFigures(keys),
@@ -75,17 +78,19 @@ def _table(o: Outcome, title: str) -> Section:
         worst = pooled.worst_direction()
         z = f"{worst.z:.1f}".replace("-", "−")
         claimed = f"{pooled.mean_trace():.5f}"
-        rows.append([name.replace("_", " "), f"{rmse:.4f} ± {error:.4f}", claimed, _short(worst.ratio), z])
+        rows.append([_named(name), f"{rmse:.4f} ± {error:.4f}", claimed, _short(worst.ratio), z])
     caption = (
-        f"{o.runs:,} runs, {o.steps} steps. **RMSE**: root of the mean over runs, nodes and steps of the squared "
-        f"error summed "
-        "over the state, ± one standard error. **Mean trace**: of the claimed covariance. **Worst ratio**: largest "
-        "actual "
-        "over claimed variance over nodes, steps and directions, found on one half of the runs and measured on the "
-        "other; "
-        "**z**: its excess over 1 in standard errors. A bound has a ratio of at most 1, but for sampling."
+        f"{o.runs:,} runs, {o.steps} steps. **RMSE**: root of the mean over runs, nodes and steps of the squared error "
+        "summed over the state, ± one standard error. **Mean trace**: of the claimed covariance. **Worst ratio**: "
+        "largest actual over claimed variance over nodes, steps and directions, found on one half of the runs and "
+        "measured on the other; **z**: its excess over 1 in standard errors. A bound has a ratio of at most 1, but "
+        "for sampling."
     )
     return Section(title, [Table(HEADERS, rows, caption)])
+
+
+def _named(name: str) -> str:
+    return NAMES.get(name, name.replace("_", " "))
 
 
 def _short(ratio: float) -> str:
@@ -121,46 +126,34 @@ def _figures(result: Reproduction, pictures: Mapping[str, bytes]) -> list[Sectio
 
 
 def _statements(statements: Sequence[Statement]) -> list[Section]:
-    text = (
-        "Each statement is judged by the runs of this report or by a computation of one step made for it. **Vacuous**: "
-        "true, but so it would be without any measurement, or its premise is never met."
-    )
     paper = [c for c in statements if c.source.startswith(THEOREM)]
     found = [c for c in statements if c.source == OURS]
     rest = [c for c in statements if c not in paper and c not in found]
     return [
-        Section("What the paper states", [Text([text]), _table_of(paper)]),
-        Section("What else was found", [_table_of(found)]),
-        Section("Errata: what is printed, taken as a statement", [_table_of(rest)]),
+        Section("What the paper states", verdict_blocks(paper)),
+        Section("What else was found", verdict_blocks(found)),
+        Section("Each printed formula, taken as a statement", verdict_blocks(rest)),
     ]
-
-
-def _table_of(statements: Sequence[Statement]) -> Table:
-    rows = [[VERDICTS[c.verdict], f"**{c.text}** [{c.source}]. {c.ours}."] for c in statements]
-    return Table(["verdict", "statement, and what is found here"], rows, wordy=True)
 
 
 def _notes(result: Reproduction) -> Section:
     first, second = result.printed.setting.beta, result.strong.setting.beta
     points = [
         "**printed:** the paper's bound, which adds the squared mean gain where it should subtract it. **tight:** "
-        "with the "
-        "sign right. **polytope:** the exact worst case over the uncertain probabilities. **zero mean:** also uses "
-        "that the "
-        "error has mean zero given the data, as every cubature filter assumes. **extended:** the same bounds behind a "
-        "linearised prediction. **exact moments:** the same behind exact Gaussian moments.",
+        "with the sign right. **polytope:** the exact worst case over the uncertain probabilities. **zero mean:** "
+        "also uses that the error has mean zero given the data, as every cubature filter assumes. **extended:** the "
+        "same bounds behind a linearised prediction. **exact moments:** the same behind exact Gaussian moments.",
         f"**fixed:** scalars (β₁, β₂) = {first} in the printed example, {second} in the strong one; for the zero-mean "
         f"bound, which is not the paper's, β = {FIXED_ZERO_MEAN_SCALAR:g}. Otherwise they minimise the trace at "
         f"each step.",
-        "**ci optimal, ci equal:** covariance intersection of the zero-mean filter's estimates; **ci printed** of the "
-        "paper's, **ci open loop** of four filters without measurements. **central:** one filter that uses all four "
-        "measurements in turn, with the zero-mean or the polytope bound.",
-        "**Strong scenario (ours):** k2 = 2 and k3 = 0 keep the machine excited and bounded over 100 steps; gains "
-        "of 0.7 to 1 "
-        "with every probability uncertain by 0.02; all measurement noises 0.001. Filters start from the true prior.",
+        "**Fused, optimal and equal weights:** covariance intersection of the zero-mean filter's estimates. **Fused, "
+        "the paper's filters:** the same of those; **no measurements:** of four filters that hear nothing. "
+        "**Central:** one filter that uses all four measurements in turn, with the zero-mean or the polytope bound.",
+        "**Strong scenario (ours):** k2 = 2 and k3 = 0 keep the machine excited and bounded over 100 steps; gains of "
+        "0.7 to 1 with every probability uncertain by 0.02; all measurement noises 0.001. Filters start from the true "
+        "prior.",
         "The channels draw from the nominal law. Claims about fused bounds use many more runs of the first three "
-        "steps, "
-        "where what is overstated shows.",
+        "steps, where what is overstated shows.",
     ]
     return Section("What is compared", [Points(points)])
 

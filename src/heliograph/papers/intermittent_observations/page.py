@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from heliograph.papers.intermittent_observations import setting
 from heliograph.papers.intermittent_observations.compute import Link, Reproduction
 from heliograph.papers.intermittent_observations.statements import statements
+from heliograph.papers.verdicts import verdict_blocks
 from heliograph.report.curves import Panel, curves_over, curves_over_time
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, VERMILION, Curve
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -34,40 +35,40 @@ def _over_arrival(result: Reproduction, name: str) -> Figure:
     marks = {f"{critical.lower:.3f}": critical.lower}
     if critical.upper - critical.lower > 0.01:
         marks[f"{critical.upper:.3f}"] = critical.upper
-    label = "E tr P after long" if name != "scalar" else "E P after long"
+    label = "mean of tr P" if name != "scalar" else "mean of P"
     return curves_over(found.arrival, Panel(label, curves), "arrival probability", marks)
 
 
 def _bursts(result: Reproduction) -> Figure:
     curves = [
-        Curve(f"fail {fail:g}", colour, mean)
+        Curve(f"begin: {fail:g}", colour, mean)
         for (fail, (_, _, mean)), colour in zip(result.burst_curves.items(), BURST_COLOURS, strict=True)
     ]
     threshold = max(result.recovery.values())
     recover = next(iter(result.burst_curves.values()))[0]
     return curves_over(
-        recover, Panel("E P after long", curves), "probability that losses end", {f"{threshold:.3f}": threshold}
+        recover, Panel("mean of P", curves), "probability that losses end", {f"{threshold:.3f}": threshold}
     )
 
 
 def _patterns(result: Reproduction) -> Figure:
     steps = np.arange(2, len(result.between))
     curves = []
-    for name, colour, values in (("0.42", BLUE, result.between), ("0.30", VERMILION, result.below)):
+    for name, colour, values in (("arrival 0.42", BLUE, result.between), ("arrival 0.30", VERMILION, result.below)):
         increments = np.diff(values)
         curves.append(Curve(name, colour, increments[1:] / increments[:-1]))
-    curves.append(Curve("its bound's", MUTED, np.full(len(steps), result.between_bound)))
-    return curves_over_time(steps, [Panel("increment of E tr P over the last", curves)])
+    curves.append(Curve("bound at 0.42", MUTED, np.full(len(steps), result.between_bound)))
+    return curves_over_time(steps, [Panel("increment over the last one", curves)])
 
 
 def _rounding(result: Reproduction) -> Figure:
     it = result.iterated
     curves = [
-        Curve("printed: skew", VERMILION, np.where(it.skew > 0, it.skew, np.nan)),
-        Curve("squares: tr V", BLUE, it.joseph),
+        Curve("as printed, skew part", VERMILION, np.where(it.skew > 0, it.skew, np.nan)),
+        Curve("as squares, tr V", BLUE, it.joseph),
     ]
     steps = np.arange(1, len(it.joseph) + 1)
-    return curves_over(steps, Panel("skew part, and tr V", curves), "step")
+    return curves_over(steps, Panel("skew part of V, and tr V", curves), "step")
 
 
 def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
@@ -75,21 +76,22 @@ def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
     critical = result.critical
     return Page(
         kicker="Reproduction: Kalman filtering with intermittent observations, and its successors",
-        title=f"{critical['scalar'].lower:.0%} of the packets must arrive, or the mean error has no bound",
+        title=f"{100 * critical['scalar'].lower:.0f} % of the packets must arrive, or the mean error has no bound",
         lead=(
-            "A Kalman filter that is told which packets were lost skips them. For an unstable plant its mean error is "
-            "bounded only if packets arrive often enough, and if losses end soon enough. Here the thresholds are found "
-            "by a certificate that does not know where its gains come from, and by what grows while losses last; "
-            f"where they do not meet (from {critical['coupled'].lower:.2f} to {critical['coupled'].upper:.3f} in the "
-            "classic example of two states) nothing is claimed."
+            "A Kalman filter that knows which packets were lost skips them. For an unstable scalar plant (a = −1.25) "
+            f"its mean error is bounded if and only if more than {100 * critical['scalar'].upper:.0f} % of the packets "
+            "arrive. In the classic example of two states the mean error is proven bounded above an arrival "
+            f"probability of {critical['coupled'].upper:.3f} and unbounded below {critical['coupled'].lower:.2f}; "
+            "nothing is proven in between. Where losses come in bursts it matters how soon they end, not how seldom "
+            "they begin."
         ),
         sections=[
             _result(result),
+            _statements(result),
             _arrival(pictures),
             _in_bursts(pictures),
             _gap(pictures),
             _arithmetic(pictures),
-            _statements(result),
             _notes(),
             _rerun(result),
         ],
@@ -99,9 +101,14 @@ def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
 
 def _result(result: Reproduction) -> Section:
     keys = [
-        KeyFigure("scalar", f"{result.critical['scalar'].upper:.2f}", "arrival needed, a = -1.25", BLUE),
-        KeyFigure("two states", f"{result.critical['coupled'].upper:.3f}", "arrival certified from here on", VERMILION),
-        KeyFigure("in bursts", f"{max(result.recovery.values()):.2f}", "recovery needed, however rare failures", GREEN),
+        KeyFigure("scalar", f"{result.critical['scalar'].upper:.2f}", "of the packets must arrive, a = −1.25", BLUE),
+        KeyFigure("two states", f"{result.critical['coupled'].upper:.3f}", "from here on a bound is proven", VERMILION),
+        KeyFigure(
+            "in bursts",
+            f"{max(result.recovery.values()):.2f}",
+            "probability of an end that is needed, however seldom losses begin",
+            GREEN,
+        ),
     ]
     rows = [
         _row(name, link)
@@ -113,8 +120,9 @@ def _result(result: Reproduction) -> Section:
         )
     ]
     caption = (
-        "Traces after long, before each measurement. **Mean**: E P by quadrature where the plant is scalar. "
-        "**Simulated**: from filters that ran, ± one standard error. **Radius**: of the certificate."
+        "Traces of the error covariance in the long run, before each measurement. **Mean**: of P, by quadrature where "
+        "the plant is scalar. **Simulated**: from filters that ran, ± one standard error. **Radius**: spectral radius "
+        "of the operator that proves the upper bound; it does below 1."
     )
     headers = ["plant and link", "lower bound", "mean", "simulated", "upper bound", "radius"]
     return Section("Bounds and what lies between them", [KeyFigures(keys), Table(headers, rows, caption)])
@@ -145,16 +153,16 @@ def _arrival(pictures: Mapping[str, bytes]) -> Section:
 
 
 def _in_bursts(pictures: Mapping[str, bytes]) -> Section:
-    caption = "Scalar plant, losses in bursts. How often links fail moves the error, not the threshold (dashed)."
+    caption = "Scalar plant, losses in bursts. How often losses begin moves the error, not the threshold (dashed)."
     return Section("Losses in bursts", [Picture(pictures["bursts"], "E P over recovery for three rates.", caption)])
 
 
 def _gap(pictures: Mapping[str, bytes]) -> Section:
     text = (
-        "Between the two conditions the certificate is silent. Listing every pattern of losses shows what happens "
+        "Between the two conditions nothing is proven. Listing every pattern of losses shows what happens "
         f"there for a few steps: at an arrival of {setting.BETWEEN:g} the mean settles, although its bound would not."
     )
-    caption = "Ratio of successive increments of E tr P, two states; below 1 the sum settles."
+    caption = "Ratio of successive increments of the mean of tr P, two states; below 1 it settles."
     return Section("Between the conditions", [Text([text]), Picture(pictures["patterns"], "Ratios by step.", caption)])
 
 
@@ -167,8 +175,7 @@ def _arithmetic(pictures: Mapping[str, bytes]) -> Section:
 
 
 def _statements(result: Reproduction) -> Section:
-    rows = [[c.text, c.source, c.ours, c.verdict.replace("_", " ")] for c in statements(result)]
-    return Section("Statements", [Table(["statement", "source", "found here", "verdict"], rows, wordy=True)])
+    return Section("What the publications state", verdict_blocks(statements(result)))
 
 
 def _notes() -> Section:

@@ -28,7 +28,7 @@ def _critical(result: Reproduction) -> list[Statement]:
     coupled = result.critical["coupled"]
     return [
         Statement("An unstable plant has a critical arrival probability: E P diverges below, is bounded above",
-            f"{SINOPOLI}, Theorem 2", "1 - 1/a^2 = 0.36 for a = -1.25",
+            f"{SINOPOLI}, Theorem 2", "1 − 1/a² = 0.36 for a = −1.25",
             f"{found.lower:.6f} to {found.upper:.6f}; just below: {v['below']}, just above: {v['above']}",
             {"lower": found.lower, "upper": found.upper, "predicted": 1 - 1.25**-2,
              "impossible_below": float(v["below"] == "impossible"),
@@ -62,7 +62,7 @@ def _bounds(result: Reproduction) -> list[Statement]:
     same = {"bound": last.bound, "bound_independent": scalar.bound, "mean": last.mean_error,
             "mean_independent": scalar.mean_error}  # fmt: skip
     return [
-        Statement("S <= lim E P <= V, the steady solutions without and with a filter's correction",
+        Statement("S ≤ lim E P ≤ V, the steady solutions without and with a filter's correction",
             f"{SINOPOLI}, Theorem 4", "no numbers", ours, each_link, _all_inside),
         Statement("The bounds by mode hold for losses that come in bursts",
             "after Huang and Dey (2007), Xie and Xie (2008)", "no numbers", bursts,
@@ -102,7 +102,7 @@ def _equal(bound: float, bound_independent: float, mean: float, mean_independent
 def _between(link: Link) -> str:
     simulated = f"{link.simulated.mean:.5g} ± {link.simulated.error:.2g}"
     mean = f"simulated {simulated}" if np.isnan(link.mean_error) else f"{link.mean_error:.5f} (simulated {simulated})"
-    return f"{link.lower:.6g} <= {mean} <= {link.bound:.8g}"
+    return f"{link.lower:.6g} ≤ {mean} ≤ {link.bound:.8g}"
 
 
 def _meeting(result: Reproduction) -> list[Statement]:
@@ -121,15 +121,15 @@ def _meeting(result: Reproduction) -> list[Statement]:
     return [
         Statement("The two conditions meet where the output shows the whole state", f"{SINOPOLI}, C invertible", "meet",
             both("components"), gap("components"), _meet),
-        Statement("They meet where one eigenvalue is unstable", f"{SINOPOLI}, special case", "meet",
+        Statement("The conditions meet where one eigenvalue is unstable", f"{SINOPOLI}, special case", "meet",
             both("one_unstable"), gap("one_unstable"), _meet),
-        Statement("They meet always", "asked since 2004", "open there", f"coupled example: {both('coupled')}",
+        Statement("The conditions always meet", "asked since 2004", "open there", f"coupled example: {both('coupled')}",
             gap(*result.critical), _meet),
         Statement("With distinct moduli of the unstable eigenvalues the lower condition is the truth",
             "You, Fu and Xie (2011); Mo and Sinopoli (2012)", "proved there", ours,
             {"between": shrinking, "below": growing},
             lambda between, below: holds(between < SHRINKS and below > 1)),
-        Statement("The lower condition is the truth for every plant", "taken for granted at times", "1 - 1/rho^2",
+        Statement("The lower condition is the truth for every plant", "taken for granted at times", "1 - 1/ρ²",
             f"turned by 90 degrees a step and heard in one coordinate, 1.3 times larger each time: arrival "
             f"{sum(result.critical['turning'][:2]) / 2:.3f} lies above it, and the increments of E tr P over two steps "
             f"grow by {turning:.3f}", {"turning": turning}, lambda turning: holds(turning < SHRINKS)),

@@ -17,6 +17,7 @@ from heliograph.papers.quadratic_bias.compute import (
     simulated_over_time,
 )
 from heliograph.papers.quadratic_bias.statements import statements
+from heliograph.papers.verdicts import verdict_blocks
 from heliograph.report.curves import Panel, curves_over_time
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, MUTED, PURPLE, VERMILION, Curve
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -90,10 +91,10 @@ def page(result: Reproduction, pictures: Mapping[str, bytes]) -> Page:
         ),
         sections=[
             _result(result),
-            *_figures(result, pictures),
             _scenario(outage, pictures),
             _statements(result),
             _notes(),
+            *_figures(result, pictures),
             _rerun(result, runs),
         ],
         footer="Every number is in summary.json; covariances, mean squared errors and the run are in record.nc.",
@@ -160,13 +161,13 @@ def _figures(result: Reproduction, pictures: Mapping[str, bytes]) -> list[Sectio
 
 def _scenario(outage: Outcome, pictures: Mapping[str, bytes]) -> Section:
     text = (
-        "A scenario of ours: a scalar state with a bias, a sensor that is off 70 % of the time and a relay that is "
+        "Not in the paper: a scalar state with a bias, a sensor that is off 70 % of the time and a relay that is "
         "off 30 %, and once in 200 steps a large shock. The printed filter takes the square of the mean gain for the "
         "mean of the square; with outages the two are far apart, and what it takes for noise is correlated with "
         "the state."
     )
     caption = "The printed filter's own covariance lies below the linear filter's, its true one above."
-    table = f"Averaged over t = {outage.model.settled + 1} ... {outage.model.horizon}; columns as above."
+    table = f"Averaged over t = {outage.model.settled + 1} ... {outage.model.horizon}; columns as in the first table."
     return Section(
         "Where the printed filter fails",
         [Text([text]), Picture(pictures["outage"], "Error variances over time in the outage scenario.", caption),
@@ -175,8 +176,7 @@ def _scenario(outage: Outcome, pictures: Mapping[str, bytes]) -> Section:
 
 
 def _statements(result: Reproduction) -> Section:
-    rows = [[c.text, c.source, c.ours, c.verdict.replace("_", " ")] for c in statements(result)]
-    return Section("Statements", [Table(["statement", "source", "found here", "verdict"], rows)])
+    return Section("What the paper states", verdict_blocks(statements(result)))
 
 
 def _notes() -> Section:

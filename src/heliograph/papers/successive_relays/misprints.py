@@ -21,24 +21,24 @@ def proofs() -> list[Statement]:
     noise, least, order, bound = _largest_noise(), *_noise_squared()
     largest = 0.1 / 0.5**2  # phi / mu^2 of that law: s is below it
     return [
-        Statement("o I <= O O'", "Assumption 1", f"p_{order} = {bound[0]:.4g} with o = O^2 on a scalar system",
+        Statement("o I ≤ O O′", "Assumption 1", f"p_{order} = {bound[0]:.4g} with o = O² on a scalar system",
             f"P_{order} = {least:.4g} there; with o = O, which the proofs use, p_{order} = {bound[1]:.4g}",
             {"bound": bound[0], "error": least}, lambda bound, error: holds(bound <= error)),
-        Statement("w~ = rho wbar, any rho below 1, in the lower bound", "(34)",
-            "m >= 0.5 with W = diag(0.01, 1), rho = 0.5",
-            f"smallest eigenvalue of Xi_1 is {noise:.4g}; the lower w is meant, with rho <= (phi - s mu^2) / "
-            "(phi + mu^2)", {"bound": 0.5, "error": noise}, lambda bound, error: holds(bound <= error)),
-        Statement("the factor mu^2 / phi in (34) and (46), -Gamma Xi Gamma' in (38)", "(34), (38), (46)", "mu^2 / phi",
-            "1 / s with s < phi / mu^2, so 1 / s > mu^2 / phi: (46) and rho_k do not follow from (38)",
+        Statement("w̃ = ρ w̄, any ρ below 1, in the lower bound", "(34)",
+            "m ≥ 0.5 with W = diag(0.01, 1), ρ = 0.5",
+            f"smallest eigenvalue of Ξ₁ is {noise:.4g}; the lower w is meant, with ρ ≤ (φ - s μ²) / "
+            "(φ + μ²)", {"bound": 0.5, "error": noise}, lambda bound, error: holds(bound <= error)),
+        Statement("the factor μ²/φ in (34) and (46), −Γ Ξ Γ′ in (38)", "(34), (38), (46)", "μ²/φ",
+            "1 / s with s < φ/μ², so 1 / s > μ²/φ: (46) and ρₖ do not follow from (38)",
             {"printed": 1 / largest, "needed": 1 / (0.99 * largest)},
             lambda printed, needed: holds(printed >= needed)),
         Statement("the algorithm can be run as ordered", "Algorithm 1",
-            "covariances at k before gains at k; Pi from (1)",
-            "gains at k use covariances at k - 1 and come first; Pi from (13)",
+            "covariances at k before gains at k; Π from (1)",
+            "gains at k use covariances at k - 1 and come first; Π from (13)",
             {"used_before_known": used_before_known(ORDER)},
             lambda used_before_known: holds(used_before_known == 0)),
         Statement("notation", ", ".join(MISREAD),
-            "[w v]; w_k for w_(k-1); lost transposes and terms; x(t) for its derivative",
+            "[w v]; wₖ for wₖ₋₁; lost transposes and terms; x(t) for its derivative",
             "read as meant; the results stated after them are right", {"formulas_not_as_meant": len(MISREAD)},
             lambda formulas_not_as_meant: holds(formulas_not_as_meant == 0)),
     ]  # fmt: skip
@@ -91,21 +91,21 @@ def misprints(result: Reproduction) -> list[Statement]:
     more, less = misprinted("lemma_1", process=4 * setting.VARIANCE), misprinted("lemma_1", sensor=4 * setting.VARIANCE)
     gain, seventh = wrong["theorem_1"], wrong["lemma_7"]
     return [
-        Statement("Pi_k from Sigma V Sigma'", "(13), Lemma 1", "V",
+        Statement("Πₖ from Σ V Σ′", "(13), Lemma 1", "V",
             f"W: nothing on the example, where V = W; with W = 4 V {_effect(more, -1)}; with V = 4 W "
             f"{_effect(less, -1)}", *_judged(more)),
-        Statement("Xi_i in the term with g3 of the gain", "(30), proof of Theorem 1; perhaps the scan", "Xi_i",
-            f"Xi_ij, as in (29); with Xi_i: tr P {_percent(gain.true[10])} at k = 10, {_percent(gain.true[100])} at "
-            f"100, {_percent(gain.true[-1])} steady; tr Xi_2 {_percent(gain.relay_2[3])} at k = 3",
+        Statement("Ξᵢ in the term with γ₃ of the gain", "(30), proof of Theorem 1; perhaps the scan", "Ξᵢ",
+            f"Ξᵢⱼ, as in (29); with Ξᵢ: tr P {_percent(gain.true[10])} at k = 10, {_percent(gain.true[100])} at "
+            f"100, {_percent(gain.true[-1])} steady; tr Ξ₂ {_percent(gain.relay_2[3])} at k = 3",
             *_judged(gain)),
-        Statement("variance squared before P_i + P_i'", "Lemma 7, (58), (39); perhaps the scan", "variance squared",
+        Statement("variance squared before Pᵢ + Pᵢ′", "Lemma 7, (58), (39); perhaps the scan", "variance squared",
             f"mean squared, as (28); as printed at k = 10: {_effect(seventh, 10)}; steady: {_effect(seventh, -1)}",
             *_judged(seventh)),
-        Statement("first bracket of (24) with delta_i + delta_j", "(24); perhaps the scan", "delta",
-            f"deltabar; as printed, steady: {_effect(wrong['lemma_6_sign'], -1)}",
+        Statement("first bracket of (24) with δᵢ + δⱼ", "(24); perhaps the scan", "δ",
+            f"δ̄; as printed, steady: {_effect(wrong['lemma_6_sign'], -1)}",
             *_judged(wrong["lemma_6_sign"])),
-        Statement("last term of (24) with Xi_i'", "(24); perhaps the scan", "Xi_i'",
-            f"Xi_ij'; as printed, steady: {_effect(wrong['lemma_6_last'], -1)}",
+        Statement("last term of (24) with Ξᵢ′", "(24); perhaps the scan", "Ξᵢ′",
+            f"Ξᵢⱼ′; as printed, steady: {_effect(wrong['lemma_6_last'], -1)}",
             *_judged(wrong["lemma_6_last"])),
     ]  # fmt: skip
 
@@ -134,9 +134,9 @@ def circuit(result: Reproduction) -> list[Statement]:
     radius, wrong = float(np.max(np.abs(np.linalg.eigvals(plus)))), float(np.max(np.abs(plus - setting.TRANSITION)))
     own = float(result.paper.trace("receiver")[10])
     return [
-        Statement("L = 0.5 H gives the printed Gamma", "Section IV", "0.5 H",
+        Statement("L = 0.5 H gives the printed Γ", "Section IV", "0.5 H",
             f"largest difference {gap[0.5]:.3f}; 5 H gives it to {gap[5.0]:.1g} (four printed decimals). With 0.5 H "
-            f"tr P_10 is {other:.3g}, not {own:.3g}",
+            f"tr P₁₀ is {other:.3g}, not {own:.3g}",
             {"largest_difference": gap[0.5]}, lambda largest_difference: holds(largest_difference <= DIGITS)),
         Statement("second capacitor's equation with + i_L", "Section IV", "+ i_L",
             f"the matrix A has - i_L; with + the plant has spectral radius {radius:.3f}",

@@ -21,10 +21,7 @@ HALF = 0.25  # of a mean squared error: half the error
 
 def statements(result: Reproduction) -> list[Statement]:
     """All of them: results first, then bounds, then misprints."""
-    return [
-        *_designs(result), *_estimates(result), *_bounds(result), *_scalar_bounds(result), *proofs(),
-        *misprints(result), *circuit(result),
-    ]  # fmt: skip
+    return [*on_filters(result), *on_bounds(result), *on_formulas(result)]
 
 
 def worst_z(result: Reproduction, name: str = "receiver") -> tuple[float, int]:
@@ -43,6 +40,11 @@ def tuned_mean_ratio(result: Reproduction, name: str = "tuned") -> float:
     """Mean over k = 1 .. horizon of tr P_k / tr P_k(paper)."""
     design = result.tuned if name == "tuned" else result.bounded
     return float(np.mean(design.trace("receiver")[1:] / result.paper.trace("receiver")[1:]))
+
+
+def on_filters(result: Reproduction) -> list[Statement]:
+    """What the paper claims of its filters."""
+    return [*_designs(result), *_estimates(result)]
 
 
 def _totals(result: Reproduction) -> dict[str, float]:
@@ -71,14 +73,15 @@ def _designs(result: Reproduction) -> list[Statement]:
             {"gap_of_traces": float(np.max(np.abs(right.claimed - 1))), "gap_of_recursions": own},
             lambda gap_of_traces, gap_of_recursions: holds(gap_of_traces < 1e-8 and gap_of_recursions < 1e-10)),
         Statement("the gains minimise the next trace of each error covariance", "Theorems 1 and 2, (12)", "optimal",
-            f"error and innovation are uncorrelated to {correlation:.1g} at every step of the {mean - 1}",
+            f"error and innovation are uncorrelated to {correlation:.1g} at each of the {mean - 1} steps",
             {"largest_correlation": correlation}, lambda largest_correlation: holds(largest_correlation < 1e-8)),
-        Statement("the filters of relays and system are designed together and are optimal", "abstract, Remark 3",
+        Statement("the filters of relays and receiver are designed together and are optimal", "abstract, Remark 3",
             "concurrently designed optimal recursive filters",
-            f"optimal for one step only: tuned for the receiver, the mean over k = 1 .. {mean - 1} of "
-            f"tr P_k / tr P_k(paper) is {ratio:.4f}, at no step more power than the paper's "
-            f"{tuned_mean_ratio(result, 'bounded'):.4f}; the steady sum falls from {total['paper']:.5g} to "
-            f"{total['joint']:.6g}, and to {total['lmmse_tuned']:.5g} with the best linear receiver",
+            "each relay's gain is the best for its own next estimate, not for the receiver's: with gains chosen for "
+            f"the receiver the mean over k = 1 .. {mean - 1} of tr Pₖ / tr Pₖ(paper) is {ratio:.4f}, and "
+            f"{tuned_mean_ratio(result, 'bounded'):.4f} at no step with more power than the paper's; the steady sum "
+            f"falls from {total['paper']:.5g} to {total['joint']:.6g}, and to {total['lmmse_tuned']:.5g} with the best "
+            "linear receiver",
             {"mean_ratio_when_tuned": ratio, "steady_ratio_when_tuned": total["joint"] / total["paper"]},
             lambda mean_ratio_when_tuned, steady_ratio_when_tuned: holds(
                 min(mean_ratio_when_tuned, steady_ratio_when_tuned) >= 1 - ROUNDING)),
@@ -87,7 +90,7 @@ def _designs(result: Reproduction) -> list[Statement]:
             f"(limit {limit:.1f}: false alarm {FALSE_ALARM:g} over all steps, t with {BATCHES - 1} degrees of "
             f"freedom); relays included: {worst:.2f}", {"largest_z": worst, "limit": limit},
             lambda largest_z, limit: holds(largest_z < limit)),
-        Statement("inter-relay interference is eliminated in the mean", "Remark 2", "E (g3 - mean) yh_j = 0",
+        Statement("inter-relay interference is eliminated in the mean", "Remark 2", "E (γ₃ − mean) ŷⱼ = 0",
             f"the estimates are unbiased; but the relay subtracts its own signal for the other's, and fading is what "
             f"costs: the remote error is {trace[10]:.4g} at k = 10, of which the gains' variances make all but 0.3 %"
             if _without_fading() / trace[10] < 0.004 else "unbiased",
@@ -117,14 +120,19 @@ def _estimates(result: Reproduction) -> list[Statement]:
             lambda over_the_floor: holds(over_the_floor < 2)),
         Statement("behind the paper's relays the remote filter (9) is good", "Theorem 2", "optimal",
             f"the best linear filter gains {100 * (1 - total['lmmse'] / total['paper']):.1f} % in the steady sum and "
-            f"at most {100 * (1 - np.min(result.best_behind / trace[1:])):.1f} % for k <= {len(state) - 1}",
+            f"at most {100 * (1 - np.min(result.best_behind / trace[1:])):.1f} % for k ≤ {len(state) - 1}",
             {"steady_gain": 1 - total["lmmse"] / total["paper"],
              "largest_gain": float(1 - np.min(result.best_behind / trace[1:]))},
             lambda steady_gain, largest_gain: holds(max(steady_gain, largest_gain) < LITTLE)),
-        Statement("L_1 carries nothing", "(31)", "not said",
-            f"largest entry of L_1 {first:.1g}",
+        Statement("L₁ carries nothing", "(31)", "not said",
+            f"largest entry of L₁ {first:.1g}",
             {"largest_entry": first}, lambda largest_entry: holds(largest_entry <= ROUNDING)),
     ]  # fmt: skip
+
+
+def on_formulas(result: Reproduction) -> list[Statement]:
+    """Each printed formula, taken as a statement."""
+    return [*misprints(result), *circuit(result)]
 
 
 def _relative(result: Reproduction, k: int) -> float:
@@ -148,6 +156,11 @@ def _without_fading() -> float:
     return float(hg.relays.own_error_design(network, 10).trace("receiver")[10])
 
 
+def on_bounds(result: Reproduction) -> list[Statement]:
+    """Its bounds on the errors, as printed."""
+    return [*_bounds(result), *_scalar_bounds(result), *proofs()]
+
+
 def _bounds(result: Reproduction) -> list[Statement]:
     certificate, tuned = result.certificates["paper"], result.certificates["tuned"]
     bounds = certificate.bounds
@@ -157,30 +170,30 @@ def _bounds(result: Reproduction) -> list[Statement]:
     least = {name: min(_below_state(result.certificates[name], f) for f in FILTERS) for name in ("paper", "tuned")}
     assert upper.values is not None and alpha.values is not None and state.values is not None
     return [
-        Statement("Xi_i <= mbar_k I and P_k <= mbar_k I", "Theorems 3 and 4, upper", "bounded",
-            f"obeyed, but mbar_100 = {upper.values[-1]:.3g} where tr P_100 = {truth:.3g}: it grows without limit, "
-            f"since the largest eigenvalue of Gamma Gamma' is {certificate.constants['tau_upper']:.4f}",
+        Statement("Ξᵢ ≤ m̄ₖ I and Pₖ ≤ m̄ₖ I", "Theorems 3 and 4, upper", "bounded",
+            f"obeyed, but m̄₁₀₀ = {upper.values[-1]:.3g} where tr P₁₀₀ = {truth:.3g}: it grows without limit, "
+            f"since the largest eigenvalue of Γ Γ′ is {certificate.constants['tau_upper']:.4f}",
             {"growth": certificate.constants["tau_upper"],
              "obeyed": int(bool(upper.holds and bounds["Theorem 4, upper"].holds))},
             lambda growth, obeyed: vacuous(obeyed, growth >= 1)),
-        Statement("Xi_i >= m_k I", "Theorem 3, lower", "if a condition holds",
+        Statement("Ξᵢ ≥ mₖ I", "Theorem 3, lower", "if a condition holds",
             "does not apply: " + "; ".join(lower.failing), *_conditional(lower)),
-        Statement("P_k >= p_k I", "Theorem 4, lower", "a positive bound",
-            f"p_k falls to {alpha.values[1]:.1g} at k = 1 and {alpha.values[-1]:.1g} at k = 100; assumption missed: "
+        Statement("Pₖ ≥ pₖ I", "Theorem 4, lower", "a positive bound",
+            f"pₖ falls to {alpha.values[1]:.1g} at k = 1 and {alpha.values[-1]:.1g} at k = 100; assumption missed: "
             + "; ".join(alpha.failing), *_conditional(alpha)),
-        Statement("uniform bounds m I <= Xi_i <= mbar I, p I <= P_k <= mbar I", "Lemmas 8 and 9",
+        Statement("uniform bounds m I ≤ Ξᵢ ≤ m̄ I, p I ≤ Pₖ ≤ m̄ I", "Lemmas 8 and 9",
             "boundedness is guaranteed",
             "do not apply to the paper's own example: " + bounds["Lemma 8, upper"].failing[0],
             {"assumptions_missed": len(bounds["Lemma 8, upper"].failing)},
             lambda assumptions_missed: holds(assumptions_missed == 0)),
         Statement("errors are bounded for all time", "abstract", "from Lemmas 8 and 9",
-            f"true for another reason: Xi_i, P_k <= cov x_k for gains that are optimal for one step, and the "
-            f"spectral radius of Gamma is {state.assumptions[1].found}; largest eigenvalue of cov x_k "
+            f"true for another reason: Ξᵢ, Pₖ ≤ cov xₖ for gains that are optimal for one step, and the "
+            f"spectral radius of Γ is {state.assumptions[1].found}; largest eigenvalue of cov xₖ "
             f"{np.max(state.values):.3g}",
             {"assumptions_missed": len(state.failing), "least_slack": least["paper"]},
             lambda assumptions_missed, least_slack: holds(assumptions_missed == 0 and least_slack >= -ROUNDING)),
-        Statement("P_k <= cov x_k also for jointly tuned gains", "not in the paper", "not said",
-            f"smallest eigenvalue of cov x_k - P_k over its trace {_below_state(tuned, 'receiver'):.2g} (relay 2: "
+        Statement("Pₖ ≤ cov xₖ also for jointly tuned gains", "not in the paper", "not said",
+            f"smallest eigenvalue of cov xₖ - Pₖ over its trace {_below_state(tuned, 'receiver'):.2g} (relay 2: "
             f"{_below_state(tuned, 'relay_2'):.2g}), against {_below_state(certificate, 'receiver'):.2g} for the "
             "paper's gains: the proof needs the gain that is best for one step",
             {"least_slack": least["tuned"]}, lambda least_slack: holds(least_slack >= -ROUNDING)),
@@ -193,19 +206,23 @@ def _scalar_bounds(result: Reproduction) -> list[Statement]:
     highest = [scalar[name].values for name in ("Lemma 8, upper", "Lemma 9, upper")]
     tops = max(values[0] for values in highest if values is not None)
     return [
-        Statement("mbar = tau p0 + w / (1 - tau) bounds the errors", "Lemma 8, upper",
+        Statement("m̄ = τ p₀ + w / (1 - τ) bounds the errors", "Lemma 8, upper",
             f"{printed['upper']:.4g} on a scalar system",
-            f"10 at k = 0: fails there; max(p0, w / (1 - tau)) = {tops:.4g} is obeyed",
+            f"10 at k = 0: fails there; max(p₀, w / (1 - τ)) = {tops:.4g} is obeyed",
             {"bound": printed["upper"], "error": 10.0}, lambda bound, error: holds(bound >= error)),
-        Statement("p = alpha p0 + w / (1 - alpha) <= P_k", "Lemma 9, lower, and (51)", f"{printed['receiver']:.4g}",
-            f"P_60 = {remote:.4g} on the same system; min(p0, w / (1 - alpha)) is obeyed: "
-            f"{scalar['Lemma 9, lower'].holds}",
+        Statement("p = α p₀ + w / (1 - α) ≤ Pₖ", "Lemma 9, lower, and (51)", f"{printed['receiver']:.4g}",
+            f"P₆₀ = {remote:.4g} on the same system; min(p₀, w / (1 - α)) is "
+            f"{_kept(scalar['Lemma 9, lower'])}",
             {"bound": printed["receiver"], "error": remote}, lambda bound, error: holds(bound <= error)),
-        Statement("m = rho p0 + w~ / (1 - rho) <= Xi_i", "Lemma 8, lower", f"{printed['relay']:.4g}",
-            f"Xi_1 = {relay:.4g} at k = 60 on the same system; the corrected bound is obeyed: "
-            f"{scalar['Lemma 8, lower'].holds}",
+        Statement("m = ρ p₀ + w̃ / (1 - ρ) ≤ Ξᵢ", "Lemma 8, lower", f"{printed['relay']:.4g}",
+            f"Ξ₁ = {relay:.4g} at k = 60 on the same system; the corrected bound is "
+            f"{_kept(scalar['Lemma 8, lower'])}",
             {"bound": printed["relay"], "error": relay}, lambda bound, error: holds(bound <= error)),
     ]  # fmt: skip
+
+
+def _kept(bound: Bound) -> str:
+    return "obeyed" if bound.holds else "broken"
 
 
 def _conditional(bound: Bound) -> tuple[Evidence, Callable[..., Verdict]]:
