@@ -15,6 +15,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
@@ -27,7 +28,7 @@ R = TypeVar("R")
 
 
 @readable
-class AbstractFilter(eqx.Module):
+class AbstractFilter(Module):
     """A filter: `predict` moves its state over a step, `correct` uses a measurement, `estimate` says what is known now.
 
     Deterministic: it never receives a random key. A component of z that is NaN did not arrive and is skipped. The

@@ -7,13 +7,13 @@ z - G C E[x_k] hears x_k - E[x_k] alone, and all moments are about the mean.
 
 from typing import TypeVar
 
-import equinox as eqx
 import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.about_mean import about_mean
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -24,7 +24,7 @@ Part = TypeVar("Part", AbstractPlant, AbstractSensor, AbstractRandomAffine)
 T = TypeVar("T")
 
 
-class Centre(eqx.Module):
+class Centre(Module):
     """E[x_0], and E[x+] = A E[x] + b, of which G C E[x+] arrives; each at every step, or the same throughout.
 
     Shapes: start (n,), transition (n, n), drift (n,), heard (m, n).

@@ -6,13 +6,13 @@ Notation as in `update`: e prior error with covariance P, y = yhat + e_y the sen
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
     PRECISE,
@@ -51,7 +51,7 @@ class Signal(NamedTuple):
 
 
 @readable
-class Scalars(eqx.Module):
+class Scalars(Module):
     """Fixed positive scalars (beta_1, beta_2) of Young's inequality, as published bounds use them.
 
     Raises:

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.gaussian import Belief
+from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Bool, Float
 
@@ -24,7 +24,7 @@ class ModalBeliefs(NamedTuple):
     moved: Bool[jax.Array, ""]
 
 
-class AbstractMerging(eqx.Module):
+class AbstractMerging(Module):
     """When Gaussians are merged."""
 
     def moved(self, state: ModalBeliefs, rows: jax.Array) -> ModalBeliefs:

@@ -22,6 +22,7 @@ from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
+from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import with_rounding
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 from heliograph.random_affine.atoms import GainAndNoise
@@ -32,7 +33,7 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import JointModes, joint_modes
 
 
-class Components(eqx.Module):
+class Components(Module):
     """All combinations of one step: in their `mode` of the links they have the probability `weight`.
 
     transition: of the modes from the step before; one mode where nothing remembers.

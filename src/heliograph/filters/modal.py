@@ -25,13 +25,14 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.module import Module
 from heliograph.numerics.traced import stacked
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import nominal_spread
 
 
-class Heard(eqx.Module):
+class Heard(Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
 
     transition: of the modes from the step before to this one; radius: how far each may be off.

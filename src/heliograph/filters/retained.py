@@ -11,6 +11,7 @@ import jax
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import (
     congruence,
     runs_last,
@@ -36,7 +37,7 @@ class Point(NamedTuple):
     link: Float[jax.Array, "N N"]
 
 
-class AbstractRetained(eqx.Module):
+class AbstractRetained(Module):
     """A step as a sweep back needs it: the estimate after it, of the filter's own state of N numbers.
 
     The plant's state is want y + shift of the filter's state y, y itself without them. claim: of estimates given later

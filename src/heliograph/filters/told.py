@@ -22,13 +22,14 @@ from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import symmetric_product
 from heliograph.random_affine.told import Outcome, outcomes, second_moments
 
 
-class Told(eqx.Module):
+class Told(Module):
     """A channel at one step, by mode and by what arrives.
 
     transition: of the modes from the step before to this one. Of each pattern of components that arrive: `present`, its

@@ -11,6 +11,7 @@ import numpy as np
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import add, runs_last, symmetric, times, transpose
 from heliograph.numerics.types import Array
@@ -29,7 +30,7 @@ class Transformed(NamedTuple):
 
 
 @readable
-class AbstractTransform(eqx.Module):
+class AbstractTransform(Module):
     """A rule that carries a mean and a covariance through a function; every rule is exact for affine functions."""
 
     def apply(self, function: Function, mean: jax.Array, covariance: jax.Array) -> Transformed:

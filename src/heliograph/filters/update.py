@@ -7,12 +7,12 @@ M = E[G] nominal, D_v = E_v[G] - M the shift under a possible law v.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from heliograph.filters.correction import Scalars, Signal, as_array, as_scalars, young_correction, zero_mean_correction
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -28,7 +28,7 @@ from heliograph.random_affine.second_moments import (
 
 
 @readable
-class AbstractUpdate(eqx.Module):
+class AbstractUpdate(Module):
     """How a channel's uncertainty is bounded, and the gain that minimises the bound."""
 
     def describe(self, channel: AbstractRandomAffine) -> SecondOrder:

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import OverTime
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int, PyTree
 
@@ -29,7 +29,7 @@ class Quantized(NamedTuple):
 
 
 @readable
-class AbstractQuantizer(eqx.Module):
+class AbstractQuantizer(Module):
     """A quantizer of vectors: `init(n)` gives the state before any value, `step` the next state and what arrives.
 
     Deterministic, and by component: values of further axes (run, time) go through alike. Parameters are numbers, or

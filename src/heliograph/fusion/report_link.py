@@ -10,13 +10,14 @@ import numpy as np
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import check_count, fail, instance, probabilities
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 
 
 @readable
-class ReportLink(eqx.Module):
+class ReportLink(Module):
     """A node's report m is sent after every d-th step, arrives as G m + n, and perhaps late.
 
     `channel`: any random affine map that forgets: fading hops, chains of them, losses that the centre is told of

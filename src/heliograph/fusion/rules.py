@@ -21,6 +21,7 @@ from heliograph.model.over_time import OverTime, first, stack
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import array, fail, instance, items, probabilities
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -30,7 +31,7 @@ Fused = tuple[Float[jax.Array, "n"], Float[jax.Array, "n n"]]
 
 
 @readable
-class AbstractFusion(eqx.Module):
+class AbstractFusion(Module):
     """A rule that makes one estimate of several.
 
     A fused claim is never stronger than the weakest of its inputs; what else a rule assumes is in `claim`.
@@ -212,7 +213,7 @@ def _of_covariances(claims: list[Claim], strongest: Claim) -> Claim:
 
 
 @readable
-class Fusion(eqx.Module):
+class Fusion(Module):
     """Which filter's estimates a network fuses, at every node that has it, by which rule, and through which uplinks.
 
     `quantizer`: what each node's mean goes through on its way to the fusion centre; one for all nodes, or one for each

@@ -2,7 +2,6 @@
 
 from typing import TypeVar
 
-import equinox as eqx
 import numpy as np
 
 from heliograph.learning.shares import Share, wilson
@@ -10,6 +9,7 @@ from heliograph.learning.stretches import as_fates
 from heliograph.model.channel import erasure
 from heliograph.model.fading import gilbert_elliott, markov_fading
 from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -20,7 +20,7 @@ Packets = Float[np.ndarray, " packets"]
 
 
 @readable
-class AbstractLossLaw(eqx.Module):
+class AbstractLossLaw(Module):
     """A law of told losses. A subclass says `shares` and `predicted`, and `channel` where one has such losses.
 
     The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;

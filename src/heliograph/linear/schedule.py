@@ -8,6 +8,7 @@ import numpy as np
 
 from heliograph.model.estimate import STRENGTH, Claim
 from heliograph.numerics.check import array, fail, file_path, instance, shown
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -38,7 +39,7 @@ PERHAPS = ("predicted", "innovation")  # fields that may be unknown
 
 
 @readable
-class Schedule(eqx.Module):
+class Schedule(Module):
     """A linear filter over time from the state `start`; its covariance is claimed for complete data.
 
     Raises:

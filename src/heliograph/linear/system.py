@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import array, covariance, instance
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -26,7 +26,7 @@ class Steps(NamedTuple):
 
 
 @readable
-class LinearSystem(eqx.Module):
+class LinearSystem(Module):
     """y+ = A y + a + w, z = C y+ + c + v, and what is to be known, x = W y.
 
     w and v have mean zero given all earlier y and are uncorrelated with each other. Random coefficients fit: take A and

@@ -16,6 +16,7 @@ from heliograph.live.mould import Mould, cast
 from heliograph.live.tape import Ears, Tape, at_step, interval
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.gathering import Fused
 from heliograph.simulation.network import FUSED, Network
@@ -24,7 +25,7 @@ from heliograph.simulation.stepping import AllFilters
 Retained: TypeAlias = "tuple[dict[int, AbstractRetained], dict[str, AbstractRetained]]"  # by kind, and by name
 
 
-class Sweep(eqx.Module):
+class Sweep(Module):
     """The filters of a network that can be smoothed, by `kinds`, and the fusions of these."""
 
     ears: Ears

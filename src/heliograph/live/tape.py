@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.mould import Mould
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
@@ -42,7 +43,7 @@ class Tape(NamedTuple):
         return jax.tree.map(lambda leaf: leaf[slot], self.state)
 
 
-class Ears(eqx.Module):
+class Ears(Module):
     """All filters of a network; `places` of each group's nodes in a row of all that is heard, (node, received)."""
 
     filters: AllFilters

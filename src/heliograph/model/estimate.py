@@ -4,6 +4,7 @@ from typing import Literal
 
 import equinox as eqx
 
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
 
@@ -12,7 +13,7 @@ STRENGTH: dict[Claim, int] = {"none": -1, "nominal": 0, "upper": 1, "exact": 2}
 
 
 @readable
-class Estimate(eqx.Module):
+class Estimate(Module):
     """An estimate and the covariance claimed for its error.
 
     claim: "exact" if `covariance` is E[(x - mean)(x - mean)'], "upper" if it dominates it, "nominal" if it is only what
@@ -27,7 +28,7 @@ class Estimate(eqx.Module):
 
 
 @readable
-class Innovation(eqx.Module):
+class Innovation(Module):
     """What a measurement says that the filter did not expect, and how likely the filter finds it.
 
     value: z - E[z | what came before]; covariance: what the filter believes of it. Both are NaN in the components that

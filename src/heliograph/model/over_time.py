@@ -11,6 +11,7 @@ from jaxtyping import Array, Int
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.check import items as as_items
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import PyTree
 from heliograph.random_affine.base import one_memory
@@ -19,7 +20,7 @@ T = TypeVar("T")
 
 
 @readable
-class OverTime(eqx.Module):
+class OverTime(Module):
     """Values whose leading axis is time; an unmarked array never varies, whatever its shape.
 
     `values` is an array (time, ...) or any model object stacked over time; build the latter with `over_time`.

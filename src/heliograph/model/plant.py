@@ -13,6 +13,7 @@ from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
 from heliograph.numerics.check import array, covariance, fail, function, instance, items, names, shown_error
 from heliograph.numerics.linalg import cholesky
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array
@@ -32,7 +33,7 @@ NoiseFunction = Callable[[jax.Array], ArrayLike]  # covariance of w, (n, n), fro
 
 
 @readable
-class AbstractPlant(eqx.Module):
+class AbstractPlant(Module):
     """A system x+ = f(x, u) + w with w independent over time; x_0 has `initial_mean` and `initial_covariance`.
 
     x_0 is Gaussian unless `deviation` holds the law of x_0 - initial_mean up to a constant. States that are `circular`

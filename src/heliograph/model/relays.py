@@ -11,6 +11,7 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import second_moment_tensor
@@ -22,7 +23,7 @@ Slot = Mapping[str, Links]  # by listener
 
 
 @readable
-class RelayNetwork(eqx.Module):
+class RelayNetwork(Module):
     """Relays with memory between a sensor and a receiver.
 
     At step k the sensor sends y_k = C_k x_k + v_k and relay r sends C_k s_r, with s_r its estimate at k - 1: what it
@@ -129,7 +130,7 @@ class RelayNetwork(eqx.Module):
         )
 
 
-class Steps(eqx.Module):
+class Steps(Module):
     """What the second moments of a relay network need, for each step (leading axis).
 
     R numbers are heard by the F filters together, T = (1 + relays) m are sent: y, then what each relay sends. With

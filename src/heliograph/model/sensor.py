@@ -14,12 +14,13 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
 from heliograph.numerics.kept import kept
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
 @readable
-class AbstractSensor(eqx.Module):
+class AbstractSensor(Module):
     """A sensor y = h(x) + v with v independent over time and of everything else.
 
     Outputs that are `circular` are angles in radians: y and y with a full turn more in one of them are the same.

@@ -3,10 +3,10 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, SupportsFloat, cast
 
-import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import fail, instance, scalar, table
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Bool, Float
 
@@ -14,7 +14,7 @@ MET = 1e-9  # relative excess over a limit that counts as met
 
 
 @readable
-class Budget(eqx.Module):
+class Budget(Module):
     """Limits of power: of all transmitters together, of each one's mean over time, of each one at every step.
 
     `each` and `peak` are one number for every transmitter or numbers by name. Transmitters that are not free count

@@ -6,6 +6,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import array, check_count, covariance, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
@@ -13,7 +14,7 @@ WEIGHT = "weight of the error"
 
 
 @readable
-class Error(eqx.Module):
+class Error(Module):
     """The error that a design makes small, of the covariance P of the best linear filter after each step.
 
     <W, P>, with W the `weight`: a matrix (n, n), or a number for each named state ({"position": 1.0} asks for that

@@ -1,8 +1,8 @@
 """What a design gives."""
 
-import equinox as eqx
 import numpy as np
 
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.planning.certificate import Certificate
@@ -12,7 +12,7 @@ from heliograph.simulation.network import Network
 
 
 @readable
-class NetworkDesign(eqx.Module):
+class NetworkDesign(Module):
     """Powers that were found, what they give, and how good they are.
 
     powers: of every transmitter, {name: (steps,)}, steps of the error's period or horizon (one if steady). error: what

@@ -1,6 +1,5 @@
 """What each transmitter of a network sends: mean, peak and by step, from the moments of the true state."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from heliograph.model.sensor import AnySensor, is_linear
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.channel_power import sent_powers, steady_powers
@@ -30,7 +30,7 @@ Worlds = dict[str, tuple[AnySensor, Channel]]  # what sends, by the beginning of
 
 
 @readable
-class SentPower(eqx.Module):
+class SentPower(Module):
     """What each transmitter sends, in the units of the sensor's output squared.
 
     over_time: mean square at each step by name, (steps,), one step if steady; standard_error of it, zero where it is

@@ -11,7 +11,7 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, items, shown
-from heliograph.numerics.plain_methods import plain_methods
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
 from heliograph.random_affine.chain import AbstractMemory
@@ -20,7 +20,7 @@ from heliograph.random_affine.monomials import exponents, monomials
 T = TypeVar("T")
 
 
-class Moments(eqx.Module):
+class Moments(Module):
     """Joint moments of (G, n) of one order: the matrix E[Sym^k(H)].
 
     It takes the monomials of (y, 1) of degree k to the conditional expectations of those of (z, 1),
@@ -59,9 +59,8 @@ def _among(outputs: int, inputs: int, high: int, low: int) -> tuple[np.ndarray, 
     return np.ix_(*each)
 
 
-@plain_methods
 @readable
-class AbstractRandomAffine(eqx.Module):
+class AbstractRandomAffine(Module):
     """A random affine map z = G y + n, one at each step.
 
     Laws: `sample` and `moments` describe one distribution (heliograph.testing.check_random_affine compares them);

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
 from heliograph.numerics.domain import PROBABILITY, SIMPLEX, tell
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
 
@@ -37,7 +38,7 @@ class Nodes(NamedTuple):
 
 
 @readable
-class AbstractMemory(eqx.Module):
+class AbstractMemory(Module):
     """A state that moves from step to step and on which the law of what is drawn depends.
 
     Links that hold one memory share it: they are in one shadow. One memory is the same object, or the same `name`; the

@@ -8,7 +8,6 @@ is linear in p has its worst case.
 from itertools import product
 from math import gamma
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
 from heliograph.numerics.kept import kept
-from heliograph.numerics.plain_methods import plain_methods
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
 
@@ -27,9 +26,8 @@ Vector = Float[jax.Array | np.ndarray, " n"]
 CORNER_LIMIT = 12  # atoms whose corners are listed; above, moments are bounded one by one
 
 
-@plain_methods
 @readable
-class AbstractLaw(eqx.Module):
+class AbstractLaw(Module):
     """A law of a real random gain, independent over time.
 
     Its parameters are numbers, or traced by JAX: then so are its moments.

@@ -13,6 +13,7 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, instance, scalar, shown
+from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import (
@@ -208,7 +209,7 @@ class Faded(AbstractModal):
         return GainAndNoise(Constant(self.mean + self.deviation * state), self.matrix, self.noise)
 
 
-class JointModes(eqx.Module):
+class JointModes(Module):
     """A map as one chain and one map that forgets for each of its modes.
 
     Where a fading drifts, its modes are the nodes of `AbstractMemory.nodes`: expectations are right, and `initial` and

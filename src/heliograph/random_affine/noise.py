@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, covariance, fail, instance, items, probabilities, shown
 from heliograph.numerics.linalg import cholesky
-from heliograph.numerics.plain_methods import plain_methods
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.random_affine.monomials import Exponents, exponents
@@ -25,9 +25,8 @@ Matrix = Float[jax.Array | np.ndarray, "n m"]
 Square = Float[jax.Array | np.ndarray, "n n"]
 
 
-@plain_methods
 @readable
-class AbstractNoise(eqx.Module):
+class AbstractNoise(Module):
     """A law of a noise vector, independent over time and of everything else.
 
     Its parameters are numbers, or traced by JAX: then so are its moments.

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from heliograph.numerics.kept import kept
+from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import add, contract, diagonal
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
@@ -23,7 +24,7 @@ Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
 Matrix = Float[jax.Array | np.ndarray, "m p"]
 
 
-class QuadraticMap(eqx.Module):
+class QuadraticMap(Module):
     """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
 
     Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
@@ -50,7 +51,7 @@ class QuadraticMap(eqx.Module):
         return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
 
 
-class SecondOrder(eqx.Module):
+class SecondOrder(Module):
     """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
 
     mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];

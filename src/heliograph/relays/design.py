@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 
-import equinox as eqx
 import jax
 import numpy as np
 
@@ -10,6 +9,7 @@ from heliograph.linear.schedule import Gains, Schedule
 from heliograph.model.relays import RelayNetwork, Steps
 from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.relays.second_moments import Propagated, initial_moments, propagate, step_moments
@@ -18,7 +18,7 @@ GainsByFilter = Mapping[str, ArrayLike]  # by name, each (steps, n, received)
 
 
 @readable
-class RelayDesign(eqx.Module):
+class RelayDesign(Module):
     """Gains of every filter for each step, computed before any data, and what they give.
 
     gains[filter]: zero where the filter hears nothing. covariance[filter]: E (x - s)(x - s)' at k = 0 .. steps, exact.

@@ -17,6 +17,7 @@ from heliograph.model.relays import SENSOR as SENDER
 from heliograph.model.relays import RelayNetwork
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.angle import wrapped
+from heliograph.numerics.module import Module
 from heliograph.random_affine.base import anonymous
 from heliograph.simulation.draws import SENSOR, checksum, draw_key
 from heliograph.simulation.network import OWN, Network
@@ -26,7 +27,7 @@ from heliograph.simulation.shadows import deliver, memory_places, start
 Heard = tuple[jax.Array, ...]  # (node, received) of each group
 
 
-class AbstractAir(eqx.Module):
+class AbstractAir(Module):
     """How signals reach the nodes: it holds the states of all channels of a run."""
 
     def init(self, key: jax.Array) -> PyTree:
@@ -42,7 +43,7 @@ class AbstractAir(eqx.Module):
         return state
 
 
-class Antenna(eqx.Module):
+class Antenna(Module):
     """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws.
 
     `teller`: the filters that sensors hear back, whose estimates stand at `place` (kind, filter) among all.

@@ -30,13 +30,14 @@ from heliograph.model.over_time import OverTime, at, first, over_time, stack, st
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.arrived import arrived
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import SecondOrder, second_order
 
 
-class Listening(eqx.Module):
+class Listening(Module):
     """Sensors and channels of nodes of one structure, stacked; each node has its own, and they share nothing."""
 
     sensor: AnySensor
@@ -69,7 +70,7 @@ def _heard(sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covarian
     return Hearing(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
-class AbstractHears(eqx.Module):
+class AbstractHears(Module):
     """What the nodes hear of the plant, in the nodes' order, with rows of zeros up to the longest measurement."""
 
     def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
@@ -112,7 +113,7 @@ class CentreState(NamedTuple):
     rules: dict[str, PyTree]
 
 
-class Centre(eqx.Module):
+class Centre(Module):
     """All informed fusions of one filter's estimates, at the nodes that have it.
 
     `sources`: kind and place of that filter, one group after another; `order` brings what is gathered from them into

@@ -14,6 +14,7 @@ from heliograph.fusion.rules import AbstractFusion, Fusion
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at, first, stack, structure
 from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array
 from heliograph.simulation.centre import (
     AbstractHears,
@@ -32,7 +33,7 @@ from heliograph.simulation.side_by_side import over_all, started
 from heliograph.simulation.uplinks import Drawn, Flying, Uplinks
 
 
-class Fused(eqx.Module):
+class Fused(Module):
     """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
 
     `sources` of each fusion: kind and filter whose nodes' estimates it takes, one group after another; `order` of each
@@ -82,7 +83,7 @@ class Fused(eqx.Module):
         return jnp.stack([part[order] for part, order in zip(joined, self.order, strict=True)])
 
 
-class Reporting(eqx.Module):
+class Reporting(Module):
     """A fusion that hears reports: what happens to them on their way, and the filter at the centre.
 
     `sources` and `order` as in `Centre`.

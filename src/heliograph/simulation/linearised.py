@@ -15,6 +15,7 @@ from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AnyPlant
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, PyTree
 
 
@@ -26,7 +27,7 @@ class Followed(NamedTuple):
     rule: PyTree
 
 
-class LinearisedCentre(eqx.Module):
+class LinearisedCentre(Module):
     """As `Centre`, of filters whose gains depend on data: nominal, as they are.
 
     P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i C_i: K_i and C_i are derivatives of each filter's

@@ -21,7 +21,7 @@ from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.model.relays import RECEIVER, RelayNetwork
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_horizon, fail, table
-from heliograph.numerics.plain_methods import plain_methods
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
@@ -40,9 +40,8 @@ class Kind(NamedTuple):
     filters: tuple[str, ...]
 
 
-@plain_methods
 @readable
-class Network(eqx.Module):
+class Network(Module):
     """A plant observed by named nodes. Everything downstream (simulation, filters, reports) reads this one description.
 
     `fused` names what is made of several nodes: a `Fusion` of the estimates that one of their filters gives, or a

@@ -10,12 +10,13 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, shown, table
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
 
 @readable
-class Node(eqx.Module):
+class Node(Module):
     """A sensor, the channel its signal takes, and named filters; the world's channel need not be what they believe.
 
     With a `fed_back_filter` among them the sensor sends what that filter does not expect.
@@ -59,7 +60,7 @@ class Node(eqx.Module):
 
 
 @readable
-class Listener(eqx.Module):
+class Listener(Module):
     """A place in a network of relays, which hears one of them or the sensor, and the filters there.
 
     `received` numbers named after `outputs` are heard, always all of them if it is `complete`.
@@ -72,7 +73,7 @@ class Listener(eqx.Module):
 
 
 @readable
-class Common(eqx.Module):
+class Common(Module):
     """One sensor and one channel for all nodes: of what arrives each hears the rows that follow those before it."""
 
     sensor: AnySensor

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Generic, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,7 @@ from jaxtyping import PyTree
 
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.simulation.by_name import by_name, measurements_of, reports_by_name, uplinks_by_name
 from heliograph.simulation.network import Network
@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 
 
 @readable
-class AbstractReducer(eqx.Module, Generic[Result]):
+class AbstractReducer(Module, Generic[Result]):
     """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
 
     A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes,

@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Estimate
+from heliograph.numerics.module import Module
 
 
 class Told(NamedTuple):
@@ -31,7 +32,7 @@ def told_step(
     return after, Told(item.after_step(after, k), retained)
 
 
-class Alike(eqx.Module):
+class Alike(Module):
     """Filters that differ in numbers alone, stacked along one axis, node after node for each of them.
 
     `group`: of nodes that they belong to; `count` of filters at each of `nodes` nodes. `retains`: each step tells what

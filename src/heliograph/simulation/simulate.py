@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.forked import check_process
+from heliograph.numerics.module import Module
 from heliograph.simulation.air import air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.given import inputs_of, key_of
@@ -124,7 +125,7 @@ def monte_carlo(
     return reducer.finish(*kept, told)
 
 
-class _Job(eqx.Module):
+class _Job(Module):
     """What is simulated and smoothed, up to which run, what is kept of it, and whether in single precision."""
 
     world: World

@@ -17,6 +17,7 @@ from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.relays import RECEIVER
 from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_run import each_run
 from heliograph.simulation.gathering import Fused
@@ -28,7 +29,7 @@ from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing
 
 
-class Smoother(eqx.Module):
+class Smoother(Module):
     """What of a network's filters is smoothed, and how: `kinds` of them and `groups` of measurements, by their places.
 
     `fusions`: of smoothed estimates at the same time.

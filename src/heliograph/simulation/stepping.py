@@ -20,6 +20,7 @@ from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import large_program
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.centre import (
     Centre,
@@ -35,7 +36,7 @@ from heliograph.simulation.uplinks import Drawn, uplinks_of
 from heliograph.smoothing.sweep import planned_with_past
 
 
-class AllFilters(eqx.Module):
+class AllFilters(Module):
     """Every filter of a network: those of the nodes by kind, fusion rules, centres that know more, central filters.
 
     `order` brings the groups' measurements, joined, into the order of the nodes. `retains`: central filters tell what a

@@ -14,6 +14,7 @@ from jaxtyping import PyTree
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import squared_distance
 from heliograph.simulation.by_name import by_name, uplinks_by_name
 from heliograph.simulation.lanes import BLOCK
@@ -25,7 +26,7 @@ from heliograph.simulation.statistics_by_name import StatisticsByName
 from heliograph.simulation.uplinks import Uplink
 
 
-class Sums(eqx.Module):
+class Sums(Module):
     """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
 
     Run r goes to batch r mod BATCHES; the last axis is longer, so that a block of consecutive runs lies in one piece,

@@ -15,6 +15,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.channel import Channel, perfect
 from heliograph.model.over_time import OverTime, at, over_time, stack, structure
 from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, PyTree
 from heliograph.random_affine.second_moments import SecondOrder
@@ -52,7 +53,7 @@ class Flying(NamedTuple):
     quantizers: PyTree
 
 
-class Group(eqx.Module):
+class Group(Module):
     """Nodes with channels of one structure: the channels stacked, the nodes' checksums and places."""
 
     channel: Channel
@@ -60,7 +61,7 @@ class Group(eqx.Module):
     places: np.ndarray
 
 
-class Uplinks(eqx.Module):
+class Uplinks(Module):
     """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
 
     Shapes: delay (node, ages), every (node,). `links`: what a centre knows of them.

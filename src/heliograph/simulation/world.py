@@ -1,6 +1,5 @@
 """One step of everything: the plant moves, its nodes hear it, every filter is fed."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
@@ -9,12 +8,13 @@ from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.angle import wrapped
+from heliograph.numerics.module import Module
 from heliograph.simulation.air import AbstractAir
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
 from heliograph.simulation.stepping import AllFilters
 
 
-class World(eqx.Module):
+class World(Module):
     """A network as it is simulated: the plant, what is between it and the nodes, and all filters."""
 
     plant: AnyPlant

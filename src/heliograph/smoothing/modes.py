@@ -11,6 +11,7 @@ from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.sweep import carried_ahead, swept, swept_means, swept_over_lag
@@ -19,7 +20,7 @@ A = TypeVar("A", jax.Array, np.ndarray)
 
 
 @readable
-class AbstractSmoothing(eqx.Module):
+class AbstractSmoothing(Module):
     """Which states are estimated from which later data, given what a filter retained of a run."""
 
     def estimates(self, steps: AbstractRetained) -> Estimate:

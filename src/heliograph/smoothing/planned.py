@@ -1,6 +1,5 @@
 """A smoother whose every matrix is known before any data: of many runs, only vectors are left to compute."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +8,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_horizon, fail, instance
 from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -16,7 +16,7 @@ from heliograph.smoothing.sweep import planned_with_past, quiet_steps, stepped
 
 
 @readable
-class PlannedSmoother(eqx.Module):
+class PlannedSmoother(Module):
     """What a linear filter and a sweep back over it come to before any data: covariances, and a map from z to means.
 
     For complete data: where a component is missing all means are NaN. Built by `planned_smoother`.

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +27,7 @@ from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
 from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.monomials import exponents
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
@@ -36,7 +36,7 @@ from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
 Modes = TypeVar("Modes", Told, Heard)  # a channel at one step, mode by mode
 
 
-class InUnits(eqx.Module):
+class InUnits(Module):
     """A function of vectors, in other units: out f(x / into_1, ...). Functions in whatever units are one program."""
 
     function: Callable[..., ArrayLike]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.module import Module
 
 STEP = 5e-4  # s, of the drive's control and of the filters
 POLE_PAIRS = 2
@@ -62,7 +63,7 @@ def runge_kutta(rate: Rate, x: jax.Array, step: float) -> jax.Array:
     return x + step / 6 * (a + 2 * b + 2 * c + d)
 
 
-class Machine(eqx.Module):
+class Machine(Module):
     """One step of the machine, x per unit of `RATED` (5 states, or 6 with the load's torque), u in volts."""
 
     rotor_resistance: np.ndarray

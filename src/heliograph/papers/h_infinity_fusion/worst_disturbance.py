@@ -17,12 +17,13 @@ from numpy.typing import ArrayLike
 
 import heliograph as hg
 from heliograph.filters.prediction import Ahead
+from heliograph.numerics.module import Module
 
 SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken
 FIRST = (1.0, 1.0, 0.1, 1e-3)  # sizes of x_0, e_0, v, rho where a climb starts; where it ends they are what they are
 
 
-class World(eqx.Module):
+class World(Module):
     """x+ = f(x, k) + B v, y = h(x) + D v, received = G y + N rho, z = M x, over the steps of `inputs`.
 
     Shapes: disturbance (n, v), feedthrough (y, v), wanted (z, n), weight (2n, 2n), inputs (time, inputs) of the filter.
