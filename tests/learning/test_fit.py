@@ -37,7 +37,7 @@ def found(recording):
     return hg.fit(network, recording, INPUTS, starts=3)
 
 
-def oracle(values, z, form):
+def oracle(values, z, form, inputs=INPUTS):
     mean, variance, noise = values["mean gain"], values["gain variance"], values["hop noise"]
     m, one = np.diag([mean, 1.0]), np.eye(1)
 
@@ -46,7 +46,7 @@ def oracle(values, z, form):
 
     c, r = np.ones((2, 1)), np.diag([0.3, 0.2])
     model = (0.95 * one, one, values["plant noise"] * one, c, r, 0.0, m, np.zeros(2), spread, np.zeros(1), one)
-    return likelihood(model, z, INPUTS, form)
+    return likelihood(model, z, inputs, form)
 
 
 @pytest.mark.parametrize("form", ["linear", "conditional"])
@@ -115,14 +115,14 @@ def test_a_profile_ends_where_the_likelihood_has_fallen(found):
 
 def test_several_recordings_are_one_likelihood(found, recording):
     z = recording.measurements["node"][0]
-    surface = found.solutions[0].surface
+    solution = found.solutions[0]
+    surface = solution.surface
     parts = gathered(found.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
     assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
-    x = found.best.x[None]
-    whole = Surface(surface.objective, parts).found(x).total
-    first = surface.found(x).total
-    short = gathered(found.description.start, z[:150], INPUTS[:150], 4)
-    assert whole == pytest.approx(first + Surface(surface.objective, short).found(x).total, rel=1e-12)
+    whole = Surface(surface.objective, parts).found(solution.x[None]).total
+    values = found.description.parameters.known(solution.x)
+    short = oracle(values, z[:150], solution.form, INPUTS[:150])
+    assert whole == pytest.approx(surface.found(solution.x[None]).total + short, rel=1e-12)
 
 
 def test_who_interrupts_keeps_the_best_so_far(recording):

@@ -134,7 +134,8 @@ def test_what_remembers_or_is_too_much_is_refused():
 
 def test_samples_needed_are_of_the_right_size():
     """Two points whose noise hides little: I and V by quadrature over z of a signal that is all but known."""
-    a, b, noise = hg.Discrete([0.6, 1.4], [0.5, 0.5]), hg.Discrete([0.2, 1.0, 1.8], [0.125, 0.75, 0.125]), 0.5
+    values = [0.6, 1.0, 1.4], [0.2, 1.0, 1.8]  # of one structure: what is compiled for one law serves the other
+    a, b, noise = hg.Discrete(values[0], [0.5, 0.0, 0.5]), hg.Discrete(values[1], [0.125, 0.75, 0.125]), 0.5
     still = hg.LinearPlant([[0.0]], 1e-9, [2.0], 1e-9)
     sensor = hg.Sensor(lambda x: jnp.stack([2.0 + x[0]]), 1e-9)
     own = {"open": hg.filters.open_loop_filter(still)}
