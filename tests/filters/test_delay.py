@@ -122,36 +122,6 @@ def test_delays_that_are_a_chain():
     np.testing.assert_allclose(found.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
 
 
-LATE = [0.5, 0.3, 0.2]  # a relay's own delay
-RELAYS = [
-    hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), N, delay=hg.Discrete([0, 1], [0.7, 0.3])),
-    hg.hop(hg.Discrete([0.8, 1.1], [0.4, 0.6]), 2 * N, delay=hg.Discrete([0, 1, 2], LATE)),
-    hg.hop(1.0, N, delay=1),
-]
-
-
-def test_relays_that_are_late_by_chance(filters):
-    """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
-    channel, generator = hg.amplify_and_forward(RELAYS), np.random.default_rng(0)
-    item = hg.linear_filter(PLANT, SENSOR, channel)
-    relay = oracle.of_untold(PARTS, independent([0.7, 0.3]), 0.9, 0.9, N)
-    stage = (PARTS[0], relay[0], PARTS[2], *relay[1:])
-    gains = np.array([0.98, 0.4 * 0.64 + 0.6 * 1.21])
-    heard = oracle.of_untold(stage, independent([0.0, *LATE]), *gains, 2 * N + N)
-    best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, 13)])
-    found = np.asarray(item.planned(np.zeros((12, 0))).covariances)[2::2]
-    np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
-    usual = hg.filters.as_current_filter(PLANT, SENSOR, channel)
-    assert usual.claim == "nominal"
-    record = hg.monte_carlo(hg.Network(PLANT, {"it": hg.Node(SENSOR, channel, {"exact": item})}), 12, 1024, key=0)
-    squares = record.errors("it", "exact")[:, -1] ** 2
-    assert np.all(np.abs(squares.mean(axis=0) - np.diag(best[-1])) < 3 * squares.std(axis=0) / 32)
-    state = item.init()
-    for k in range(4):  # not planned, with a gap
-        state, estimate = item.step(state, [np.nan] if k == 2 else generator.normal(size=1), k=k)
-    assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
-
-
 @pytest.mark.parametrize("seed", [0, 1])
 def test_told_the_claim_is_the_best_linear_error_given_the_delays(filters, seed):
     """Values heard twice, out of order, lost, and too late to be of any step."""
@@ -184,13 +154,23 @@ def test_a_constant_delay_is_predicted_over(filters):
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12, atol=1e-13)
 
 
+LATE = [0.5, 0.3, 0.2]  # a relay's own delay
+RELAYS = [
+    hg.hop(hg.Discrete([0.6, 1.2], [0.5, 0.5]), N, delay=hg.Discrete([0, 1], [0.7, 0.3])),
+    hg.hop(hg.Discrete([0.8, 1.1], [0.4, 0.6]), 2 * N, delay=hg.Discrete([0, 1, 2], LATE)),
+    hg.hop(1.0, N, delay=1),
+]
+
+
 @pytest.fixture(scope="module")
 def simulated(filters):
-    """A network of all of them, and its record."""
+    """A network of all of them and of late relays, and its record."""
+    relayed = hg.amplify_and_forward(RELAYS)
     nodes = {
         "untold": hg.Node(SENSOR, UNTOLD, {name: filters[name] for name in ("untold", "as_current")}),
         "told": hg.Node(SENSOR, TOLD, {"told": filters["told"]}),
         "fixed": hg.Node(SENSOR, FIXED, {}),
+        "relayed": hg.Node(SENSOR, relayed, {"exact": hg.linear_filter(PLANT, SENSOR, relayed)}),
     }
     network = hg.Network(PLANT, nodes)
     return network, hg.monte_carlo(network, STEPS, 1024, key=0)
@@ -204,6 +184,26 @@ def test_simulated_errors_are_as_known_before(simulated):
         assert abs(errors[name].mean() - expected) < 3 * errors[name].std() / 32
     told = record.estimates["told"]["told"].covariance[:, -1, 0, 0]
     assert abs(told.mean() - 0.460) < 3 * told.std() / 32
+
+
+def test_relays_that_are_late_by_chance(simulated):
+    """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
+    (network, record), generator = simulated, np.random.default_rng(0)
+    item = network.nodes["relayed"].filters["exact"]
+    relay = oracle.of_untold(PARTS, independent([0.7, 0.3]), 0.9, 0.9, N)
+    stage = (PARTS[0], relay[0], PARTS[2], *relay[1:])
+    gains = np.array([0.98, 0.4 * 0.64 + 0.6 * 1.21])
+    heard = oracle.of_untold(stage, independent([0.0, *LATE]), *gains, 2 * N + N)
+    best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, 13)])
+    found = np.asarray(item.planned(np.zeros((12, 0))).covariances)[2::2]
+    np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
+    assert hg.filters.as_current_filter(PLANT, SENSOR, network.nodes["relayed"].channel).claim == "nominal"
+    squares = record.errors("relayed", "exact")[:, 11] ** 2
+    assert np.all(np.abs(squares.mean(axis=0) - np.diag(best[-1])) < 3 * squares.std(axis=0) / 32)
+    state = item.init()
+    for k in range(4):  # not planned, with a gap
+        state, estimate = item.step(state, [np.nan] if k == 2 else generator.normal(size=1), k=k)
+    assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
 
 
 def test_a_record_as_events(simulated):

@@ -70,7 +70,7 @@ def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
     cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.mixture_filter(*s)})})
-    found = hg.monte_carlo(network, 30, 192, 0, keep=hg.Statistics())["node"]["mixture"]
+    found = hg.monte_carlo(network, 30, 96, 0, keep=hg.Statistics())["node"]["mixture"]
     assert found.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
 
 

@@ -130,15 +130,16 @@ def test_maps_may_vary_while_the_chain_does_not():
     np.testing.assert_allclose(found, expected(LAW_B, [CHAIN_B] * 3, maps), **EXACT)
 
 
-NODES, WEIGHTS = (a for a in np.polynomial.hermite_e.hermegauss(3))  # exact to degree 5 in each drawn number
+def drifts(correlations, steps, points):
+    """All paths of drifting gains on a grid of what drives them: weight, c of shape (steps, gains).
 
-
-def drifts(correlations, steps):
-    """All paths of drifting gains on a grid of what drives them: weight, c of shape (steps, gains)."""
-    weights = WEIGHTS / WEIGHTS.sum()
+    Exact to degree 2 `points` - 1 in each drawn number: second moments have degree 2 for each hop that is driven by it.
+    """
+    nodes, weights = np.polynomial.hermite_e.hermegauss(points)
+    weights = weights / weights.sum()
     rho = np.asarray(correlations)
-    for choice in product(range(3), repeat=steps * len(rho)):
-        e = NODES[np.array(choice)].reshape(steps, len(rho))
+    for choice in product(range(points), repeat=steps * len(rho)):
+        e = nodes[np.array(choice)].reshape(steps, len(rho))
         c = [e[0]]
         for row in e[1:]:
             c.append(rho * c[-1] + np.sqrt(1 - rho**2) * row)
@@ -170,7 +171,7 @@ def test_drifting_gains_need_no_grid(name):
     """Their covariance is that over all paths of c, though the filter knows but one or two functions of it."""
     correlations, build, at_c = DRIFTING[name]
     steps, total = 3 if len(correlations) == 1 else 2, None
-    for weight, c in drifts(correlations, steps):
+    for weight, c in drifts(correlations, steps, 3 if name == "two hops that drift together" else 2):
         maps = [at_c(lambda value: hg.hop(1.1 + 0.4 * value, 0.2), row) for row in c]
         parts = oracle.path_moments(
             SECOND[:steps, :steps],
@@ -294,6 +295,6 @@ def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
 
     at, steps = np.array([0.05, 0.1, 1.0, 0.3, 0.8]), 1e-5 * np.eye(5)
     with jax.enable_x64(True):
-        slopes = jax.grad(likelihood)(jnp.asarray(at))
+        slopes = jax.jit(jax.grad(likelihood))(jnp.asarray(at))
     expected = [(likelihood(at + d) - likelihood(at - d)) / 2e-5 for d in steps]
     np.testing.assert_allclose(slopes, expected, rtol=1e-6, atol=1e-6)

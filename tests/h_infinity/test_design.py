@@ -70,7 +70,7 @@ def test_the_recursion_cannot_look_ahead():
 
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
-    short = node(0, steps=5)
+    short = node(0, steps=2)
     np.testing.assert_allclose(
         hg.h_infinity.horizon_design(short, solver="scs").level, hg.h_infinity.horizon_design(short).level, rtol=1e-5
     )

@@ -51,10 +51,11 @@ def test_every_run_is_the_one_that_a_loop_makes(monkeypatch, ahead):
                 np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-14)
 
 
-def world(channel, plain, gains):
+def world(plain):
+    """Two nodes that hear everything and one that loses half of it."""
     plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
     nodes = {}
-    for name, gain in zip("ab", gains, strict=True):
+    for name, gain, channel in (("a", 1.0, plain), ("b", 0.3, plain), ("lost", 1.0, hg.erasure(plain, 0.5))):
         sensor = hg.LinearSensor([[gain]], 0.1)
         nodes[name] = hg.Node(sensor, channel, {"f": hg.linear_filter(plant, sensor, plain)})
     return hg.Network(plant, nodes)
@@ -62,8 +63,7 @@ def world(channel, plain, gains):
 
 def test_planned_filters_tell_what_they_would_without_a_plan():
     """Step by step without a plan; a channel that erases takes no plan."""
-    gains, plain = (1.0, 0.3), hg.hop(hg.Rayleigh(1.0), 0.1)
-    network = world(plain, plain, gains)
+    network = world(hg.hop(hg.Rayleigh(1.0), 0.1))
     record = hg.monte_carlo(network, 6, 40, 4)
     with jax.enable_x64(True):
         for node in "ab":
@@ -74,8 +74,7 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
                     state, estimate = item.step(state, z, (), k)
                     np.testing.assert_allclose(found.mean[run, k], estimate.mean, rtol=1e-12, atol=1e-13)
                     np.testing.assert_allclose(found.covariance[run, k], estimate.covariance, rtol=1e-12)
-    lost = hg.monte_carlo(world(hg.erasure(plain, 0.5), plain, gains), 6, 40, 4)
-    assert np.isnan(lost.measurements["a"]).any() and lost.failures() == []
+    assert np.isnan(record.measurements["lost"]).any() and record.failures() == []
     sums = hg.monte_carlo(network, 6, 40, 4, hg.Statistics())["b"]["f"]
     kept = hg.simulation.error_statistics(record, "b", "f")
     for name in ("outer", "covariance", "nees", "count"):

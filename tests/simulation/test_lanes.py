@@ -12,7 +12,7 @@ import pytest
 import heliograph as hg
 from heliograph.simulation.lanes import BLOCK, LANES
 
-HORIZON = 4
+HORIZON, RUNS = 4, 10 * BLOCK + 7  # two blocks for each lane
 
 
 def network():
@@ -28,12 +28,11 @@ def test_more_lanes_than_one_are_used():
 
 @pytest.mark.parametrize("chunk", [BLOCK, 3 * BLOCK, LANES * BLOCK, 11 * BLOCK])
 def test_chunks_do_not_change_a_bit(chunk):
-    runs = 10 * BLOCK + 7
-    whole, parts = (hg.monte_carlo(network(), HORIZON, runs, 0, chunk=c) for c in (100 * BLOCK, chunk))
+    whole, parts = (hg.monte_carlo(network(), HORIZON, RUNS, 0, chunk=c) for c in (100 * BLOCK, chunk))
     np.testing.assert_array_equal(whole.truth, parts.truth)
     np.testing.assert_array_equal(whole.estimates["a"]["f"].mean, parts.estimates["a"]["f"].mean)
     one, other = (
-        hg.monte_carlo(network(), HORIZON, runs, 0, hg.Statistics(), chunk=c)["a"]["f"] for c in (100 * BLOCK, chunk)
+        hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics(), chunk=c)["a"]["f"] for c in (100 * BLOCK, chunk)
     )
     np.testing.assert_array_equal(one.outer, other.outer)
     np.testing.assert_array_equal(one.nees, other.nees)
@@ -49,11 +48,11 @@ def test_one_core_gives_the_same_bits(monkeypatch):
 
 DEVICES = """
 import numpy as np, jax, sys
-from tests.simulation.test_lanes import network, HORIZON
+from tests.simulation.test_lanes import network, HORIZON, RUNS
 import heliograph as hg
 assert len(jax.devices()) == 3
-record = hg.monte_carlo(network(), HORIZON, 700, 0)
-statistics = hg.monte_carlo(network(), HORIZON, 700, 0, hg.Statistics(), chunk=64)["a"]["f"]
+record = hg.monte_carlo(network(), HORIZON, RUNS, 0)
+statistics = hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics(), chunk=64)["a"]["f"]
 np.savez(sys.argv[1], truth=record.truth, mean=record.estimates["a"]["f"].mean, outer=statistics.outer)
 """
 
@@ -64,17 +63,18 @@ def test_several_devices_share_the_lanes(tmp_path):
     environment = os.environ | {"XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", DEVICES, str(tmp_path / "found.npz")], env=environment, check=True)
     found = np.load(tmp_path / "found.npz")
-    record = hg.monte_carlo(network(), HORIZON, 700, 0)
+    record = hg.monte_carlo(network(), HORIZON, RUNS, 0)
     np.testing.assert_allclose(found["truth"], record.truth, rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(found["mean"], record.estimates["a"]["f"].mean, rtol=1e-10, atol=1e-12)
-    statistics = hg.monte_carlo(network(), HORIZON, 700, 0, hg.Statistics())["a"]["f"]
+    statistics = hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics())["a"]["f"]
     np.testing.assert_allclose(found["outer"], statistics.outer, rtol=1e-10, atol=1e-12)
 
 
 def test_single_precision_tells_the_same_story():
-    """Other draws of the same laws: RMSE within 4 standard errors of its difference over 4,096 runs."""
+    """Other draws of the same laws: RMSE within 4 standard errors of its difference over 8,192 runs."""
     double, single = (
-        hg.monte_carlo(network(), 10, 4096, 0, hg.Statistics(), precision=p)["a"]["f"] for p in ("float64", "float32")
+        hg.monte_carlo(network(), HORIZON, 8192, 0, hg.Statistics(), chunk=LANES * BLOCK, precision=p)["a"]["f"]
+        for p in ("float64", "float32")
     )
     (a, a_error), (b, b_error) = double.rmse(), single.rmse()
     assert a != b and abs(a - b) < 4 * np.hypot(a_error, b_error)
