@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from heliograph.numerics.check import check_count, fail, shown
+from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
 from heliograph.random_affine.chain import MarkovChain
@@ -104,7 +104,7 @@ class Delayed(AbstractOfLine):
         (self.link,) = as_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
-        self.times, self.told = _times(delay), told
+        self.times, self.told = _times(delay), instance("told", told, bool, "True or False")
         each = [_chosen(d, self.past, link.inputs, told) for d in self.times]
         match delay:
             case Discrete():

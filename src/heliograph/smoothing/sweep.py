@@ -9,7 +9,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.retained import AbstractRetained, Moments, Point
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import array, instance
+from heliograph.numerics.check import array, check_count, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
@@ -31,13 +31,14 @@ def retained_steps(
     Shapes: measurements (steps, received), NaN for what did not arrive; inputs (steps, inputs).
 
     Raises:
-        ValueError: arrays that are not the filter's, a filter that cannot be smoothed.
+        ValueError: arrays that are not the filter's, a step that is none, a filter that cannot be smoothed.
     """
     instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
     z = array("measurements", measurements, (None, filter.received or None), missing=True)
     z = z if filter.received else z[:, :0]
     u = array("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, (len(z), len(filter.inputs)))
-    return stepped(filter, z, u, filter.init() if state is None else state, np.asarray(first_step))
+    first = np.asarray(check_count("first step", first_step, 0))
+    return stepped(filter, z, u, filter.init() if state is None else state, first)
 
 
 @compiled
