@@ -77,7 +77,7 @@ class Table:
     @property
     def _cells(self) -> list[int]:
         """Length of the longest cell of each column."""
-        return [max((len(row[i]) for row in self.rows), default=0) for i in range(len(self.headers))]
+        return [max((len(row[i]) for row in self.rows if i < len(row)), default=0) for i in range(len(self.headers))]
 
 
 @dataclass(frozen=True)
