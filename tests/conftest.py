@@ -21,6 +21,8 @@ def pytest_configure(config):
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
         # Most programs run once, so that compiling them is what takes time: a fifth of it with these.
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+        # BLAS threads wait busily for matrices of a few rows: thirty times the processor time of a small L-BFGS-B.
+        os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         flags = f"{os.environ.get('XLA_FLAGS', '')} {IN_A_HURRY}"
         if understood(flags):
             os.environ["XLA_FLAGS"] = flags

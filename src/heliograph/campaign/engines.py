@@ -30,6 +30,8 @@ LOOK = 0.01  # seconds between looks whether a cluster has done something
 LOST = "scheduler", "one that goes on to the end", "a lost connection: the same command goes on with what is missing"
 LOOK_AHEAD = 2  # jobs a cluster is given for each of its threads, so that none waits for this process
 
+Untyped = Any  # what dask.distributed gives
+
 
 def start_engine(
     campaign: str, store: Path, workers: int, scheduler: str | None = None, timeout: float = math.inf
@@ -167,7 +169,7 @@ def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.i
     """
     from distributed import Client
 
-    start: Any = Client  # it has no types
+    start: Untyped = Client
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what there is to say is said in one line
     try:
         client = start(address, set_as_default=False, timeout=CONNECT)
@@ -179,11 +181,13 @@ def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.i
         client.close(timeout=CONNECT)
 
 
-def _submit(client: Any, campaign: str, store: str, waiting: deque[Job], timeout: float) -> Iterator[tuple[Job, Reply]]:
+def _submit(
+    client: Untyped, campaign: str, store: str, waiting: deque[Job], timeout: float
+) -> Iterator[tuple[Job, Reply]]:
     from distributed import as_completed
 
     jobs: dict[object, Job] = {}
-    collect: Any = as_completed
+    collect: Untyped = as_completed
     flying = collect(loop=client.loop)
     while waiting or jobs:
         room = max(LOOK_AHEAD * sum(_reached(client, client.nthreads).values()), 1) - len(jobs)
@@ -200,7 +204,7 @@ def _submit(client: Any, campaign: str, store: str, waiting: deque[Job], timeout
         yield jobs.pop(future), _result(future)
 
 
-def _next(client: Any, flying: Any, timeout: float) -> Any:
+def _next(client: Untyped, flying: Untyped, timeout: float) -> Untyped:
     """The next job that is done; None if none is for `timeout` seconds."""
     waited = 0.0
     while not flying.has_ready():
@@ -213,7 +217,7 @@ def _next(client: Any, flying: Any, timeout: float) -> Any:
     return _reached(client, lambda: next(flying))
 
 
-def _reached(client: Any, ask: Callable[[], Any]) -> Any:
+def _reached(client: Untyped, ask: Callable[[], Untyped]) -> Untyped:
     try:
         return ask()
     except (OSError, RuntimeError, TimeoutError):
@@ -224,7 +228,7 @@ def _line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _result(future: Any) -> Reply:
+def _result(future: Untyped) -> Reply:
     if future.status == "finished":
         reply: Reply = future.result()
         return reply

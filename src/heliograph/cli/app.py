@@ -3,9 +3,8 @@
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from cyclopts import App, Parameter
+from cyclopts import App, Parameter, Token
 
 import heliograph
 
@@ -44,14 +43,14 @@ def folder(command: str, out: Path | None, name: str) -> Path:
     return out.parent if out.name == name else out
 
 
-def _whole(_: type, tokens: Sequence[Any]) -> int:
+def _whole(_: type, tokens: Sequence[Token]) -> int:
     """Digits: no fraction is rounded away."""
     if not re.fullmatch(r"[+-]?[0-9]+", tokens[0].value, re.ASCII):
         raise ValueError(f"expected a whole number, got {tokens[0].value!r}")
     return int(tokens[0].value)
 
 
-def _path(_: type, tokens: Sequence[Any]) -> Path:
+def _path(_: type, tokens: Sequence[Token]) -> Path:
     if not tokens[0].value or "\0" in tokens[0].value:
         raise ValueError(f"expected a path, got {tokens[0].value!r}")
     return Path(tokens[0].value)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import jax
 import numpy as np
@@ -25,7 +24,7 @@ class Description:
     parameters: Parameters
     named: tuple[bool, ...]
 
-    def at(self, values: Mapping[str, Any]) -> Network:
+    def at(self, values: Mapping[str, object]) -> Network:
         """The network with these values."""
         with reading(Given(self.parameters, self.named, values)), jax.enable_x64(True):
             try:

@@ -51,7 +51,7 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
 
 
 class _Reader(Protocol):
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any: ...
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object: ...
 
 
 # What `free` answers depends on who builds the network: nobody, one who asks what is free, or one who tries values.
@@ -95,7 +95,7 @@ class Asking:
     def __init__(self) -> None:
         self.marks: list[_Mark] = []
 
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """The start, which learns what it is for."""
         for mark in self.marks:
             if name is not None and mark.given == name:
@@ -128,7 +128,7 @@ class Given:
         self.values = values
         self.unnamed = iter([one.name for one, own in zip(parameters.every, named, strict=True) if not own])
 
-    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> Any:
+    def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """The value."""
         key = next(self.unnamed, "") if name is None else name
         if key not in self.values:

@@ -1,7 +1,7 @@
 """What a recording of a network can tell of its free numbers, before there is one and after, in words."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -178,7 +178,7 @@ def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Flo
 
 
 @large_program
-def _expected(objective: Objective, x: Array, u: Array, key: Any) -> jax.Array:
+def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     item = objective.filter(jnp.asarray(x))
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:

@@ -1,14 +1,12 @@
 """From a number on its domain to numbers on the whole line and back: where steps are taken and intervals are made."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.domain import Domain
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
 
 
 def to_line(name: str, domain: Domain, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, " size"]:
@@ -52,7 +50,7 @@ def from_line(domain: Domain, shape: tuple[int, ...], x: Array) -> Array:
     return domain.high - jnp.exp(value) if np.isfinite(domain.high) else value
 
 
-def link(domain: Domain, value: Any) -> Any:
+def link(domain: Domain, value: PyTree) -> PyTree:
     """The scale on which an interval of one number is symmetric."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return np.log((value - domain.low) / (domain.high - value))
@@ -61,7 +59,7 @@ def link(domain: Domain, value: Any) -> Any:
     return np.log(domain.high - value) if np.isfinite(domain.high) else value
 
 
-def unlink(domain: Domain, value: Any) -> Any:
+def unlink(domain: Domain, value: PyTree) -> PyTree:
     """Back from there; infinite values give the limits."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return domain.low + (domain.high - domain.low) / (1 + np.exp(-value))
@@ -70,7 +68,7 @@ def unlink(domain: Domain, value: Any) -> Any:
     return domain.high - np.exp(value) if np.isfinite(domain.high) else value
 
 
-def unlink_slope(domain: Domain, value: Any) -> Any:
+def unlink_slope(domain: Domain, value: PyTree) -> PyTree:
     """d unlink / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / (2 * np.cosh(value / 2)) ** 2
@@ -79,7 +77,7 @@ def unlink_slope(domain: Domain, value: Any) -> Any:
     return -np.exp(value) if np.isfinite(domain.high) else np.ones_like(value)
 
 
-def slope(domain: Domain, value: Any) -> Any:
+def slope(domain: Domain, value: PyTree) -> PyTree:
     """d link / d value."""
     if np.isfinite(domain.low) and np.isfinite(domain.high):
         return (domain.high - domain.low) / ((value - domain.low) * (domain.high - value))

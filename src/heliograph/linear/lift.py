@@ -1,7 +1,7 @@
 """A linear model lifted to monomials: powers of the state and of the measurement as one linear system."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import numpy as np
@@ -14,7 +14,7 @@ from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import check_count, check_horizon, fail
 from heliograph.numerics.small_matrix import with_rounding
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
@@ -193,7 +193,7 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 
-def _maps(items: Sequence[Any], order: int) -> list[GainAndNoise]:
+def _maps(items: Sequence[PyTree], order: int) -> list[GainAndNoise]:
     """A x + noise of each plant or sensor; `check_model` has seen that all are linear."""
     result: list[GainAndNoise] = []
     before, noise = None, Tabulated(items[0].noise, order)

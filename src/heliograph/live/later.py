@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import equinox as eqx
 import jax
@@ -14,7 +14,7 @@ from heliograph.filters.retained import AbstractRetained
 from heliograph.fusion.rules import Fusion
 from heliograph.live.mould import Mould, cast
 from heliograph.live.tape import Ears, Tape, at_step, interval
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
@@ -51,7 +51,7 @@ class Sweep(Module):
         return own, central
 
 
-def _each(function: Callable[..., object], steps: Retained, *rest: PyTree) -> Any:
+def _each(function: Callable[..., object], steps: Retained, *rest: PyTree) -> PyTree:
     """A function of one filter's step for those of each kind, (filter, node, ...), and for the central ones."""
     own = {
         kind: jax.vmap(jax.vmap(function))(step, *(part[0][kind] for part in rest)) for kind, step in steps[0].items()
@@ -68,7 +68,7 @@ Into: TypeAlias = "Callable[[Sweep, Tape, jax.Array, Place], Retained]"
 
 
 @lru_cache
-def sweep_back(mould: Mould, dt: int | None) -> Callable[..., Any]:
+def sweep_back(mould: Mould, dt: int | None) -> Callable[..., PyTree]:
     """The program (numbers, tape, order, (begin, stop)) -> estimates after the row order[begin], given those after it.
 
     Rows are order[begin:stop], begin > 0. What a step leaves is computed anew from the state before it, and so is what
@@ -76,7 +76,7 @@ def sweep_back(mould: Mould, dt: int | None) -> Callable[..., Any]:
     """
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
-    def run(numbers: list[jax.Array], tape: Tape, order: jax.Array, place: jax.Array) -> Any:
+    def run(numbers: list[jax.Array], tape: Tape, order: jax.Array, place: jax.Array) -> PyTree:
         item: Sweep = mould.filled(numbers)
         begin, stop = place
         last = stop - 1, tape.step[order[stop - 1]]
@@ -168,7 +168,7 @@ class Sweeper:
         return {node: filters for node, filters in found.items() if filters}
 
 
-def _one(told: Estimate, claim: Any, where: tuple[int, ...]) -> Estimate:
+def _one(told: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
     return Estimate(np.asarray(told.mean)[where], np.asarray(told.covariance)[where], claim)
 
 

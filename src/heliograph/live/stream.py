@@ -75,7 +75,7 @@ class Stream:
             new._state = jax.tree.unflatten(structure, [jnp.array(arrays[f"state.{i}"]) for i in range(len(leaves))])
         return new
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """Filter, steps and state, in double precision wherever it is read: what is compiled is no part of it."""
         return {"filter": self.filter, "steps": self.steps, "_state": to_numpy(self._state)}
 
@@ -94,7 +94,7 @@ class _Placed:
             self.run = _program(mould)
             self.start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
         self._like = np.zeros(filter_.received), np.zeros(len(filter_.inputs)), np.asarray(0)
-        self.estimate: Any = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
+        self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
 
     def identity(self) -> Identity:
         """Versions, names, numbers, and what a step computes, which counts for functions."""

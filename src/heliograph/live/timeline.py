@@ -81,7 +81,7 @@ class Timeline:
         self._unread, self._left = list[HeldRow](), list[int]()  # final rows, and slots to free when these were read
         self._latest: list[np.ndarray] | None = None
 
-    def __getstate__(self) -> dict[str, Any]:
+    def __getstate__(self) -> dict[str, object]:
         """All that is held, in double precision wherever it is read: what is compiled is no part of it."""
         kept = {name: value for name, value in vars(self).items() if name != "_player"}
         return kept | {"_tape": to_numpy(self._tape)}

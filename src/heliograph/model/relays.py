@@ -1,7 +1,6 @@
 """A plant observed by a sensor, relays that filter and forward, and a receiver: who hears whom, slot by slot."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -13,6 +12,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, items, names, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import second_moment_tensor
 
@@ -201,7 +201,7 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     return gain, offset, spread, live, talks
 
 
-def _tile(item: Any, horizon: int, read: Callable[[Any], Any], dimensions: int) -> np.ndarray:
+def _tile(item: PyTree, horizon: int, read: Callable[[PyTree], Array], dimensions: int) -> np.ndarray:
     """One array of a plant or sensor for each step."""
     value = np.asarray(read(item.values if isinstance(item, OverTime) else item), dtype=np.float64)
     if value.ndim == dimensions + 1:
@@ -209,7 +209,7 @@ def _tile(item: Any, horizon: int, read: Callable[[Any], Any], dimensions: int) 
     return np.broadcast_to(value, (horizon, *value.shape))
 
 
-def _check_linear(plant: Any, sensor: Any) -> None:
+def _check_linear(plant: object, sensor: object) -> None:
     if not isinstance(plant, LinearPlant) or not isinstance(sensor, LinearSensor):
         got = f"{type(plant).__name__} and {type(sensor).__name__}"
         raise fail("relay network", "a LinearPlant and a LinearSensor", got)

@@ -1,9 +1,11 @@
 """One statement of a publication, the evidence on it, and the verdict that follows."""
 
 from collections.abc import Callable, Mapping
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
+
+from heliograph.report.results import Json
 
 Verdict = Literal["holds", "holds_vacuously", "fails"]
 
@@ -54,7 +56,7 @@ class Statement(NamedTuple):
         """The verdict that would follow if some of the evidence were other."""
         return self.judge(**{**self.evidence, **other})
 
-    def entry(self) -> dict[str, Any]:
+    def entry(self) -> dict[str, Json]:
         """As it stands in a summary, which calls a statement a claim."""
         evidence = {name: found._asdict() if isinstance(found, Sampled) else found
                     for name, found in self.evidence.items()}  # fmt: skip

@@ -27,6 +27,8 @@ SETTLED = 1e-14
 
 Parts = Float[np.ndarray, "time M n n"]
 
+Numbers = Any  # NumPy's or JAX's, as what they are made of
+
 
 class Measured(NamedTuple):
     """Of each step A, Q, the chain T into it, the law pi, by mode H and N of z = H x + n, and the transmitters' powers.
@@ -34,14 +36,14 @@ class Measured(NamedTuple):
     start: the covariance before the first step; None where the steps repeat for ever.
     """
 
-    transition: Any  # (time, n, n), NumPy's or JAX's as what it is made of
-    process: Any  # (time, n, n)
-    chain: Any  # (time, M, M)
-    law: Any  # (time, M)
-    output: Any  # (time, M, m, n)
-    noise: Any  # (time, M, m, m)
-    powers: Any  # (time, hops)
-    start: Any  # (n, n)
+    transition: Numbers  # (time, n, n)
+    process: Numbers  # (time, n, n)
+    chain: Numbers  # (time, M, M)
+    law: Numbers  # (time, M)
+    output: Numbers  # (time, M, m, n)
+    noise: Numbers  # (time, M, m, m)
+    powers: Numbers  # (time, hops)
+    start: Numbers  # (n, n)
 
 
 class Settled(NamedTuple):

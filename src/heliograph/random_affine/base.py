@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -245,7 +245,7 @@ def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) ->
     assert isinstance(channel, AbstractRandomAffine)
     by_identity = dict(zip(memories(channel), states, strict=True))
 
-    def chosen(part: Any) -> Any:
+    def chosen(part: PyTree) -> PyTree:
         return part.given(by_identity[part.memory.identity]) if _is_modal(part) else part
 
     result: T = jax.tree.map(chosen, channel, is_leaf=_is_modal)
@@ -271,7 +271,7 @@ def one_memory(items: Sequence[T]) -> list[T]:
 
 
 def _relabelled(channel: T, labels: Mapping[str, str]) -> T:
-    def relabelled(part: Any) -> Any:
+    def relabelled(part: PyTree) -> PyTree:
         if not _is_modal(part) or part.memory.identity not in labels:
             return part
         return eqx.tree_at(lambda m: m.memory, part, part.memory.labelled(labels[part.memory.identity]))

@@ -17,6 +17,7 @@ from heliograph.numerics.traced import placed
 MEMORY_LIMIT_ENTRIES = 50_000_000  # 400 MB of float64: more is refused with the number
 
 Exponents = tuple[int, ...]
+Numbers = Any  # NumPy's or JAX's, or a list of such
 
 
 @cache
@@ -53,9 +54,9 @@ def refuse_if_too_large(rows: int, columns: int, what: str) -> None:
         raise fail(what, f"at most {MEMORY_LIMIT_ENTRIES:,} entries of a moment matrix", got)
 
 
-def monomials(y: Any, degree: int) -> Any:
+def monomials(y: Numbers, degree: int) -> Numbers:
     """All monomials of (y, 1) of total degree `degree`, for y of shape (p,)."""
-    values: list[Any] = [*y, 1.0]
+    values: list[Numbers] = [*y, 1.0]
     terms = [prod((v**e for v, e in zip(values, powers, strict=True) if e), start=1.0)
              for powers in exponents(len(values), degree)]  # fmt: skip
     if isinstance(y, np.ndarray):
@@ -85,7 +86,7 @@ def _last_factor(variables: int, degree: int) -> tuple[np.ndarray, np.ndarray]:
     return divisor, table[np.arange(len(divisor)), divisor]
 
 
-def symmetric_power(h: Any, degree: int) -> Any:
+def symmetric_power(h: Numbers, degree: int) -> Numbers:
     """Sym^k(H): coefficients of the monomials of H Y in the monomials of Y.
 
     Row of z_a z_b...: the product of linear forms, built degree by degree,
@@ -104,7 +105,7 @@ def symmetric_power(h: Any, degree: int) -> Any:
     return power
 
 
-def _append_zero_column(a: Any) -> Any:
+def _append_zero_column(a: Numbers) -> Numbers:
     if isinstance(a, np.ndarray):
         return np.pad(a, ((0, 0), (0, 1)))
     import jax.numpy as jnp
@@ -123,7 +124,7 @@ def product_table(variables: int, first: int, second: int) -> np.ndarray:
     return np.array(rows, dtype=np.int64).reshape(count(variables, first), count(variables, second))
 
 
-def multiply(a: Any, first: int, b: Any, second: int, variables: int) -> Any:
+def multiply(a: Numbers, first: int, b: Numbers, second: int, variables: int) -> Numbers:
     """Product of two homogeneous polynomials given by coefficients."""
     terms = a[:, None] * b
     return placed((count(variables, first + second),), product_table(variables, first, second), terms)

@@ -1,7 +1,7 @@
 """What is between the plant and the filters: each node's own sensor and channel, or relays that talk in slots."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -191,12 +191,12 @@ class Slots(AbstractAir):
 
     def _branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
         # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
-        single: Any = slots[0] if len(slots) == 1 else over_time(slots)
+        single: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
 
         def branch(
             position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
         ) -> dict[str, jax.Array]:
-            slot: Any = at(single, position) if isinstance(single, OverTime) else single
+            slot: PyTree = at(single, position) if isinstance(single, OverTime) else single
             listeners = zip(self.relays.filters, self.relays.received, strict=True)
             return {name: _hear(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
 
@@ -249,7 +249,7 @@ def air_of(network: Network) -> AbstractAir:
         checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
         held = np.stack([memories[name] for name in names])
         told_by = own[names[0]].told_by
-        teller: Any = None if told_by is None else stack([own[name].filters[told_by] for name in names])
+        teller: PyTree = None if told_by is None else stack([own[name].filters[told_by] for name in names])
         place = None if told_by is None else places[names[0], told_by][:2]
         antennas.append(Antenna(*parts, checksums, held, teller, place))
     return OwnChannels(tuple(antennas))

@@ -1,7 +1,7 @@
 """Results as tables: a record as a wide one and back, statistics as a summary."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,7 +105,7 @@ def statistics_frame(found: "StatisticsByName") -> "pd.DataFrame":
     return pd.DataFrame(rows, index=names)
 
 
-def _summary(one: "ErrorStatistics", states: Sequence[str]) -> dict[str, Any]:
+def _summary(one: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
     nees, low, high = one.nees_per_dimension()
     rmse, error = one.rmse()
     by_state = zip(states, *one.rmse_by_state(), one.deviation_by_state(), strict=True)

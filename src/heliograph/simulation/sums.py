@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -16,6 +15,7 @@ from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import squared_distance
+from heliograph.numerics.types import Array
 from heliograph.simulation.by_name import by_name, uplinks_by_name
 from heliograph.simulation.lanes import BLOCK
 from heliograph.simulation.network import FUSED, Network
@@ -224,7 +224,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
 
 
 @compiled
-def _of_record(truth: Any, mean: Any, covariance: Any) -> Sums:
+def _of_record(truth: Array, mean: Array, covariance: Array) -> Sums:
     """Sums over the runs of a record, block by block."""
     runs = len(truth)
     blocks = jnp.arange(-(-runs // BLOCK) * BLOCK).reshape(-1, BLOCK)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -212,7 +212,7 @@ def _known(told: Sequence[SecondOrder | OverTime], received: Sequence[int], erro
     return over_time([_links([at(one, k) for one in told], received, error) for k in range(min(varying))])
 
 
-def _links(told: Sequence[Any], received: Sequence[int], error: np.ndarray) -> Links:
+def _links(told: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
     more = [(0, max(received) - own) for own in received]
     gain = np.stack([np.pad(one.mean_gain, (a, (0, 0))) for one, a in zip(told, more, strict=True)])
     offset = np.stack([np.pad(one.offset, a) for one, a in zip(told, more, strict=True)])

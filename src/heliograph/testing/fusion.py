@@ -1,11 +1,10 @@
 """What a fusion rule must keep: identical estimates, claims, and a bound that is one."""
 
-from typing import Any
-
 import numpy as np
 
 from heliograph.fusion.rules import AbstractFusion, fuse
 from heliograph.model.estimate import STRENGTH, Claim, Estimate
+from heliograph.numerics.types import Array
 from heliograph.testing.filters import ROUNDING
 
 SEARCHED = 1e-6  # relative: a flat minimum fixes weights that are searched for to the root of rounding, 1e-8
@@ -49,6 +48,6 @@ def _fused(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estim
     return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
 
 
-def _close(what: str, found: Any, expected: Any) -> None:
+def _close(what: str, found: Array, expected: Array) -> None:
     gap = np.abs(np.asarray(found) - expected).max()
     assert gap <= SEARCHED * np.abs(expected).max(), f"{what}: expected the same back, off by {gap:g}"

@@ -1,12 +1,10 @@
 """What a quantizer must keep: its bound, its state, and what it delivered."""
 
-from typing import Any
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.fusion.quantizer import AbstractQuantizer
+from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
 from heliograph.testing.filters import ROUNDING
 
 
@@ -43,7 +41,7 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
         state = following
 
 
-def _check_quantized(sent: Any, value: np.ndarray, n: int) -> None:
+def _check_quantized(sent: Quantized, value: np.ndarray, n: int) -> None:
     assert all(np.shape(part) == (n,) for part in sent), f"step: expected parts of shape ({n},)"
     unusable = np.asarray(sent.saturated) | np.isnan(value)
     assert np.array_equal(np.isnan(sent.error), unusable), "error: expected NaN where saturated or NaN, and only there"
