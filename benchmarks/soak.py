@@ -39,6 +39,7 @@ DONE, RESULTS = HERE.parent / "out" / "soak.jsonl", HERE / "soak.json"
 COUNT, SEED, RUNS, AGAIN, SCALED = 10_000, 1, 256, 20_480, 49
 SUSPECT, FALSE_ALARM = 4.0, 1e-3
 WORST = 10  # cases kept
+ROUNDING = 1e-12  # of a state's size: what a dozen steps in double precision may be off
 HURRY = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
 
 
@@ -50,8 +51,11 @@ class Place(NamedTuple):
     direction: np.ndarray
 
 
-def excesses(found: Any, directions: np.ndarray) -> np.ndarray:
-    """(mean e_d^2 - claimed variance) in its standard errors, (time, direction); inf where a certainty is wrong."""
+def excesses(found: Any, directions: np.ndarray, reach: np.ndarray | float = 0.0) -> np.ndarray:
+    """(mean e_d^2 - claimed variance) in its standard errors, (time, direction); inf where a certainty is wrong.
+
+    A state that is known may be off by the rounding of its own size, `reach` (n,).
+    """
     gap = np.einsum("di,btij,dj->btd", directions, found.outer - found.covariance, directions)
     size = np.einsum("di,btij,dj->td", directions, found.covariance, directions) / found.runs
     used = found.count > 0
@@ -59,7 +63,8 @@ def excesses(found: Any, directions: np.ndarray) -> np.ndarray:
     mean = gap.sum(axis=0) / count.sum()
     spread = np.sqrt(np.sum((gap - mean * count) ** 2, axis=0) * len(gap) / (len(gap) - 1)) / count.sum()
     certain = spread <= 1e-9 * np.abs(size)
-    off = np.where(np.abs(mean) <= 1e-6 * np.abs(size) + 1e-300, 0.0, np.inf)
+    rounding = (ROUNDING * np.sum(np.abs(directions) * reach, axis=1)) ** 2
+    off = np.where(np.abs(mean) <= 1e-6 * np.abs(size) + rounding + 1e-300, 0.0, np.inf)
     return np.where(certain, off, mean / np.where(certain, 1.0, spread))
 
 
@@ -70,10 +75,18 @@ def directions_of(found: Any, random: np.random.Generator) -> np.ndarray:
     return np.concatenate([np.eye(len(unit)), (random.normal(size=len(unit)) / unit)[None]])
 
 
-def worst_place(found: Any, random: np.random.Generator) -> Place:
+def reach_of(plant: Any) -> np.ndarray:
+    """How far from zero the states may come without noise, in HORIZON steps."""
+    sizes = [np.abs(np.asarray(plant.initial_mean))]
+    for _ in range(HORIZON):
+        sizes.append(np.abs(plant.matrix) @ sizes[-1] if isinstance(plant, hg.LinearPlant) else sizes[-1] + 1)
+    return np.asarray(np.max(sizes, axis=0))
+
+
+def worst_place(found: Any, random: np.random.Generator, reach: np.ndarray | float = 0.0) -> Place:
     """The largest excess; of an exact claim also the largest lack."""
     directions = directions_of(found, random)
-    z = excesses(found, directions)
+    z = excesses(found, directions, reach)
     judged = np.abs(z) if found.claim == "exact" else z
     step, place = np.unravel_index(int(np.nanargmax(judged)), z.shape)
     return Place(float(z[step, place]), int(step), directions[place])
@@ -112,7 +125,7 @@ def soak(index: int) -> dict[str, Any]:
     found = hg.monte_carlo(item, HORIZON, RUNS, index, keep=hg.Statistics())
     result["flagged"] = found.failures()
     again: Any = None
-    random = np.random.default_rng([SEED, 2, index])
+    random, reach = np.random.default_rng([SEED, 2, index]), reach_of(item.plant)
     claims: Counter[str] = Counter()
     for node, filters in found.items():
         for name, one in filters.items():
@@ -121,13 +134,13 @@ def soak(index: int) -> dict[str, Any]:
                 result["hidden"].append(f"{node}/{name}")
             if one.claim not in ("exact", "upper") or one.failed_runs:
                 continue
-            place = worst_place(one, random)
+            place = worst_place(one, random, reach)
             result["comparisons"] += one.outer.shape[1] * (one.outer.shape[2] + 1)
             if (abs(place.z) if one.claim == "exact" else place.z) <= SUSPECT:
                 continue
             if again is None:
                 again = hg.monte_carlo(item, HORIZON, AGAIN, index + 10**6, keep=hg.Statistics(), chunk=RUNS)
-            fresh = excesses(again[node][name], place.direction[None])[place.step, 0]
+            fresh = excesses(again[node][name], place.direction[None], reach)[place.step, 0]
             where = {
                 "at": f"{node}/{name}",
                 "claim": one.claim,

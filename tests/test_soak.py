@@ -53,6 +53,14 @@ def test_a_certainty_that_is_wrong_is_hopelessly_far(soak: ModuleType) -> None:
     assert soak.worst_place(certain, np.random.default_rng(1)).z > 1e6
 
 
+def test_a_state_that_is_known_may_be_off_by_rounding_of_its_size(soak: ModuleType) -> None:
+    """Of a state of size 500 a millionth is a wrong certainty, 1e-13 is none."""
+    for error, wrong in ((1e-13, False), (1e-6, True)):
+        pairs, nothing = np.full((4, 1, 1), 64 * error**2), np.zeros((4, 1, 1))
+        known = ErrorStatistics(np.full(4, 64.0), pairs, nothing, np.zeros((4, 1)), "exact")
+        assert np.isinf(soak.excesses(known, np.eye(1), np.array([500.0]))).any() == wrong
+
+
 def test_what_is_no_number_and_not_told_is_hidden(soak: ModuleType) -> None:
     one = statistics(1.0)
     assert not soak.hidden(one)

@@ -61,6 +61,7 @@ def test_links_that_remember_and_losses_that_are_told():
     channel = hg.gilbert_elliott(good, bad, 0.2, 0.4)
     filters = {
         "linear": hg.linear_filter(plant, sensor, channel),
+        "first_degree": hg.polynomial_filter(plant, sensor, channel, 3, 1),
         "told": hg.filters.told_filter(plant, sensor, hg.erasure(good, 0.7)),
         "imm": hg.filters.imm_filter(plant, sensor, channel),
     }

@@ -212,6 +212,8 @@ def _centre(item: Centre | None, units: Units) -> Centre | None:
 
 def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
     y, z, s = _powers(units.states, degree), _powers(units.received, degree), item.steps.values
+    if s.transition.shape[-1] != len(y):  # monomials and 1, mode after mode, behind links that remember
+        y = np.tile(np.append(y, 1.0), s.transition.shape[-1] // (len(y) + 1))
     steps = Steps(
         y[:, None] * s.transition / y,
         y * s.drift,
