@@ -49,6 +49,34 @@ def test_flags_that_reveal_the_mode_make_it_the_kalman_filter_given_the_modes():
     np.testing.assert_allclose(known, expected, rtol=1e-12)
 
 
+def test_a_state_far_from_zero_keeps_its_digits():
+    """Where modes differ in their losses alone, a mean of 1e8 deviations moves the estimate and no covariance."""
+    channel = hg.markov_fading([hg.erasure(hg.hop(0.7, 0.05), a) for a in ARRIVAL], BURSTS)
+    fixed = hg.LinearPlant(np.eye(2), 0.1 * np.eye(2), [0.0, 0.0], np.eye(2))
+    far = hg.LinearPlant(np.eye(2), 0.1 * np.eye(2), [1e8, 0.0], np.eye(2))
+    sensor = hg.LinearSensor([[1.0, 0.5]], 0.05)
+    lost = np.where(np.arange(8)[:, None] % 3 == 1, np.nan, Z)
+    found = claims(told_filter(far, sensor, channel), lost + 0.7e8)
+    expected = claims(told_filter(fixed, sensor, channel), lost)
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=1e-12)
+    np.testing.assert_allclose(found[:, 0] - 1e8, expected[:, 0], atol=1e-6)  # of 1e8, with rounding of 1e-8 a step
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-14, 1e-20])
+def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
+    """Of x heard in noise far below its own: the variance is the noise's, where a difference would be rounding."""
+    plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.eye(2), [3.0, 1.0], np.eye(2))
+    sensor = hg.LinearSensor([[1.0, 0.0]], 0.0)
+    data = np.column_stack([Z, Z[:, 0]])
+    certain = hg.erasure(hg.hop(1.0, noise), 0.9)
+    two = hg.markov_fading([hg.erasure(hg.hop(1.0, noise), a) for a in ARRIVAL], BURSTS)
+    expected = claims(hg.linear_filter(plant, sensor, hg.hop(1.0, noise)), data[:, :1])
+    np.testing.assert_allclose(expected[:, 1], noise, rtol=2 * noise, atol=1e-28)  # eps^2 of 1 and more
+    np.testing.assert_allclose(claims(told_filter(plant, sensor, certain), data[:, :1]), expected, rtol=1e-9)
+    found = claims(told_filter(plant, sensor, two), data[:, :1])
+    np.testing.assert_allclose(found[:, 1], expected[:, 1], rtol=1e-6, atol=1e-15)  # rounding of the modes' own parts
+
+
 DRIFTS = hg.amplify_and_forward([hg.autoregressive_fading(m, 0.4, r, 0.05) for m, r in ((1.0, 0.95), (0.8, 0.9))])
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
-from heliograph.filters.modal import blocks, measure_matrix, move_matrix, padded
+from heliograph.filters.modal import measure_matrix, move_matrix, padded, sum_of_modes
 from heliograph.filters.scheduled import pseudo_solve
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -21,7 +21,6 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
 from heliograph.numerics.check import array, probabilities
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 from heliograph.random_affine.modes import JointModes, joint_modes
@@ -48,15 +47,24 @@ class Told(Module):
 
 
 class ToldBelief(NamedTuple):
-    """s, the estimate of zeta (mode after mode), its error's covariance, and E[r r' 1{mode} | flags], r = (x, 1, s).
+    """s, the estimate of zeta, and E[r r' 1{mode} | what was told] of r = (x~, s, e), with the error e = zeta - s.
 
-    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1 + N, n + 1 + N).
+    x~ = (x - c, 1), c = E[x] before any data, and zeta holds x~ 1{mode}, mode after mode. That s + e = zeta is told
+    twice on purpose: no covariance is the difference of larger ones.
+
+    Shapes: with N = M (n + 1): centre (n,), mean (N,), moments (M, n + 1 + 2 N, n + 1 + 2 N).
     """
 
+    centre: Float[jax.Array, " n"]
     mean: Float[jax.Array, " N"]
-    covariance: Float[jax.Array, "N N"]
     moments: Float[jax.Array, "M r r"]
     moved: Bool[jax.Array, ""]
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """E[e e' | what was told]."""
+        count = len(self.mean)
+        return jnp.sum(self.moments, axis=0)[-count:, -count:]
 
 
 class ToldFilter(AbstractFilter):
@@ -68,8 +76,8 @@ class ToldFilter(AbstractFilter):
     earlier laws.
 
     It hears z and, where there are `flags`, the number of the flag after it; the likelihood is that of z given these.
-    What is lost for reasons that the channel does not know must not depend on the modes. Moments are kept about the
-    origin: a state whose mean is beyond 1e5 of its deviations loses the digits that tell them apart.
+    What is lost for reasons that the channel does not know must not depend on the modes. Moments are those of x - E[x],
+    and the error has its own: neither a mean far from zero nor a precise measurement costs digits.
 
     Source: the filter of Costa (1994) with moments conditional on what is told.
     """
@@ -88,28 +96,33 @@ class ToldFilter(AbstractFilter):
     def init(self) -> ToldBelief:
         """The prior, independent of the mode."""
         start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        x, spread = jnp.append(jnp.asarray(start.initial_mean), 1.0), padded(jnp.asarray(start.initial_covariance))
-        s = jnp.kron(law, x)
-        r = jnp.concatenate([x, s])
-        square = jnp.outer(r, r).at[: len(x), : len(x)].add(spread)
-        covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), jnp.outer(x, x))
-        return ToldBelief(s, covariance, law[:, None, None] * square, jnp.asarray(False))
+        square = padded(jnp.asarray(start.initial_covariance)).at[-1, -1].set(1.0)
+        one = jnp.zeros(len(square)).at[-1].set(1.0)
+        expected = jnp.kron(law, one)
+        known = jnp.outer(expected, one)  # s = known x~
+        r = _stacked(jnp.eye(len(square)), known, _own(len(law), len(square)) - known)
+        moments = law[:, None, None] * (r @ square @ r.swapaxes(1, 2))
+        return ToldBelief(jnp.asarray(start.initial_mean), expected, moments, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ToldBelief, u: ArrayLike = (), k: Step = 0) -> ToldBelief:
-        """r moves by the plant and by s- = F s, the mode by the chain."""
+        """s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
-        move, noise = move_matrix(plant, jnp.asarray(u))
+        shifted, noise = move_matrix(plant, jnp.asarray(u))
+        centre = shifted[:-1] @ jnp.append(state.centre, 1.0)
+        move = shifted.at[:-1, -1].set(0.0)
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
-        step = jnp.kron(rows.T, move)
-        whole = jax.scipy.linalg.block_diag(move, step)
-        law = state.moments[:, size - 1, size - 1]
-        carried = whole @ state.moments @ whole.T
-        carried = carried.at[:, :size, :size].add(law[:, None, None] * noise)
-        moments = jnp.einsum("ij,iab->jab", rows, carried)
-        covariance = blocks(moments[:, :size, :size]) - jnp.sum(moments, axis=0)[size:, size:]  # E[zeta s'] = E[s s']
-        return ToldBelief(step @ state.mean, symmetrize(covariance), moments, jnp.asarray(True))
+        step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
+        whole = jax.scipy.linalg.block_diag(move, step, step)
+        chosen = jnp.einsum("ijl,ab->ijlab", jnp.eye(modes) - rows[:, None], jnp.eye(size))
+        change = jnp.broadcast_to(jnp.eye(len(whole)), (modes, modes, *whole.shape))
+        change = change.at[:, :, -len(step) :, :size].set(chosen.reshape(modes, modes, -1, size))
+        carried = change @ (whole @ state.moments @ whole.T)[:, None] @ change.swapaxes(2, 3)
+        fresh = _stacked(jnp.eye(size), jnp.zeros((len(step), size)), _own(modes, size))
+        moments = jnp.einsum("ij,ijab->jab", rows, carried)
+        moments = moments + (law @ rows)[:, None, None] * (fresh @ noise @ fresh.swapaxes(1, 2))
+        return ToldBelief(centre, step @ state.mean, moments, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ToldBelief, z: ArrayLike, k: Step = 0) -> tuple[ToldBelief, Innovation]:
@@ -124,7 +137,7 @@ class ToldFilter(AbstractFilter):
         size = len(self.states) + 1
         total = weight @ state.moments[:, size - 1, size - 1]
         moments = weight[:, None, None] * state.moments / total
-        prior = _projected(state.mean, moments, state.moved, size)
+        prior = _projected(state._replace(moments=moments), size)
         after, value, covariance = _used(
             prior, sensor, jnp.asarray(told.mean)[:, kind], jnp.asarray(told.spread)[:, kind], z, there
         )
@@ -137,44 +150,56 @@ class ToldFilter(AbstractFilter):
 
     @in_float64
     def estimate(self, state: ToldBelief) -> Estimate:
-        """x = sum_j zeta^j."""
-        n = len(self.states)
-        want = np.tile(np.eye(n, n + 1), (1, len(self.initial)))
-        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+        """x - c = sum_j zeta^j."""
+        want = sum_of_modes(len(self.states), len(self.initial))
+        return Estimate(state.centre + want @ state.mean, want @ state.covariance @ want.T, self.claim)
 
 
-def _projected(s: jax.Array, moments: jax.Array, moved: jax.Array, size: int) -> ToldBelief:
-    """The best s in (1, s) under these moments: G B^+ (1, s), G = E[zeta (1, s)'], B = E[(1, s)(1, s)']."""
-    modes = len(moments)
-    both = jnp.sum(moments, axis=0)[size - 1 :, size - 1 :]
-    cross = moments[:, :size, size - 1 :].reshape(modes * size, -1)
-    gain = pseudo_solve(both, cross.T).T
-    change = jnp.eye(moments.shape[-1]).at[size:, size - 1 :].set(gain).at[size:, : size - 1].set(0.0)
-    covariance = symmetrize(blocks(moments[:, :size, :size]) - gain @ cross.T)
-    after = change @ moments @ change.T
-    return ToldBelief(gain @ jnp.append(1.0, s), covariance, after, moved)
+def _own(modes: int, size: int) -> jax.Array:
+    """zeta = 1_i x x~ in mode i, as matrices (M, M (n + 1), n + 1)."""
+    return jnp.einsum("il,ab->ilab", jnp.eye(modes), jnp.eye(size)).reshape(modes, modes * size, size)
+
+
+def _stacked(x: jax.Array, s: jax.Array, e: jax.Array) -> jax.Array:
+    """r = (x~, s, e) as a matrix for each mode, where x~ and s are the same in all."""
+    both = jnp.concatenate([x, s])
+    return jnp.concatenate([jnp.broadcast_to(both, (len(e), *both.shape)), e], axis=1)
+
+
+def _projected(state: ToldBelief, size: int) -> ToldBelief:
+    """The best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
+    count, total = len(state.mean), jnp.sum(state.moments, axis=0)
+    known = slice(size - 1, size + count)
+    change = pseudo_solve(total[known, known], total[known, -count:]).T
+    turn = jnp.eye(len(total)).at[size:-count, known].add(change).at[-count:, known].add(-change)
+    moments = turn @ state.moments @ turn.T
+    return state._replace(mean=state.mean + change @ jnp.append(1.0, state.mean), moments=moments)
 
 
 def _used(
     state: ToldBelief, sensor: LinearSensor, mean: jax.Array, spread: jax.Array, z: jax.Array, there: jax.Array
 ) -> tuple[ToldBelief, jax.Array, jax.Array]:
-    """The update with what arrived; what was not expected, and its covariance."""
+    """The update with what arrived, e+ = (I - K H) e - K noise; what was not expected, and its covariance."""
     measure, noise = measure_matrix(sensor)
+    measure = measure.at[:-1, -1].add(measure[:-1, :-1] @ state.centre)
     size = measure.shape[1]
     law = state.moments[:, size - 1, size - 1]
-    output = mean @ measure
     second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
     added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
+    output = mean @ measure
+    common = law @ output[:, :, -1] / jnp.sum(law)  # the modes sum to 1: what is sent in all tells nothing of them
+    output = jnp.where(law[:, None, None] > 0, output.at[:, :, -1].add(-common), 0.0)
     joined = jnp.concatenate(list(output), axis=1)
-    cross, value = joined @ state.covariance, z - joined @ state.mean
+    prior = state.covariance
+    cross, value = joined @ prior, z - common - joined @ state.mean
     total = cross @ joined.T + jnp.sum(added, axis=0)
     seen = jnp.where(there[:, None] & there, total, 0.0) + absent(there)
-    gain, covariance = gain_and_bound(state.covariance, jnp.where(there[:, None], cross, 0.0), seen)
-    change = jnp.tile(jnp.eye(state.moments.shape[-1]), (len(law), 1, 1))
-    change = change.at[:, size:, :size].add(gain @ output).at[:, size:, size:].add(-gain @ joined)
-    moments = change @ state.moments @ change.swapaxes(1, 2)
-    moments = moments.at[:, size:, size:].add(gain @ added @ gain.T)
-    after = ToldBelief(state.mean + gain @ jnp.where(there, value, 0.0), covariance, moments, state.moved)
+    gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
+    both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
+    change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ joined)
+    moments = change @ state.moments @ change.T
+    moments = moments.at[:, size:, size:].add(both @ added @ both.T)
+    after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
     return after, value, total
 
 
