@@ -62,6 +62,14 @@ def test_a_state_far_from_zero_keeps_its_digits():
     np.testing.assert_allclose(found[:, 0] - 1e8, expected[:, 0], atol=1e-6)  # of 1e8, with rounding of 1e-8 a step
 
 
+def test_a_state_that_is_known_stays_known():
+    """Far from zero, growing, heard with gains that the mode decides: nothing is left to find out, to the last bit."""
+    plant = hg.LinearPlant([[-1.1468]], 0.0, [42.1271], 0.0)
+    found = claims(told_filter(plant, hg.LinearSensor([[1e5]], 1e-12), LOSSY), Z)
+    np.testing.assert_array_equal(found[:, 1], 0.0)
+    np.testing.assert_allclose(found[:, 0], 42.1271 * (-1.1468) ** np.arange(1, 9), rtol=1e-14)
+
+
 @pytest.mark.parametrize("noise", [1e-8, 1e-14, 1e-20])
 def test_a_precise_measurement_leaves_a_variance_that_is_right(noise):
     """Of x heard in noise far below its own: the variance is the noise's, where a difference would be rounding."""
