@@ -77,7 +77,8 @@ class ToldFilter(AbstractFilter):
 
     It hears z and, where there are `flags`, the number of the flag after it; the likelihood is that of z given these.
     What is lost for reasons that the channel does not know must not depend on the modes. Moments are those of x - E[x],
-    and the error has its own: neither a mean far from zero nor a precise measurement costs digits.
+    and the error has its own: a mean far from zero costs no digits, and with one mode no precise measurement does. With
+    several, x is the sum of its parts in each: a variance below 1e-15 of the state's own is rounding, of either sign.
 
     Source: the filter of Costa (1994) with moments conditional on what is told.
     """
