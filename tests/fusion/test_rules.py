@@ -267,3 +267,29 @@ def test_a_claim_through_a_quantizer():
 def test_bad_fusions(call, message):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+RULES_THAT_INTERSECT = [
+    hg.fusion.EqualIntersection(),
+    hg.CovarianceIntersection(),
+    hg.fusion.FixedIntersection([0.25, 0.75]),
+    hg.fusion.InverseCovarianceIntersection(),
+]
+
+
+@pytest.mark.parametrize("rule", RULES_THAT_INTERSECT, ids=lambda rule: type(rule).__name__)
+def test_how_far_the_means_are_from_zero_makes_no_difference(rule):
+    """Millions of deviations off, with components that nearly determine each other: P^-1 x has lost eight digits of x.
+
+    All numbers are multiples of 2^-20, so that only the last sum rounds: by 2^22 units of 2.2e-16, 1e-9.
+    """
+    near = 1 - 2.0**-26
+    covariances = np.array([[[1.0, near], [near, 1.0]], [[2.0, 0.5], [0.5, 1.0]]])
+    means, far = np.array([[0.25, 0.25 + 2.0**-14], [-0.5, 0.125]]), np.array([2.0**22, -(2.0**21)])
+
+    def fused(shift):
+        return hg.fusion.fuse(
+            rule, [hg.model.Estimate(m + shift, p, "exact") for m, p in zip(means, covariances, strict=True)]
+        )
+
+    assert np.allclose(fused(far).mean - far, fused(0.0).mean, rtol=0, atol=2e-9)

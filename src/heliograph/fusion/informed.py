@@ -83,7 +83,9 @@ class AbstractWeights(AbstractInformedFusion):
             unbiased = jnp.concatenate([unbiased, found.mean[None]])
             joint = with_mean(found)
         chosen = self.weights(joint)
-        return state, (jnp.einsum("aib,ib->a", chosen, unbiased), weighted(chosen, joint))
+        # W sums to I: of differences, since digits that W lacks would count against the size of the means.
+        mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
+        return state, (mean, weighted(chosen, joint))
 
 
 def with_mean(errors: Errors) -> Joint:

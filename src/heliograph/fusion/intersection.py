@@ -36,11 +36,14 @@ def intersect(
     information: Float[jax.Array, "count n n *#runs"],
     weights: Float[jax.Array, "count *#runs"],
 ) -> tuple[Float[jax.Array, "n *#runs"], Float[jax.Array, "n n *#runs"]]:
-    """(sum w J)^-1 sum w J x and (sum w J)^-1, from information matrices J."""
-    count = means.shape[0]
+    """x_0 + (sum w J)^-1 sum w J (x - x_0) and (sum w J)^-1, from information matrices J.
+
+    Differences of the means, since what multiplies them has lost the digits that nearly dependent components cost: the
+    means themselves may be millions of deviations from zero.
+    """
     covariance = inverse(_weighted(weights, information))
-    vector = add([weights[k] * times_vector(information[k], means[k]) for k in range(count)])
-    return times_vector(covariance, vector), covariance
+    off = add([w * times_vector(j, x - means[0]) for w, j, x in zip(weights, information, means, strict=True)])
+    return means[0] + times_vector(covariance, off), covariance
 
 
 @runs_last
@@ -174,7 +177,8 @@ def intersect_inversely(
     w = (low + high) / 2
     information, common = fused_information(w)
     covariance = inverse(information)
-    mean = covariance @ ((p_information - w * common) @ a + (q_information - (1 - w) * common) @ b)
+    # The two factors sum to the fused information: of differences, as above.
+    mean = a + covariance @ ((q_information - (1 - w) * common) @ (b - a))
     return mean, without_known(symmetric(covariance), both)
 
 
