@@ -69,33 +69,35 @@ def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
         case GaussianFilter():
             return replace(
                 item,
-                plant=_plant(item.plant, units),
-                sensor=_sensor(item.sensor, units),
+                plant=rescaled_plant(item.plant, units),
+                sensor=rescaled_sensor(item.sensor, units),
                 channel=_channel(item.channel, units),
                 initial_mean=s * item.initial_mean,
                 initial_covariance=np.outer(s, s) * item.initial_covariance,
             )
         case LinearFilter():
-            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
             return replace(item, plant=plant, sensor=sensor, channel=_channel(item.channel, units))
         case OpenLoop():
             return replace(
                 item,
-                plant=_plant(item.plant, units),
+                plant=rescaled_plant(item.plant, units),
                 initial_mean=s * item.initial_mean,
                 initial_covariance=np.outer(s, s) * item.initial_covariance,
             )
         case MixtureFilter():
-            return replace(item, plant=_plant(item.plant, units), components=_components(item.components, units))
+            return replace(
+                item, plant=rescaled_plant(item.plant, units), components=_components(item.components, units)
+            )
         case PolynomialFilter(inner=LinearSystemFilter()):
             assert isinstance(item.inner, LinearSystemFilter)
             inner = _system(item.inner, item.degree, units)
             return PolynomialFilter(inner, item.degree, item.endless, _centre(item.centre, units))
         case ModalFilter() | UncertainModalFilter():
-            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
             return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
         case ToldFilter(flagged=False) | MultipleModelFilter():
-            plant, sensor = _plant(item.plant, units), _sensor(item.sensor, units)
+            plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
             return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
         case PredictionFilter():
             return PredictionFilter(_gaussian(rescaled(item.base, units)))
@@ -127,9 +129,10 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
     return Shaped(np.diag(factors), law)
 
 
-def _plant(item: AnyPlant, units: Units) -> AnyPlant:
+def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
+    """The plant of S x, given U u."""
     if isinstance(item, OverTime):
-        return over_time([_plant(one, units) for one in unstack(item)])
+        return over_time([rescaled_plant(one, units) for one in unstack(item)])
     s, u = units.states, units.inputs
     law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
     center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
@@ -143,9 +146,10 @@ def _plant(item: AnyPlant, units: Units) -> AnyPlant:
     return Plant(InUnits(item.transition, s, (s, u)), noise, center, law, **names)
 
 
-def _sensor(item: AnySensor, units: Units) -> AnySensor:
+def rescaled_sensor(item: AnySensor, units: Units) -> AnySensor:
+    """The sensor that measures R y of S x."""
     if isinstance(item, OverTime):
-        return over_time([_sensor(one, units) for one in unstack(item)])
+        return over_time([rescaled_sensor(one, units) for one in unstack(item)])
     s, r = units.states, units.outputs
     if isinstance(item, LinearSensor):
         return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs, item.circular)

@@ -11,8 +11,9 @@ from heliograph.filters.prediction import PredictionFilter
 from heliograph.filters.sequential import SequentialFilter
 from heliograph.fusion.informed import ScalarWeights
 from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
+from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
-from heliograph.model.over_time import first
+from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
@@ -23,7 +24,7 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
 from heliograph.simulation.simulate import monte_carlo
-from heliograph.testing.rescaling import Units, rescaled, rescaled_channel
+from heliograph.testing.rescaling import Units, rescaled, rescaled_channel, rescaled_plant, rescaled_sensor
 
 DECADES = 9  # factors from 1e-9 to 1e9
 DIGITS = 1e-8  # of each component's own scale
@@ -103,7 +104,7 @@ def _compared(
 ) -> float:
     nodes = {name: _node(name, node, units[name]) for name, node in _nodes(network).items()}
     fused = {name: _fused(name, item, units[FUSED]) for name, item in network.fused.items()}
-    scaled = Network(network.plant, nodes, fused)
+    scaled = Network(rescaled_plant(network.plant, units[FUSED]), nodes, fused)
     shared = units[FUSED].inputs
     found = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
     worst = 0.0
@@ -145,7 +146,15 @@ def _node(name: str, node: Node, units: Units) -> Node:
         turned = Series([known(np.diag(1 / units.outputs)), part, known(np.diag(units.received))])
         off = _apart(rescaled_channel(second_order(part), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
-    return Node(node.sensor, node.channel, {f: rescaled(item, units) for f, item in node.filters.items()})
+    filters = {f: rescaled(item, units) for f, item in node.filters.items()}
+    return Node(rescaled_sensor(node.sensor, units), _between(node.channel, units), filters)
+
+
+def _between(channel: Channel, units: Units) -> Channel:
+    """The channel that has Q z where this one, given y, has z, and that one R y."""
+    if isinstance(channel, OverTime):
+        return over_time([_between(one, units) for one in unstack(channel)])
+    return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 
 def _apart(a: SecondOrder, b: SecondOrder) -> float:
