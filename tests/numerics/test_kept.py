@@ -64,3 +64,12 @@ def test_what_cannot_be_kept_is_refused_in_its_own_words() -> None:
     for item in (3, "text", None, Holder(1.0)):
         with pytest.raises(ValueError, match="no"):
             refusing(item)
+
+
+def test_it_is_called_as_the_function_is() -> None:
+    one = Holder(2.0)
+    assert Holder.power(self=one, order=2) is one.power(2)
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'item'"):
+        refusing()
+    with pytest.raises(ValueError, match="no"):
+        refusing(item=one)

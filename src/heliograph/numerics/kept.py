@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Hashable
 from functools import wraps
+from inspect import signature
 from typing import Any, Concatenate, ParamSpec, TypeVar, cast
 from weakref import ref
 
@@ -23,8 +24,13 @@ def kept(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P]
     """
     found: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
 
+    first = next(iter(signature(function).parameters))
+
     @wraps(function)
-    def known(item: S, *rest: P.args, **named: P.kwargs) -> T:
+    def known(*given: Any, **named: Any) -> T:
+        if not given and first not in named:
+            return function(*given, **named)  # which says what is missing
+        item, rest = (given[0], given[1:]) if given else (named.pop(first), ())
         place, asked = id(item), (rest, tuple(named.items()))
         answers = found[place][1] if place in found else {}
         if asked in answers:
