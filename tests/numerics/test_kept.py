@@ -68,7 +68,7 @@ def test_what_cannot_be_kept_is_refused_in_its_own_words() -> None:
 
 def test_it_is_called_as_the_function_is() -> None:
     one = Holder(2.0)
-    assert Holder.power(self=one, order=2) is one.power(2)
+    assert Holder.power(self=one, order=2) is one.power(order=2)
     with pytest.raises(TypeError, match="missing 1 required positional argument: 'item'"):
         refusing()
     with pytest.raises(ValueError, match="no"):
