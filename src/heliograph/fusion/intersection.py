@@ -192,9 +192,9 @@ def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]
 def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count n n"]:
     """P_k^-1 of several covariances of one state; what an estimate knows exactly is taken as known to KNOWN.
 
-    A component that those before it determine has KNOWN of its own variance in place of none, and one that is known by
-    itself KNOWN of the largest variance that any of the estimates has for it (1 where all know it): the limit, to
-    KNOWN of each component's own scale.
+    A component of which those before it leave less than KNOWN of its own variance has KNOWN of it more, and one that is
+    known by itself KNOWN of the largest variance that any of the estimates has for it (1 where all know it): the limit,
+    to KNOWN of each component's own scale, and never less.
     """
     own = jnp.diagonal(matrices, axis1=1, axis2=2)
     largest = jnp.max(own, axis=0)
@@ -204,8 +204,8 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
 
 @runs_last
 def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
-    _, scales = factor(a)
-    none = jnp.stack([jnp.where(s == 0, 1.0, 0.0) for s in scales])
+    _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
+    none = jnp.stack([jnp.where((s == 0) | (s**2 * one > 1), 1.0, 0.0) for s, one in zip(scales, least, strict=True)])
     return inverse(a + diagonal(none * least))
 
 
