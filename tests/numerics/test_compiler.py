@@ -15,7 +15,5 @@ def test_who_asks_for_next_to_no_optimisation_gets_it(least):
         options = understood.__wrapped__()
     finally:
         jax.config.update("jax_disable_most_optimizations", before)
-    if not options:
-        pytest.skip("this release of the compiler has other options")
-    assert (LEVEL in options) is not least
-    assert set(OPTIONS) - set(options) <= {LEVEL}
+    wanted = {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL)}
+    assert options in (wanted, {})  # none where this release of the compiler has others

@@ -31,7 +31,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of a job: a description if it was asked for, or an error in one line with its traceback.
+    """What came of a job: the description of a job without a chunk, or an error in one line with its traceback.
 
     late: it was given up, since it took longer than the campaign allows.
     """

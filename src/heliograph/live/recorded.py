@@ -18,7 +18,7 @@ from heliograph.simulation.record import Record
 class Played:
     """Final estimates after each row, those of the same moments given what came a lag later, and the verdicts.
 
-    `lagged` has each moment at which a node was heard by then, once; None where no lag was asked for.
+    `lagged` has each moment at which a node was heard by then, once; None without a lag.
     """
 
     final: Record

@@ -49,7 +49,7 @@ class Trial:
 class Outcome:
     """All that the demonstration found: one trial for each seed, the first of them shown in full.
 
-    learned: the constants learned from the ranges alone, where that was asked for.
+    learned: the constants learned from the ranges alone; None where nothing was learned.
     """
 
     recording: PlazaRecording

@@ -72,7 +72,7 @@ def relay_traces() -> dict[int, dict[str, float]]:
 
 def measured(record: hg.Record) -> dict[str, dict[str, float]]:
     """Error of filter and smoother over the runs, and NEES, which is 1 if the claim is exact."""
-    assert record.smoothed is not None  # it was asked for
+    assert record.smoothed is not None  # by `smooth=` above
     result = {}
     for name, part in {"filter": record, "smoother": record.smoothed}.items():
         found = hg.simulation.error_statistics(part, "node", "linear")
@@ -87,7 +87,7 @@ def swung(name: str, seed: int) -> tuple[dict[str, float], bool]:
         warnings.simplefilter("always")
         network = setting.pendulum(name)
         found = hg.monte_carlo(network, setting.STEPS, RUNS, seed, keep=hg.Statistics(), smooth=INTERVAL)
-    assert found.smoothed is not None  # it was asked for
+    assert found.smoothed is not None  # by `smooth=` above
     result = {}
     for which, part in {"filter": found, "smoother": found.smoothed}.items():
         one = part["node"]["extended"]
