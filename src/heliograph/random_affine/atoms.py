@@ -9,8 +9,9 @@ from numpy.typing import ArrayLike
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.kept import kept
 from heliograph.numerics.traced import library, placed, stacked
-from heliograph.random_affine.base import AbstractRandomAffine, Moments
+from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.law import AbstractLaw, Constant
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.monomials import (
     count,
     degrees,

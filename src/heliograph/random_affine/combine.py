@@ -16,8 +16,9 @@ from heliograph.numerics.check import fail
 from heliograph.numerics.kept import kept
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.monomials import (
     count,
     exponents,

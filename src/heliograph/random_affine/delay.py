@@ -9,11 +9,12 @@ from jaxtyping import PyTree
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.random_affine.atoms import GainAndNoise, known
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
+from heliograph.random_affine.moments import Moments
 
 Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain whose mode is the number of steps
 T = TypeVar("T")

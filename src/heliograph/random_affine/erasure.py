@@ -7,7 +7,8 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail, scalar
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps
+from heliograph.random_affine.moments import Moments
 
 
 class Erasure(AbstractRandomAffine):

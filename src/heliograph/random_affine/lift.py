@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.monomials import (
     count,
     exponents,

@@ -11,10 +11,11 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import add, contract, diagonal
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
-from heliograph.random_affine.base import AbstractRandomAffine, Moments, as_maps, check_forgets
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.interval import CORNERS, moment_interval
 from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.monomials import product_table
 
 PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
