@@ -41,9 +41,10 @@ def pytest_unconfigure(config):
 
 
 def pytest_collection_finish():
-    """What is imported stays: the collector need not look at it again and again while JAX traces."""
+    """What is imported stays: the collector need not look at it again and again while JAX traces, nor at each trace."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 100)
 
 
 @pytest.fixture(scope="module", autouse=True)
