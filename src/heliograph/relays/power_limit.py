@@ -92,10 +92,10 @@ def best_within(
     found = [own, _inside(problem, own)]
     for barrier in BARRIERS / len(own):
         gains = found[-1]
-        units = _units(problem, gains, barrier)
+        units = np.asarray(_units(problem, gains, barrier))
         function = partial(_descended, problem, gains, units, barrier)
         x = lbfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION)
-        found.append(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps))
+        found.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
     judged = [_judge(problem, gains) for gains in found]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
@@ -173,13 +173,13 @@ def _units(problem: Limited, gains: Float[Array, "time Fn R"], barrier: float) -
     steps, start, cost, (form, limit) = problem
     moments = jnp.asarray(propagate(steps, start, gains).moments)
     slack = limit - jnp.sum(form * moments[1:], axis=(1, 2))
-    slope = cost + (barrier / slack)[:, None, None] * form
+    slope = jnp.asarray(cost) + (barrier / slack)[:, None, None] * form
 
     def back(ahead: jax.Array, item: tuple[Steps, jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         p, gain, before, slope_k = item
         ahead = ahead + slope_k
         normal, _ = normal_matrix(step_moments(p, before)[0], ahead, p, DAMPING)
-        free = p.live[np.nonzero(gain_mask(p))[1]]
+        free = jnp.asarray(p.live)[np.nonzero(gain_mask(p))[1]]
         unit = jax.scipy.linalg.solve_triangular(jnp.linalg.cholesky(normal).T, jnp.diag(free))
         return pull_back(p, gain, ahead), free[:, None] * unit
 

@@ -67,7 +67,9 @@ def receiver_error_design(
     return given_design(network, split_gains(network, np.asarray(gains)))
 
 
-def _backward(steps: Steps, start: Array, cost: Float[Array, "time d d"], gains: Array) -> Float[jax.Array, "time d d"]:
+def _backward(
+    steps: Steps, start: Array, cost: Float[Array, "time d d"], gains: jax.Array
+) -> Float[jax.Array, "time d d"]:
     """Gradient of the cost with respect to the moments after each step, gains improved."""
 
     def ahead_of(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, jax.Array]:
@@ -85,17 +87,19 @@ def _backward(steps: Steps, start: Array, cost: Float[Array, "time d d"], gains:
     return jax.lax.scan(back, jnp.zeros_like(start), items, reverse=True)[1]
 
 
-def _forward(steps: Steps, start: Array, gains: Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _forward(steps: Steps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Best gains step by step and the moments after each step."""
 
-    def one(moments: jax.Array, item: tuple[Steps, jax.Array, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def one(
+        moments: jax.Array, item: tuple[Steps, jax.Array, jax.Array]
+    ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         p, gain, ahead_k = item
         z, _ = step_moments(p, moments)
         gain = best_gain(z, ahead_k, gain, p)
         after = correct(z, gain)
         return after, (gain, after)
 
-    return jax.lax.scan(one, jnp.asarray(start), (steps, jnp.asarray(gains), ahead))[1]
+    return jax.lax.scan(one, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
 class Search(NamedTuple):

@@ -23,7 +23,7 @@ def normal_matrix(
     rows, columns = np.nonzero(gain_mask(p))
     n, d = p.transition.shape[-1], ahead.shape[0]
     free = jnp.asarray(p.live)[columns]
-    normal = ahead[n:, n:][np.ix_(rows, rows)] * z[d:, d:][np.ix_(columns, columns)]
+    normal = jnp.asarray(ahead)[n:, n:][np.ix_(rows, rows)] * z[d:, d:][np.ix_(columns, columns)]
     normal = normal * free[:, None] * free
     trace = jnp.trace(normal)
     added = jnp.where(trace > 0, damping * trace / len(rows), 1.0)  # 1 where nothing hangs on any gain
