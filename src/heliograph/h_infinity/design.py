@@ -71,9 +71,9 @@ def recursive_design(
 
     Each inequality leaves P_s+1 = L^-1 free, and the choice decides whether later steps can be solved: `objective` is
     "trace" (smallest tr L; as the next, in coordinates of order one where no growth makes lengths comparable),
-    "largest_eigenvalue" (of L), "log_determinant" (largest log det P) or "none" (whatever the solver finds first: it
-    often ends in a dead end). `initial` is P_0, or None for the largest allowed, level^2 W. `separate` multipliers are
-    less conservative. `search`: look for the smallest level if this one fails.
+    "largest_eigenvalue" (of L, and among those the smallest tr L), "log_determinant" (largest log det P) or "none"
+    (whatever the solver finds first: it often ends in a dead end). `initial` is P_0, or None for the largest allowed,
+    level^2 W. `separate` multipliers are less conservative. `search`: look for the smallest level if this one fails.
 
     Raises:
         ValueError: a level that is not positive, an unknown objective or solver, an initial weight of the wrong shape.

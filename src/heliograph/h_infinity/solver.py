@@ -21,11 +21,12 @@ from heliograph.numerics.extras import how_to_install
 from heliograph.numerics.types import Float
 
 if TYPE_CHECKING:
-    from cvxpy import Constraint, Expression, Maximize, Minimize, Problem
+    from cvxpy import Constraint, Expression, Maximize, Minimize, Parameter, Problem
 
 MARGIN = 1e-7  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
 Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
 Solver = Literal["clarabel", "scs"]
+TIE = 1e-6  # relative, of a largest eigenvalue that counts as the smallest one
 SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
 
@@ -71,9 +72,13 @@ class StepProblem:
     """One step's inequality, compiled once: find P+, gain and multipliers for a given P, at level 1.
 
     Everything is divided by the level squared before it comes here, so that the level does not matter to the solver.
-    The objective picks one of the feasible P+ = L^-1: "trace" the smallest tr L, "largest_eigenvalue" that of L,
-    "log_determinant" the largest log det P+, "none" any. `sizes`: those of x and e where S1 and S2 are numbers, so that
-    the first two are of L in the system's own units. `start`: a weight before the step that is not diag(P1, P2).
+    The objective picks one of the feasible P+ = L^-1: "trace" the smallest tr L, "largest_eigenvalue" that of L and
+    among those the smallest tr L, "log_determinant" the largest log det P+, "none" any. `sizes`: those of x and e where
+    S1 and S2 are numbers, so that the first two are of L in the system's own units. `start`: a weight before the step
+    that is not diag(P1, P2).
+
+    A later step needs P+ as large as can be. Trace and determinant leave nothing smaller than another feasible P+; the
+    largest eigenvalue alone leaves all the others open, and what a solver makes of them may end far above.
     """
 
     def __init__(
@@ -98,33 +103,42 @@ class StepProblem:
             k = int(np.sqrt(len(form)))
             constraints.append(cp.reshape(form @ self.unknowns, (k, k), order="C") >> MARGIN * np.eye(k))
         weight = cp.reshape(forms.weight @ self.unknowns, (2 * n, 2 * n), order="C")
-        goal, more = _goal(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes)
-        self.problem = cp.Problem(goal, constraints + more)
+        self.reached = cp.Parameter()
+        goals = _goals(cp, objective, [weight[:n, :n], weight[n:, n:]], sizes, self.reached)
+        self.problems = [cp.Problem(goal, constraints + more) for goal, more in goals]
 
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
         """The status, and a solution if there is one; fixed = S - diag(P, 0) at level 1."""
         self.fixed.value = fixed
-        status = run_solver(self.problem, self.solver)
-        if not status.startswith("optimal") or self.unknowns.value is None:
-            return status, None
+        for problem in self.problems:
+            status = run_solver(problem, self.solver)
+            if not status.startswith("optimal") or self.unknowns.value is None:
+                return status, None
+            self.reached.value = (1 - TIE) * float(problem.value)
         return status, self.layout.unpack(np.asarray(self.unknowns.value))
 
 
-def _goal(
-    cp: ModuleType, objective: Objective, weights: list["Expression"], sizes: tuple[float, float]
-) -> tuple["Minimize | Maximize", list["Constraint"]]:
-    """The objective on L = P+^-1 and the constraints that express it."""
+def _goals(
+    cp: ModuleType,
+    objective: Objective,
+    weights: list["Expression"],
+    sizes: tuple[float, float],
+    reached: "Parameter",
+) -> list[tuple["Minimize | Maximize", list["Constraint"]]]:
+    """Objectives on L = P+^-1, one after another, and the constraints that express each; `reached`: the one before."""
     if objective == "none":
-        return cp.Minimize(0), []
+        return [(cp.Minimize(0), [])]
     if objective == "log_determinant":
-        return cp.Maximize(sum(cp.log_det(w) for w in weights)), []
+        return [(cp.Maximize(sum(cp.log_det(w) for w in weights)), [])]
     eye = np.eye(weights[0].shape[0])
-    if objective == "largest_eigenvalue":
-        smallest = cp.Variable()
-        return cp.Maximize(smallest), [w >> smallest * s**2 * eye for w, s in zip(weights, sizes, strict=True)]
     inverses = [cp.Variable(w.shape, symmetric=True) for w in weights]
     above = [cp.bmat([[inverse, eye], [eye, w]]) >> 0 for inverse, w in zip(inverses, weights, strict=True)]
-    return cp.Minimize(sum(s**2 * cp.trace(inverse) for inverse, s in zip(inverses, sizes, strict=True))), above
+    trace = cp.Minimize(sum(s**2 * cp.trace(inverse) for inverse, s in zip(inverses, sizes, strict=True)))
+    if objective == "trace":
+        return [(trace, above)]
+    smallest = cp.Variable()
+    within = [w >> smallest * s**2 * eye for w, s in zip(weights, sizes, strict=True)]
+    return [(cp.Maximize(smallest), within), (trace, [*above, *within, smallest >= reached])]
 
 
 class HorizonProblem:

@@ -1,5 +1,6 @@
-"""A small minimiser: BFGS with backtracking, for smooth functions of tens of variables that may be infinite."""
+"""Small minimisers: BFGS with backtracking, for smooth functions that may be infinite, with few variables or many."""
 
+from collections import deque
 from collections.abc import Callable
 
 import numpy as np
@@ -12,6 +13,7 @@ DECREASE = 1e-4  # Armijo: least part of the predicted decrease that a step must
 SHORTEN = 0.3
 SHORTEST = 1e-14
 PATIENCE = 5  # steps in a row that gain nothing
+MEMORY = 30  # updates that stand for the inverse Hessian of many variables
 
 
 def bfgs(
@@ -40,6 +42,46 @@ def bfgs(
         if idle >= PATIENCE or not np.any(gradient):
             break
     return x
+
+
+def lbfgs(
+    function: Function, start: Float[np.ndarray, "n"], iterations: int, tolerance: float
+) -> Float[np.ndarray, "n"]:
+    """As `bfgs`, for thousands of variables of like scale: of the inverse Hessian the last MEMORY updates are kept."""
+    x = np.asarray(start, dtype=np.float64)
+    value, gradient = function(x)
+    updates: deque[tuple[np.ndarray, np.ndarray]] = deque(maxlen=MEMORY)
+    idle = 0
+    for _ in range(iterations):
+        direction = -_inverse_times(updates, gradient)
+        taken = _backtrack(function, x, value, direction, float(direction @ gradient))
+        if taken is None:
+            break
+        step, new_value, new_gradient = taken
+        change = new_gradient - gradient
+        if step @ change > 1e-12 * np.linalg.norm(step) * np.linalg.norm(change):
+            updates.append((step, change))
+        idle = idle + 1 if value - new_value < tolerance else 0
+        x, value, gradient = x + step, new_value, new_gradient
+        if idle >= PATIENCE or not np.any(gradient):
+            break
+    return x
+
+
+def _inverse_times(
+    updates: deque[tuple[np.ndarray, np.ndarray]], vector: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "n"]:
+    """H v of the updates (s, y), H = V'H_before V + s s'/s'y with V = I - y s'/s'y, H = I s'y/y'y before the first."""
+    v, parts = vector, []
+    for s, y in reversed(updates):
+        parts.append(float(s @ v / (s @ y)))
+        v = v - parts[-1] * y
+    if updates:
+        s, y = updates[-1]
+        v = v * float(s @ y / (y @ y))
+    for (s, y), part in zip(updates, reversed(parts), strict=True):
+        v = v + (part - float(y @ v / (s @ y))) * s
+    return v
 
 
 def _backtrack(

@@ -13,7 +13,7 @@ from heliograph.papers.successive_relays.printed import MISPRINTS, by_filter, re
 from heliograph.relays.design import GainsByFilter
 
 RUNS = 20_000
-SWEEPS = 400  # of the design at the paper's power: its multipliers settle slowly
+SWEEPS = 200  # of the design at the paper's power
 STEADY = 1500  # steps after which a recursion is taken as settled: the plant forgets by 0.98 a step
 FILTERS = ("relay_1", "relay_2", "receiver")
 
