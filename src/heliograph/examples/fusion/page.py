@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from heliograph.examples.fusion.compute import CASES, MANY, MEASURED_STEPS, RUNS, STEPS, STRONG_RUNS, Outcome
 from heliograph.examples.fusion.pictures import KINDS, LABELS
 from heliograph.report.figures import BLUE, PURPLE, VERMILION
-from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
+from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 
 
 def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
@@ -74,6 +74,7 @@ def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
                 "root.",
             ]),
         ]),
+        Section("Run it again", [Code("heliograph example fusion --out out")]),
     ]  # fmt: skip
     lead = (
         "Local filters of one plant share its noise, so their errors are correlated. Covariance intersection is safe "

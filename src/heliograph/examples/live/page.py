@@ -30,7 +30,11 @@ def live_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
         "Heliograph example",
         f"Killed {outcome.kills} times, and every final estimate is {same}",
         lead,
-        [_service(outcome, drawings), _speed(outcome)],
+        [
+            _service(outcome, drawings),
+            _speed(outcome),
+            Section("Run it again", [Code("heliograph example live --out out")]),
+        ],
     )
 
 
