@@ -59,7 +59,10 @@ def _service(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         "The mower's path with four beacons, and the true one.",
         "Final estimates, as the service told them.",
     )
-    return Section("Killed and started again", [KeyFigures(keys), Points(points), picture, Text([text]), Code(COMMAND)])
+    return Section(
+        "Killed and started again",
+        [KeyFigures(keys), Points(points), picture, Text([text, "The service was started so:"]), Code(COMMAND)],
+    )
 
 
 def _speed(outcome: Outcome) -> Section:
