@@ -1,5 +1,6 @@
 """Every Python example in the docs runs, in the order of its page; the README has a test of its own."""
 
+import importlib
 import json
 import re
 import runpy
@@ -52,24 +53,27 @@ def test_every_page_stands_in_the_contents():
     assert not missing, f"docs: no toctree has {missing}; docs/guide.md is the place for most"
 
 
-def test_speeds_are_those_that_were_measured():
-    """Each comparison has its row: ours and the other's nanoseconds, and their ratio, as in benchmarks/results.json."""
-    measured = json.loads((ROOT / "benchmarks" / "results.json").read_text())
-    page = (ROOT / "docs" / "comparisons.md").read_text()
-    for each in measured["comparisons"].values():
-        for title, peer in each["peers"].items():
-            if "absent" not in peer:
-                ours, theirs, ratio = (
-                    f"{v:,.0f}" if v >= 100 else f"{v:.1f}" for v in (each["ours"]["best"], peer["best"], peer["ratio"])
-                )
-                row = f"| {each['title']} | {ours} | {title} ({peer['how']}) | {theirs} | {ratio} |"
-                assert row in page, f"docs/comparisons.md lacks: {row}"
-    alone = measured["alone"]
-    for name, value in {
-        "a step of `hg.Stream`": f"{alone['stream']['values']['one sample, median']:.0f} µs in the median",
-        "first call": f"{alone['startup']['values']['linear filter, first process']:.1f} s for the first linear filter",
-    }.items():
-        assert value in page, f"docs/comparisons.md, {name}: expected {value}"
+@pytest.fixture
+def pages(monkeypatch):
+    """benchmarks/pages.py, imported as it is when run."""
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    return importlib.import_module("pages")
+
+
+def test_times_are_those_that_were_measured(pages):
+    """README and docs say what benchmarks/results.json does: if not, `python benchmarks/pages.py` writes them."""
+    for page, text in pages.written(json.loads(pages.RESULTS.read_text())).items():
+        assert (ROOT / page).read_text() == text, f"{page}: run python benchmarks/pages.py"
+
+
+def test_a_time_has_one_place(pages):
+    place = pages.Place("a step takes {} ns, theirs {} ns", ("57", "2,485"))
+    assert pages.with_figures("Here a step takes 1.5 ns, theirs 12,000 ns.", place) == (
+        "Here a step takes 57 ns, theirs 2,485 ns."
+    )
+    for text in ("a step takes long", "a step takes 1 ns, theirs 2 ns; a step takes 1 ns, theirs 2 ns"):
+        with pytest.raises(ValueError, match="expected once in the page"):
+            pages.with_figures(text, place)
 
 
 def test_a_source_distribution_holds_all_but_what_a_clone_needs():

@@ -25,16 +25,6 @@ DRIVEN = {
     "mean_gain": "trusts the mean gain",
     "perfect_channel": "the same ranges without a relay",
 }
-FILTERPY = {"FilterPy, a loop": "FilterPy"}
-SPEEDS = {  # how a row begins: the comparison, and how the row calls its peers
-    "a Kalman step": ("kalman", {"cuthbert, vectorised": "cuthbert"} | FILTERPY),
-    "a cubature step": (
-        "cubature",
-        {"jax.numpy.linalg, vectorised": "`jax.numpy.linalg`", "FilterPy, mean gain only": "FilterPy"},
-    ),
-    "a step of multiple models": ("modes", FILTERPY),
-    "a step of smoothing": ("smoothing", {"cuthbert, vectorised": "cuthbert", "pykalman, a loop": "pykalman"}),
-}
 
 
 def recipe(target: str) -> str:
@@ -91,6 +81,29 @@ def test_all_of_it_runs_in_order(after_make_demo):
         )
         row = f"| {title} | {error:.2f} m | {claimed:.2f} m | {shown(nees)} |"
         assert row.replace("*", "") in README.replace("*", ""), f"README lacks: {row}"
+    check_what_else_is_said_of_the_drive(found)
+
+
+def check_what_else_is_said_of_the_drive(found: dict) -> None:
+    """The README's row beside peers, the start page and the page on learning, by the same summary."""
+    aware, mean = (f"{found['position_rmse_m'][name]:.2f} m" for name in ("relay_aware", "mean_gain"))
+    row = beside_peers()["a sensor behind relays with random gains: error on the recorded drive"]
+    assert row[:2] == [f"{mean}: the mean gain, in any package", aware]
+    claimed, learned = found["claimed_rmse_m"]["mean_gain"], found["learned"]
+    gyro = learned["parameters"]["gyro_rate"]
+    said = {
+        "index.md": [f"is off by {aware};", f"by {mean}, and believes that it is {claimed:.2f} m."],
+        "fit.md": [
+            f"is off by {learned['second_half']:.3f} m;",
+            f"it is off by {learned['second_half_calibrated']:.3f} m.",
+            f"before the robot moved, {learned['gyro_rate_at_rest']:.1e} rad/s.".replace("e-0", "e-"),
+            "off by {estimate:.1e} ({low:.1e} to {high:.1e})".format(**gyro).replace("e-0", "e-"),
+            f"and {learned['gyro_rate_of_truth']:.1e}, as the true path says.".replace("e-0", "e-"),
+        ],
+    }
+    for page, sentences in said.items():
+        text = " ".join((ROOT / "docs" / page).read_text().split())
+        assert [s for s in sentences if s not in text] == [], f"docs/{page}"
 
 
 def shown(number: float) -> str:
@@ -98,19 +111,26 @@ def shown(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def test_its_speeds_are_those_that_were_measured():
-    """Each number in nanoseconds of the rows that `make bench` shows."""
-    measured = json.loads((ROOT / "benchmarks" / "results.json").read_text())
-    rows = {row.split(" | ")[0]: row for row in README.splitlines() if row.endswith("| `make bench` |")}
-    assert len(rows) == 1 + len(SPEEDS)
-    for begin, (name, peers) in SPEEDS.items():
-        (row,) = (row for title, row in rows.items() if title.startswith(f"| {begin}"))
-        found = measured["comparisons"][name]
-        assert f"| {found['ours']['best']:,.0f} ns |" in row, row
-        for peer, title in peers.items():
-            assert f"{title} {found['peers'][peer]['best']:,.0f} ns" in row, row
-    design = measured["alone"]["network_design"]["values"]["two hops, 20 sensors, 30 starts"]
-    assert f"| {design / 1000:.2f} s |" in next(row for title, row in rows.items() if "powers" in title)
+def beside_peers() -> dict[str, list[str]]:
+    """The rows of the table beside the best peers, by what they are of: others, ours, and the command."""
+    section = README.split("## Beside the best peers")[1].split("\n## ")[0]
+    rows = [row.strip("| ").split(" | ") for row in section.splitlines() if row.startswith("| ")][1:]
+    return {name: cells for name, *cells in rows}
+
+
+def test_every_row_beside_peers_names_a_command_that_there_is():
+    """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
+    rows = beside_peers()
+    assert len(rows) == 10
+    for others, ours, command in rows.values():
+        assert others and ours
+        kind, *words = shlex.split(command.strip("`"))
+        if kind == "make":
+            assert recipe(words[0])
+        elif kind == "python":
+            assert (ROOT / words[0]).exists()
+        else:
+            assert kind == "heliograph"  # its words are looked at below, with those of all others in passing
 
 
 def run(words: list[str]) -> int:

@@ -19,6 +19,7 @@ from heliograph.learning import describe
 from heliograph.model.estimate import Estimate
 from tests.widths import Widths
 
+ROOT = Path(__file__).parents[2]
 PLAZA2 = robot.DRIVES["plaza2"]
 
 
@@ -158,6 +159,9 @@ def test_constants_of_one_drive_serve_another(outcome: Outcome) -> None:
         assert 0.6 <= aware.nees_per_dimension <= 1.6
         assert mean.position_rmse_m >= 2.5 * aware.position_rmse_m
         assert mean.nees_per_dimension > 100
+    first = [found.trials[0].scores[name].position_rmse_m for name in ("relay_aware", "mean_gain")]
+    said = "{:.2f} m where the mean gain gives {:.2f} m".format(*first)
+    assert said in " ".join((ROOT / "README.md").read_text().split())
     told, known = run.summary(found), run.summary(outcome)
     assert (told["recording"], told["rows"], known["recording"]) == ("Plaza1", 9660, "Plaza2")
     assert list(told) == list(known)

@@ -1,16 +1,20 @@
 """Rows of a radio network's log, and what a filter makes of packets that come late."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from heliograph.cli import main
 from heliograph.examples.demo.recording import read_recording
 from heliograph.examples.late_data import moving
-from heliograph.examples.late_data.compute import through_moving, through_plaza
+from heliograph.examples.late_data.compute import SYNTHETIC, Outcome, through_moving, through_plaza
 from heliograph.examples.late_data.packets import Packets, statistics
+from heliograph.examples.late_data.page import late_data_figures, late_data_page
 from heliograph.examples.late_data.plaza import fates_by_node
 from heliograph.examples.late_data.synthetic import synthetic_packets
 from heliograph.examples.late_data.trace import SLOT, read_trace
+from heliograph.report.figures import svg
 
 
 def row(node, sequence, sent, received, clock="0:00:01.000000"):
@@ -109,7 +113,7 @@ def test_rewinding_is_honest_and_taking_data_as_current_is_not(monkeypatch):
     assert found.counts["used"] > 150 and found.counts["duplicate"] > 0
 
 
-def test_the_mower_through_a_network():
+def test_the_mower_through_a_network(tmp_path, fits):
     """The first 150 ranges; a network that delays nothing gives each method the same."""
     recording = read_recording().first(150)
     packets = synthetic_packets(1000.0, 0)
@@ -120,3 +124,17 @@ def test_the_mower_through_a_network():
     assert ideal.scores["rewound"] == ideal.scores["no_delay"] == ideal.scores["late_dropped"]
     assert late.scores["no_delay"] == ideal.scores["no_delay"]
     assert late.scores["used_as_current"].rmse > 2 * late.scores["rewound"].rmse
+    outcome = Outcome(None, 0, statistics(packets), late, late, lost)
+    drawings = {name: svg(figure) for name, figure in late_data_figures(outcome).items()}
+    (tmp_path / "report.html").write_text(late_data_page(outcome, drawings).html(), encoding="utf-8")
+    fits(tmp_path / "report.html")
+    titles = [section.title for section in late_data_page(outcome, drawings).sections]
+    assert titles == ["A point that moves", "A recorded drive", "The network", "How to run this again"]
+
+
+def test_the_whole_drive_is_what_readme_says():
+    """To its three digits, which another order of rounding does not reach."""
+    found, _ = through_plaza(read_recording(), synthetic_packets(SYNTHETIC, 0))
+    dropped, rewound, later = (f"{found.scores[name].rmse:.3f} m" for name in ("late_dropped", "rewound", "lag_2s"))
+    row = f"| {dropped}: late ones dropped | {rewound}; {later} two seconds later | `heliograph example late-data --out"
+    assert row in (Path(__file__).parents[2] / "README.md").read_text()

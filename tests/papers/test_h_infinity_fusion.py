@@ -31,6 +31,7 @@ from heliograph.papers.h_infinity_fusion import (
 )
 from heliograph.papers.h_infinity_fusion.statements import statements
 from heliograph.papers.statement import Sampled
+from tests.papers.readme import said_of
 from tests.papers.verdicts import both, check_verdicts
 
 RECURSIVE = example.RECURSIVE
@@ -119,6 +120,11 @@ def test_smallest_levels(nodes):
         assert node.zero_gain.level == pytest.approx(node.without_measurements, rel=3e-6)
         assert node.horizon_certificate.certified and node.failed["trace"] is None
     assert all(node.failed["none"] is not None for node in nodes)  # which step depends on the solver's version
+    published, here = said_of("h-infinity-fusion")
+    smallest = [node.horizon.level for node in nodes]
+    assert published == f"{min(setting.LEVELS):.1f} to {max(setting.LEVELS):.1f}"
+    assert here.startswith(f"{min(smallest):.4f} to {max(smallest):.4f} with the published growth constant")
+    assert here.endswith(f"Without any measurement: {nodes[0].without_measurements:.4f}")
 
 
 def test_separate_multipliers_have_a_closed_form(nodes):

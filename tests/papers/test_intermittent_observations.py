@@ -11,6 +11,7 @@ from heliograph.papers.intermittent_observations.rounding import iterate
 from heliograph.papers.intermittent_observations.run import results
 from heliograph.papers.intermittent_observations.statements import statements
 from heliograph.report.results import _write
+from tests.papers.readme import said_of
 from tests.riccati import riccati
 
 MEAN = {(0.1, 0.6): 4.3818, (0.3, 0.6): 6.1303, (0.1, 0.9): 3.6096, (0.4, 0.6): 6.8095}
@@ -84,6 +85,8 @@ def test_summary_has_the_numbers_of_each_test(numbers):
     np.testing.assert_allclose(
         [two["threshold"], two["necessary"], two["bound"], two["lower"]], [0.471074, 0.36, 703.246, 234.499], **digits
     )
+    said = f"{two['necessary']:.2g} necessary, certified from {two['threshold']:.6f} on;"
+    assert said_of("intermittent-observations")[1].startswith(said)
     np.testing.assert_allclose(
         [three["threshold"], three["bound"], three["lower"]], [0.36, 75850.75, 5165.91], **digits
     )

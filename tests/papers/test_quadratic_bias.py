@@ -1,6 +1,7 @@
 """The reproduction: its setting, its numbers and its files."""
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from heliograph.papers.quadratic_bias.run import reproduce, results
 from heliograph.papers.quadratic_bias.statements import statements
 from heliograph.papers.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
+from tests.papers.readme import README, said_of
 from tests.papers.verdicts import both, check_verdicts
 
 # Means over t = 31 ... 100 by a separate implementation (enumerated monomials in NumPy), for what the oracle lacks.
@@ -83,6 +85,17 @@ def test_gains_over_the_linear_filter(numbers):
     assert gain["quadratic"]["x1"] >= 50.4 and gain["cubic"]["x1"] >= 63.0 and gain["mixture"]["x1"] >= 90.0
     ratio = np.mean(numbers["covariance"]["cubic"]["x2"][31:]) / np.mean(numbers["covariance"]["linear"]["x2"][31:])
     assert gain["cubic"]["x2"] == pytest.approx(100 * (1 - ratio), abs=1e-9)
+
+
+def test_readme_says_what_is_found(numbers):
+    """Designed gains digit by digit; the mixture's, simulated, within four standard errors of these few runs."""
+    published, here = said_of("quadratic-bias")
+    gain = {name: f"{states['x1']:.1f} %" for name, states in numbers["gain_percent"].items()}
+    assert published == gain["quadratic"] and here.startswith(f"{gain['cubic']} by cubes, ")
+    mixture = float(re.search(r"([\d.]+) % by a mixture", here)[1])
+    assert f"| {published}, as published; no package has it | {mixture} % | `heliograph reproduce quadratic-" in README
+    found, linear = numbers["monte_carlo"]["mixture"], numbers["mean_covariance"]["linear"]["x1"]
+    assert abs(found["x1"] - (1 - mixture / 100) * linear) < 4 * found["x1_se"]
 
 
 def test_simulation_agrees_with_the_design(numbers):

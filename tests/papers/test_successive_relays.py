@@ -12,6 +12,7 @@ from heliograph.papers.successive_relays.run import reproduce, results
 from heliograph.papers.successive_relays.statements import statements, z_limit
 from heliograph.relays.design import given_design
 from tests.oracles import successive_relays as oracle
+from tests.papers.readme import said_of
 from tests.papers.verdicts import both, check_verdicts
 
 RUNS = 600
@@ -77,6 +78,9 @@ def test_steady_states(summary):
     assert total["lmmse_tuned"] <= 9.8478e-6  # found: 9.84775e-6
     assert total["no_relay"] == pytest.approx(2 * 3.8365e-6, rel=1e-4)
     assert summary["tuned_mean_ratio"] <= 0.775  # found: 0.7678
+    paper, joint, receiver = (f"{1e5 * total[name]:.3f}e-5" for name in ("paper", "joint", "lmmse_tuned"))
+    published, here = said_of("successive-relays")
+    assert published == paper and here.startswith(f"{joint} with") and f"{receiver} with the best linear" in here
 
 
 def test_claims_and_misprints_have_their_verdicts(summary):

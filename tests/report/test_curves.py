@@ -26,3 +26,13 @@ def test_marks_stand_where_they_are_named_and_gaps_stay_open():
     assert list(mark.get_xdata()) == [0.36, 0.36]
     assert [text.get_text() for text in axes.texts] == ["0.36", "bound"]
     assert axes.get_yscale() == "log" and axes.get_xlabel() == "arrival"
+
+
+def test_a_curve_that_ends_early_is_named_at_its_own_end():
+    time = np.arange(20.0)
+    early = np.where(time < 10, 3.0, np.nan)
+    figure = curves_over_time(time, [Panel("a", [Curve("early", BLUE, early), Curve("late", INK, 0 * time)])])
+    axes = figure.axes[0]
+    heights = {text.get_text(): text.get_position()[1] for text in axes.texts}
+    at = axes.transAxes.inverted().transform(axes.transData.transform((0.0, 3.0)))[1]
+    assert heights["early"] > 0.9 * at and heights["late"] < 0.1

@@ -31,7 +31,8 @@ def curves_over_time(time: np.ndarray, panels: Sequence[Panel], label: str = "st
             axes.plot(time, curve.values, color=curve.colour, linewidth=1.4)
         axes.set(ylabel=panel.label, xlim=(time[0], time[-1]))
         tail = max(len(time) // 10, 1)
-        label_right(axes, {c.name: (float(np.nanmean(c.values[-tail:])), c.colour) for c in panel.curves})
+        ends = {c.name: c.values[~np.isnan(c.values)][-tail:] for c in panel.curves}  # some end before the others
+        label_right(axes, {c.name: (float(ends[c.name].mean()), c.colour) for c in panel.curves})
     grid[-1].set_xlabel(label)
     return figure
 

@@ -37,9 +37,8 @@ Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean a
 
 @dataclass(frozen=True)
 class Outcome:
-    """Traces over time by case and rule, numbers for the summary, and what simulation says of one case."""
+    """Traces by case and rule, the tree, the scale, and what simulation says."""
 
-    traces: dict[str, dict[str, np.ndarray]]
     cases: dict[str, dict[str, float | list[float]]]
     measured: dict[str, dict[str, float]]
     tree: dict[str, float]
@@ -106,19 +105,18 @@ def equal_intersection(joint: np.ndarray) -> tuple[float, float]:
     return float(np.trace(claimed)), float(np.trace(weights @ joint.reshape(count * n, -1) @ weights.T))
 
 
-def one_case(name: str) -> tuple[dict[str, np.ndarray], dict[str, float | list[float]]]:
-    """Traces over time, and at the end."""
+def one_case(name: str) -> dict[str, float | list[float]]:
+    """Traces at the end."""
     plant, parts = described(name)
     net = network(plant, parts)
     found = hg.simulation.fused_covariances(net, STEPS) | {"central": central(plant, parts, STEPS)}
-    traces = {rule: np.trace(p, axis1=1, axis2=2) for rule, p in found.items()}
     joint = hg.simulation.cross_covariances(net, OWN, STEPS).joint
     claimed, true = equal_intersection(joint)
     local = [float(np.trace(joint[i, :, i])) for i in range(len(parts))]
     head: dict[str, float | list[float]] = {
         "local": local, "equal_intersection_claimed": claimed, "equal_intersection_true": true,
     }  # fmt: skip
-    return traces, head | {rule: float(trace[-1]) for rule, trace in traces.items()}
+    return head | {rule: float(np.trace(covariances[-1])) for rule, covariances in found.items()}
 
 
 def measured(seed: int) -> dict[str, dict[str, float]]:
@@ -258,10 +256,10 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
     """Everything; `advance` is told what begins."""
     advance(f"{TREE_NODES} nodes in a tree, {MANY} nodes")
     of_many = scale(seed)  # first: what memory the process has had at most is of all that came before
-    traces, numbers = {}, {}
+    numbers = {}
     for name, what in CASES.items():
         advance(what)
-        traces[name], numbers[name] = one_case(name)
+        numbers[name] = one_case(name)
     advance("simulating three rooms")
     simulated = measured(seed)
     advance("a tree of relays")
@@ -270,4 +268,4 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
     sent = traffic(seed)
     advance("an induction machine")
     errors, claims = strong(seed)
-    return Outcome(traces, numbers, simulated, of_tree, levels, of_many, errors, claims, sent)
+    return Outcome(numbers, simulated, of_tree, levels, of_many, errors, claims, sent)

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 
 from heliograph.examples.fusion.compute import CASES, MANY, MEASURED_STEPS, RUNS, STEPS, STRONG_RUNS, Outcome
-from heliograph.examples.fusion.pictures import KINDS, LABELS
+from heliograph.examples.fusion.pictures import KINDS, LABELS, NETWORKS
 from heliograph.report.figures import BLUE, PURPLE, VERMILION
-from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
+from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 
 
 def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
@@ -38,10 +38,10 @@ def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
                 _key("matrix weights", equal["matrix"], "four equal sensors", BLUE),
                 _key("all reports", equal["all_reports"], "four equal sensors", PURPLE),
             ]),
-            Table(["rule", *(name.replace("_", " ") for name in CASES)], rows,
+            Table(["rule", *(NETWORKS[name] for name in CASES)], rows,
                   f"Traces of the error's covariance after {STEPS} steps."),
-            Picture(pictures["traces"], "Traces of four rules over time in three networks",
-                    "Trace of the error's covariance over time."),
+            Picture(pictures["traces"], "Traces of five rules in three networks: intersection claims more than twice.",
+                    "The same beside the central filter, which hears every sensor itself (dashed: as good as that)."),
         ]),
         Section("Simulated", [
             Table(["rule", "claimed", "measured"], judged,
@@ -56,24 +56,26 @@ def fusion_page(outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
         Section("What is sent", [
             Picture(pictures["traffic"], "Reports per step and node against the error, and what is claimed of it",
                     "Three rooms: reports that are sent, and the error that is left. Lower left is better."),
-            Table(["sent", "level", "reports", "error", "claimed"], sent,
+            Table(["sent", "d or threshold", "reports", "error", "claimed"], sent,
                   "A node that sends only on change tells by its silence that little changed. A centre that takes the "
                   "silence for a loss guarantees nothing."),
         ]),
         Section("Trees and many nodes", [
             Picture(pictures["tree"], "A tree of relays with the covariance of each place's error as an ellipse",
-                    "Who knows what: the error of the point's place, and the trace of its covariance."),
+                    "How well each place of the tree knows where the point is: ellipses of one deviation, and traces."),
             Text([
-                "Twelve nodes heard by four relays, these by two, these by a root, each forwarding its matrix-"
-                f"weighted estimate: {tree['root']:.4f} at the root, {tree['flat']:.4f} where one centre hears all "
-                f"nodes, {tree['central']:.4f} for the central filter.",
-                f"All cross-covariances and weights of {MANY} nodes took {scale['seconds']:.1f} s and "
-                f"{scale['peak_gb']:.2f} GB: {scale['matrix']:.4f} instead of {scale['local']:.2f} at a node.",
-                f"A tree of {scale['tree_nodes']} nodes in which each relay hears {scale['tree_degree']} took "
+                "Twelve nodes heard by four relays, these by two, these by a root, each forwarding one estimate made "
+                f"with matrix weights. Traces: {tree['root']:.4f} at the root, {tree['flat']:.4f} where one centre "
+                f"hears all nodes, {tree['central']:.4f} for the central filter.",
+                f"All cross-covariances and weights of {MANY:,} nodes took {scale['seconds']:.1f} s and "
+                f"{scale['peak_gb']:.2f} GB. One node by itself has the trace {scale['local']:.2f}, all together "
+                f"{scale['matrix']:.4f}.",
+                f"A tree of {scale['tree_nodes']:,} nodes in which each relay hears {scale['tree_degree']} took "
                 f"{scale['tree_seconds']:.1f} s and {scale['tree_peak_gb']:.2f} GB: {scale['tree_root']:.4f} at its "
                 "root.",
             ]),
         ]),
+        Section("Run it again", [Code("heliograph example fusion --out out")]),
     ]  # fmt: skip
     lead = (
         "Local filters of one plant share its noise, so their errors are correlated. Covariance intersection is safe "

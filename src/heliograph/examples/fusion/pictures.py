@@ -1,15 +1,16 @@
-"""The example's figures: traces over time, the tree with what each of its places knows, traffic against error."""
+"""The example's figures: what each rule reaches, the tree with what each of its places knows, traffic against error."""
+
+from collections.abc import Mapping
 
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
-from heliograph.examples.fusion.compute import CASES, Outcome
-from heliograph.report.curves import Panel, curves_over_time
-from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, STYLE, VERMILION, WIDTH, Curve
+from heliograph.examples.fusion.compute import Outcome
+from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PURPLE, STYLE, VERMILION, WIDTH, legend_above
 
-DRAWN = {"matrix": BLUE, "matrix_with_mean": AMBER, "all_reports": PURPLE, "central": GREEN}
+DRAWN = {"three_partial": BLUE, "three_rooms": AMBER, "four_equal": PURPLE}
 LABELS = {
     "equal_intersection_claimed": "equal intersection, claimed",
     "equal_intersection_true": "equal intersection, its error",
@@ -19,26 +20,43 @@ LABELS = {
     "all_reports": "all reports ever heard",
     "central": "central filter",
 }
+SHORT = {
+    "equal_intersection_claimed": "intersection,\nclaimed",
+    "equal_intersection_true": "intersection,\nits error",
+    "matrix_with_mean": "matrix weights,\nplant's mean",
+    "all_reports": "all reports",
+}
+NETWORKS = {"three_partial": "partial sensors", "three_rooms": "three rooms", "four_equal": "equal sensors"}
 KINDS = {"every": ("every d-th step", BLUE), "told": ("on event, silence understood", GREEN),
          "untold": ("on event, silence taken for a loss", VERMILION)}  # fmt: skip
 PLACES = 0, 2  # the states drawn: where the point is in either direction
-SHOWN_STEPS = 60
+LEFT_OUT = ("scalar", "central")  # one is far off, the other is what all are divided by
 
 
 def fusion_figures(outcome: Outcome) -> dict[str, Figure]:
     """All of them, by name."""
-    clock = np.arange(1, SHOWN_STEPS + 1)
-    panels = [
-        Panel(name.replace("_", " "), [
-            Curve(LABELS[rule], colour, outcome.traces[name][rule][:SHOWN_STEPS]) for rule, colour in DRAWN.items()
-        ])
-        for name in CASES
-    ]  # fmt: skip
     return {
-        "traces": curves_over_time(clock, panels, "step"),
+        "traces": traces_picture(outcome.cases),
         "tree": tree_picture(outcome.levels),
         "traffic": traffic_picture(outcome),
     }
+
+
+@matplotlib.rc_context(STYLE)
+def traces_picture(cases: Mapping[str, Mapping[str, float | list[float]]]) -> Figure:
+    """Each rule's trace over that of the central filter, which hears every sensor itself: 1 is the best there is."""
+    figure = Figure(figsize=(WIDTH, 3.2), layout="constrained")
+    axes = figure.subplots()
+    rules = [rule for rule in LABELS if rule not in LEFT_OUT]
+    for i, (name, colour) in enumerate(DRAWN.items()):
+        traces = np.array([cases[name][rule] for rule in rules]) / np.array(cases[name]["central"])
+        axes.plot(traces, np.arange(len(rules)) + 0.22 * (i - 1), "o", color=colour, label=NETWORKS[name])
+    axes.axvline(1.0, color=INK, linewidth=1.0, linestyle=(0, (4, 1.6)))
+    axes.set_yticks(range(len(rules)), [SHORT.get(rule, LABELS[rule]) for rule in rules])
+    axes.set(xlabel="trace over the central filter's", ylim=(len(rules) - 0.5, -0.5))
+    axes.grid(visible=False, axis="y")
+    legend_above(figure, axes, 3)
+    return figure
 
 
 @matplotlib.rc_context(STYLE)
@@ -47,7 +65,7 @@ def tree_picture(levels: list[np.ndarray]) -> Figure:
 
     The axes of an ellipse are standard deviations, so that sizes can be compared from the leaves to the root.
     """
-    figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
     axes = figure.subplots()
     count = len(levels[0])
     where = [np.arange(count) + 0.5]

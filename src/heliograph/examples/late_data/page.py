@@ -40,9 +40,11 @@ def late_data_figures(outcome: Outcome) -> dict[str, Figure]:
     stretch = slice(0, STRETCH)
     return {
         "point": curves_over_time(
-            point.time[stretch], [Panel("position error (m)", _errors(point, SHOWN, stretch))], "s"
+            point.time[stretch], [Panel("position error (m)", _errors(point, SHOWN, stretch))], "time (s)"
         ),
-        "mower": curves_over_time(mower.time, [Panel("position error (m)", _errors(mower, SHOWN, slice(None)))], "s"),
+        "mower": curves_over_time(
+            mower.time, [Panel("position error (m)", _errors(mower, SHOWN, slice(None)))], "time (s)"
+        ),
         "map": paths(mower.truth, map_of, DRIVE.beacons),
     }
 
@@ -68,7 +70,7 @@ def late_data_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     )
     right, wrong = scores["rewound"].rmse, scores["used_as_current"].rmse
     title = f"Late packets put where they belong: {right:.2f} m off, not {wrong:.1f} m"
-    sections = [_network(outcome), _point(outcome, drawings), _mower(outcome, drawings), _again(outcome)]
+    sections = [_point(outcome, drawings), _mower(outcome, drawings), _network(outcome), _again(outcome)]
     return Page("Heliograph example", title, lead, sections, SOURCE)
 
 
@@ -76,7 +78,7 @@ def _network(outcome: Outcome) -> Section:
     n = outcome.network
     what = (
         "**No recording was given**: this is a synthetic network with the statistics of a recorded one, independent "
-        "delays, and losses that are a chain. With `--trace FILE` it is the recorded one."
+        "delays, and losses that come in runs. With `--trace FILE` it is the recorded one."
         if outcome.trace is None
         else f"The log `{outcome.trace}`, as the network's root heard it; {outcome.odd} of its rows are no packets."
     )
@@ -109,7 +111,7 @@ def _nees(value: float) -> str:
 
 
 def _verdicts(found: Through) -> str:
-    return ", ".join(f"{count} {verdict}" for verdict, count in found.counts.items())
+    return ", ".join(f"{count:,} {verdict}" for verdict, count in found.counts.items() if count)
 
 
 def _point(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
@@ -121,14 +123,22 @@ def _point(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
     caption = (
         f"A point pushed at random; each packet sent between {BEGIN:g} and {BEGIN + DURATION:g} s holds its position "
         f"with an error of 0.5 m on each axis. {RUNS} paths, judged every second. **NEES / dim**: squared error in "
-        f"units of the claimed covariance; 1 where that is right. Rewound over {WINDOW:g} s: {_verdicts(found)}."
+        f"units of the claimed covariance; 1 where that is right. What became of the packets that were rewound over "
+        f"{WINDOW:g} s: {_verdicts(found)}."
     )
     picture = Picture(
         drawings["point"],
         "Position error over the first minutes: least for the estimate of ten seconds ago.",
         "Errors at the moments that the estimates are of.",
     )
-    return Section("A point that moves", [KeyFigures(keys), _table(found, caption), picture])
+    methods = [
+        "**Taken as current**: what arrives is used as if it had just been measured.",
+        "**Late dropped**: what is older than something that was used already is thrown away.",
+        "**Rewound**: it is put where it belongs in time, and what came after it is computed again.",
+        "**2 s ago, 10 s ago, smoothed**: the estimate of that moment, from all that has arrived since.",
+        "**No delay**: the same packets, as if each had arrived at once.",
+    ]
+    return Section("A point that moves", [KeyFigures(keys), _table(found, caption), Points(methods), picture])
 
 
 def _mower(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
@@ -140,7 +150,7 @@ def _mower(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         if outcome.trace is not None
         else "The demonstration's mower, its recorded ranges and odometry; each range is late or lost as a packet is."
     )
-    caption = f"{outcome.unheard} ranges never came; of the others, rewound: {_verdicts(found)}."
+    caption = f"{outcome.unheard} ranges never came. What became of the others, rewound: {_verdicts(found)}."
     chart = Picture(
         drawings["map"],
         "The mower's path with four beacons: the rewound path stays near the truth.",
@@ -152,8 +162,8 @@ def _mower(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
 
 def _again(outcome: Outcome) -> Section:
     points = [
-        "**Late** means before the base, the newest event that is older than the window: what an in-order filter would "
-        "have used is used, whatever its age.",
+        "A packet is refused as **late** only if one that was measured after it is older than "
+        f"{WINDOW:g} s by now. All others are used, whatever their age.",
         "Estimates of a while ago are smoothed over all that is held; they cost nothing until they are asked for.",
     ]
     trace = "" if outcome.trace is None else f" --trace {outcome.trace}"

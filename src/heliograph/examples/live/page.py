@@ -30,7 +30,11 @@ def live_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
         "Heliograph example",
         f"Killed {outcome.kills} times, and every final estimate is {same}",
         lead,
-        [_service(outcome, drawings), _speed(outcome)],
+        [
+            _service(outcome, drawings),
+            _speed(outcome),
+            Section("Run it again", [Code("heliograph example live --out out")]),
+        ],
     )
 
 
@@ -55,7 +59,10 @@ def _service(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         "The mower's path with four beacons, and the true one.",
         "Final estimates, as the service told them.",
     )
-    return Section("Killed and started again", [KeyFigures(keys), Points(points), picture, Text([text]), Code(COMMAND)])
+    return Section(
+        "Killed and started again",
+        [KeyFigures(keys), Points(points), picture, Text([text, "The service was started so:"]), Code(COMMAND)],
+    )
 
 
 def _speed(outcome: Outcome) -> Section:

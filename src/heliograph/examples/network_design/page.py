@@ -85,21 +85,23 @@ def _sites() -> Figure:
 def design_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
     """The report; `drawings` holds each figure as SVG."""
     plain, least = (outcome.demonstration[name] for name in ("as_it_is", "centred_thousandth"))
-    two = outcome.two_hops[min(outcome.two_hops)]
+    total = min(outcome.two_hops)
+    two = outcome.two_hops[total]
+    saved = f"{100 * (1 - two.least.total / total):.0f} %"
     keys = [
-        KeyFigure("two hops, little power", f"{1 - two.least.total / min(outcome.two_hops):.0%}", "less power for the "
+        KeyFigure("two hops, little power", saved, "less power for the "
                   "error of equal powers", BLUE),
         KeyFigure("the demonstration", f"1/{plain.power / least.power:.0f}", "of the power for "
-                  f"{least.rmse / plain.rmse:.0%} of the error", GREEN),
-        KeyFigure("a published circuit", f"{outcome.circuit.power_saved_percent:.0f} %", "less relay power for the "
-                  "published error", VERMILION),
+                  f"{100 * least.rmse / plain.rmse:.0f} % of the error", GREEN),
+        KeyFigure("published relays that filter", f"{outcome.circuit.power_saved_percent:.0f} %",
+                  "less relay power for the published error", VERMILION),
     ]  # fmt: skip
     return Page(
         kicker="Heliograph example",
-        title=f"Sharing power by design saves {1 - two.least.total / min(outcome.two_hops):.0%} of it",
+        title=f"Sharing power by design saves {saved} of it",
         lead=(
             f"Six sensors behind relays need {two.least.total:.3g} units of power in all for the error that "
-            f"{min(outcome.two_hops):g} units give when all transmit alike. How much power, how many relays, where "
+            f"{total:g} units give when all transmit alike. How much power, how many relays, where "
             "they stand and who sends when is chosen here, each time beside a proof of how much better any other "
             "choice could be at most."
         ),
@@ -143,7 +145,7 @@ def _six(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
 def _row(hops: str, total: float, one: Case) -> list[str]:
     saved = 1 - one.least.total / total
     return [hops, f"{total:g}", f"{one.equal:.5f}", f"{one.best.error:.5f}", f"{one.best.certificate.bound:.5f}",
-            f"{one.least.total:.3f} (−{saved:.0%})"]  # fmt: skip
+            f"{one.least.total:.3f} (−{100 * saved:.0f} %)"]  # fmt: skip
 
 
 def _less(outcome: Outcome) -> Section:
@@ -156,11 +158,14 @@ def _less(outcome: Outcome) -> Section:
         for words, one in ((words, outcome.demonstration[name]) for name, words in names.items())
     ]
     text = (
-        "The demonstration's relays multiply by a gain nobody knows. It multiplies the whole range; of a range less "
-        "that at the known start it multiplies little."
+        "The demonstration's relays multiply what they hear by a random gain, and so make an error in proportion to "
+        "what is sent. If the sensor sends how far the range is from that at the known start, less is sent, which "
+        "costs less power, and the random gain does less harm."
     )
     caption = "Power of a beacon's sensor and relay together (m²); errors are means over the seeds (m)."
-    return Section("Sending less", [Text([text]), Table(("what is sent", "power", "RMSE", "claimed"), rows, caption)])
+    return Section(
+        "Sending less of the signal", [Text([text]), Table(("what is sent", "power", "RMSE", "claimed"), rows, caption)]
+    )
 
 
 def _published(outcome: Outcome) -> Section:
@@ -188,7 +193,9 @@ def _when(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         f"{bursts.every}th step with {bursts.every} times the power has the error {bursts.error:.4g}, every step "
         f"{bursts.errors[1]:.4g}."
     )
-    return Section("When", [Picture(drawings["schedules"], "Errors by period and by spacing, with bounds.", caption)])
+    return Section(
+        "Who sends when", [Picture(drawings["schedules"], "Errors by period and by spacing, with bounds.", caption)]
+    )
 
 
 def _where(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
@@ -198,9 +205,14 @@ def _where(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         for rho, (one, best) in outcome.lines.items()
     ]  # fmt: skip
     caption = (
-        f"Noise of the path where the path loss has the exponent {EXPONENT:g}. **relays**: how many are best, of at "
-        "most eight, where each hop fades a little (κ = 1.02)."
+        f"The signal falls with distance to the power {EXPONENT:g}. **ρ**: noise of the whole way without a relay, in "
+        "units of the power; **best site**: the relay's distance from one end, the whole way being 1; **noise**: of "
+        "the path, with a relay there. **relays**: how many are best, of at most eight, if E g² of each hop's gain is "
+        "1.02 (E g)², that is if it fades a little."
     )
     table = Table(("ρ", "best site", "noise", "at the midpoint", "without a relay", "relays"), rows, caption)
     words = "The midpoint (dots: up to where) is the best site only while noise is small; then nearer to one end."
-    return Section("Where", [Picture(drawings["sites"], "The best site of one relay over the noise.", words), table])
+    return Section(
+        "Where a relay stands best",
+        [Picture(drawings["sites"], "The best site of one relay over the noise.", words), table],
+    )

@@ -58,7 +58,12 @@ def _result(result: Reproduction) -> Section:
                   VERMILION),
         KeyFigure("mean fused error", f"{own:.4f}", f"dynamic {dynamic:.4f}, static {static:.4f}", GREEN),
     ]  # fmt: skip
-    return Section("The result", [KeyFigures(keys)])
+    words = (
+        "A **level** γ is a promise: the energy of the error stays below γ² times that of all disturbances and of the "
+        "initial error, whatever these are. Smaller is better. A sample is **saturated** if it is larger than the "
+        "quantizer can send; then nothing is guaranteed."
+    )
+    return Section("The result", [KeyFigures(keys), Text([words])])
 
 
 def _levels(result: Reproduction, pictures: Mapping[str, bytes]) -> Section:
