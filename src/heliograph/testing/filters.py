@@ -1,6 +1,7 @@
 """What a filter must keep: its sizes, its claim, and that a step is its prediction and its correction."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +10,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter
 from heliograph.model.estimate import STRENGTH, Estimate, Innovation
 from heliograph.numerics.check import own_units
-from heliograph.numerics.types import ArrayLike
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.types import ArrayLike, PyTree
 from heliograph.simulation.likelihood import log_likelihood
 
 ROUNDING = 1e-9  # relative: far above what a few operations lose, far below what a wrong formula gains
@@ -31,30 +33,42 @@ def check_filter(item: AbstractFilter, inputs: ArrayLike = (), steps: int = 5, s
     data = np.random.default_rng(seed).normal(size=(steps, item.received))
     data[1:][np.random.default_rng(seed + 1).random(data[1:].shape) < 0.3] = np.nan
     data[-1] = np.nan
+    u = np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(item.inputs)))
     state, total = item.init(), 0.0
     structure = str(jax.tree.structure(state))
-    side_by_side = jax.jit(jax.vmap(lambda s, z, k: item.step(s, z, inputs, k)[1].mean, in_axes=(0, 0, None)))
     for k, z in enumerate(data):
-        following, estimate = item.step(state, z, inputs, k)
-        again = item.step(state, z, inputs, k)[1]
-        assert np.array_equal(estimate.mean, again.mean), "step: expected the same estimate from the same arguments"
-        corrected, innovation = item.correct(item.predict(state, inputs, k), z, k)
+        seen, again = _seen(item, state, z, u[k], k), _seen(item, state, z, u[k], k)
+        (following, estimate), (corrected, innovation) = seen.step, seen.correction
+        assert np.array_equal(estimate.mean, again.step[1].mean), (
+            "step: expected the same estimate from the same arguments"
+        )
         for part in (following, corrected):
             assert str(jax.tree.structure(part)) == structure, "step: expected a state of init's structure"
         _check_estimate(estimate, len(item.states), k)
         _same(f"step {k}: the prediction, corrected", item.estimate(corrected), estimate)
         _check_innovation(innovation, z, item, k)
-        with jax.enable_x64(True):
-            twice = np.asarray(side_by_side(*jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z)), k))
-        gap = np.abs(twice - estimate.mean).max()
+        gap = np.abs(seen.side_by_side - estimate.mean).max()
         scale = 1 + np.abs(estimate.mean).max()
         assert gap <= ROUNDING * scale, f"step {k}: expected the same estimate inside vmap, off by {gap:g}"
         state, total = following, total + float(innovation.log_likelihood)
-    whole = float(
-        log_likelihood(item, data, np.broadcast_to(np.asarray(inputs, dtype=float), (steps, len(item.inputs))))
-    )
+    whole = float(log_likelihood(item, data, u))
     same = abs(whole - total) <= ROUNDING * (1 + abs(total)) or bool(np.isnan(whole) and np.isnan(total))
     assert same, f"log_likelihood: expected the sum over the steps {total:g}, got {whole:g}"
+
+
+class Seen(NamedTuple):
+    """What a filter makes of one step: at once, by its parts, and the means of two such steps in one vmap."""
+
+    step: tuple[PyTree, Estimate]
+    correction: tuple[PyTree, Innovation]
+    side_by_side: PyTree
+
+
+@compiled
+def _seen(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> Seen:
+    twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, z))
+    means = jax.vmap(lambda s, z: item.step(s, z, u, k)[1].mean)(*twice)
+    return Seen(item.step(state, z, u, k), item.correct(item.predict(state, u, k), z, k), means)
 
 
 def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
@@ -67,7 +81,7 @@ def _check_sizes(item: AbstractFilter, inputs: ArrayLike) -> None:
     ]
     if item.received:
         longer = np.zeros(item.received + 1)
-        wrong.append(("measurement", lambda: item.correct(item.predict(state, inputs), longer)))
+        wrong.append(("measurement", lambda: item.correct(state, longer)))
         wrong.append(("measurement", lambda: item.step(state, np.full(item.received, np.inf), inputs)))
         wrong.append(("measurement", lambda: item.step(state, longer, inputs)))
     wrong.append(("step", lambda: item.step(state, fitting, inputs, -1)))
