@@ -3,6 +3,7 @@
 from fractions import Fraction
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -118,3 +119,26 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     item = hg.kalman_filter(hg.LinearPlant(np.eye(2), 0.0, [0.0, 0.0], 1.0), hg.LinearSensor(h, noise))
     gain = [np.asarray(item.estimate(item.correct(item.init(), z)[0]).mean) for z in np.eye(2)]
     np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
+
+
+def test_more_precise_outputs_than_are_unrolled():
+    """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
+    h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
+    item = hg.kalman_filter(hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), 1.0), hg.LinearSensor(h, d * np.eye(9)))
+    z = np.arange(9.0)
+    found = item.estimate(item.correct(item.init(), z)[0])
+    left = d * np.linalg.inv(d * np.eye(3) + h.T @ h)
+    np.testing.assert_allclose(found.covariance, left, rtol=1e-9, atol=1e-12 * left.max())
+    np.testing.assert_allclose(found.mean, left @ h.T @ z / d, rtol=1e-9)
+
+
+def test_a_noise_free_output_has_a_gradient():
+    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not heard too."""
+
+    def mean(wide):
+        plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))
+        item = hg.linear_filter(plant, hg.LinearSensor(C, 0.0), hg.perfect(1))
+        return item.correct(item.init(), jnp.ones(1))[0].mean.sum()
+
+    with jax.enable_x64(True):
+        assert float(jax.grad(mean)(2.0)) == pytest.approx(0.0, abs=1e-15)

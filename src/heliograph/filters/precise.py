@@ -87,7 +87,8 @@ def _heard(state: Heard, own: jax.Array, j: int | jax.Array) -> Heard:
     used = total > least
     safe = jnp.where(used, total, 1.0)
     column = jnp.where(used, times(before, transpose(f)) / safe, 0.0)
-    turned = f * jnp.where(used, 1 / (safe + jnp.sqrt(safe * jnp.where(variance > 0, variance, 0.0))), 0.0)
+    both = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, safe * variance, 1.0)), 0.0)
+    turned = f * jnp.where(used, 1 / (safe + both), 0.0)
     return Heard(
         before - times(times(before, transpose(f)), turned),
         gain - times(column, times(row, gain)) + column * here,
