@@ -279,6 +279,26 @@ def test_what_does_not_arrive_is_left_out():
     assert heard.log_likelihood == 0
 
 
+@pytest.mark.parametrize("radius", [0.0, 0.01])
+def test_a_mean_far_from_zero_costs_no_digits(radius):
+    """Where modes differ in their noise alone, a mean of 1e8 deviations moves all estimates and no covariance."""
+    chain = hg.random_affine.MarkovChain(BURSTS, radius=radius)
+    channel = hg.markov_fading([hg.hop(0.7, noise) for noise in (0.05, 0.5)], chain)
+    z, found = np.random.default_rng(1).normal(size=(8, 1)), []
+    for far in (0.0, 1e8):
+        plant = hg.LinearPlant(np.eye(2), 0.1 * np.eye(2), [far, 0.0], np.eye(2))
+        item = hg.linear_filter(plant, hg.LinearSensor([[1.0, 0.5]], 0.05), channel)
+        network = hg.Network(plant, {"node": hg.Node(item.sensor, channel, {"one": item})})
+        data = {"node": np.where(np.arange(8)[:, None] == 3, np.nan, z + 0.7 * far)}
+        record = hg.run(network, data, smooth=hg.smoothing.FixedInterval())
+        each = record.estimates["node"]["one"], record.smoothed.estimates["node"]["one"]
+        means, claimed = [one.mean - [far, 0.0] for one in each], [one.covariance for one in each]
+        found.append((means, claimed, item.planned(np.zeros((8, 0))).covariances))
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-6)  # of 1e8, with rounding of 1e-8 a step
+    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-12)
+    np.testing.assert_allclose(found[1][2], found[0][2], rtol=1e-12)
+
+
 def test_it_keeps_the_contract_of_filters():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))

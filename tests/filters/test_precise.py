@@ -3,6 +3,7 @@
 from fractions import Fraction
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -77,3 +78,67 @@ def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
         together = jax.jit(jax.grad(lambda z: jax.vmap(moved)(z).sum()))(z)
         each = jax.jit(jax.vmap(jax.grad(moved)))(z)
     np.testing.assert_allclose(together, each, rtol=1e-14)
+
+
+WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
+
+
+def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
+    """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
+
+    A variance that is told is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is told to 1e-3.
+    """
+    noise = [[1e-9, 0.0], [0.0, 1e-9]]
+    lost = 0
+    for wide in WIDE:
+        plant = hg.LinearPlant(A, noise, [0.0, 0.0], wide)
+        for precise in PRECISE:
+            expected = exact(A, noise, precise, [[wide, 0.0], [0.0, wide]])
+            item = hg.linear_filter(plant, hg.LinearSensor(C, precise), hg.perfect(1))
+            found = claimed(item)
+            if precise + 1e-9 >= 1e-11 * wide:
+                np.testing.assert_allclose(found, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
+            told = ~np.isnan(found)
+            lost += np.sum(~told)
+            np.testing.assert_allclose(found[told], expected[told], rtol=0.05, err_msg=f"{wide} {precise}")
+    assert 0 < lost < WIDE.size * PRECISE.size * STEPS
+
+
+@pytest.mark.parametrize("tied", [0.0, 0.9])
+def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
+    """The condition of S is 1e9, its solution is that many times rounding off; one after another they are not.
+
+    Of contradicting outputs the estimate is as wrong as the gain. K = P H' S^-1 in fractions.
+    """
+    h, noise = [[1.0, 1.0], [1.0, 1.0001]], [[1e-12, tied * 1e-12], [tied * 1e-12, 1e-12]]
+    a, n = [[Fraction(x) for x in row] for row in h], [[Fraction(x) for x in row] for row in noise]
+    s = [[sum(a[i][k] * a[j][k] for k in range(2)) + n[i][j] for j in range(2)] for i in range(2)]
+    determinant = s[0][0] * s[1][1] - s[0][1] * s[1][0]
+    inverse = [[s[1][1], -s[0][1]], [-s[1][0], s[0][0]]]
+    exact_gain = [[sum(a[k][i] * inverse[k][j] for k in range(2)) / determinant for j in range(2)] for i in range(2)]
+    item = hg.kalman_filter(hg.LinearPlant(np.eye(2), 0.0, [0.0, 0.0], 1.0), hg.LinearSensor(h, noise))
+    gain = [np.asarray(item.estimate(item.correct(item.init(), z)[0]).mean) for z in np.eye(2)]
+    np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
+
+
+def test_more_precise_outputs_than_are_unrolled():
+    """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
+    h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
+    item = hg.kalman_filter(hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), 1.0), hg.LinearSensor(h, d * np.eye(9)))
+    z = np.arange(9.0)
+    found = item.estimate(item.correct(item.init(), z)[0])
+    left = d * np.linalg.inv(d * np.eye(3) + h.T @ h)
+    np.testing.assert_allclose(found.covariance, left, rtol=1e-9, atol=1e-12 * left.max())
+    np.testing.assert_allclose(found.mean, left @ h.T @ z / d, rtol=1e-9)
+
+
+def test_a_noise_free_output_has_a_gradient():
+    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not heard too."""
+
+    def mean(wide):
+        plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))
+        item = hg.linear_filter(plant, hg.LinearSensor(C, 0.0), hg.perfect(1))
+        return item.correct(item.init(), jnp.ones(1))[0].mean.sum()
+
+    with jax.enable_x64(True):
+        assert float(jax.grad(mean)(2.0)) == pytest.approx(0.0, abs=1e-15)

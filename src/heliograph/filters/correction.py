@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.precise import precise_update
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
@@ -174,14 +175,11 @@ def gain_and_covariance(
     """The same of z = H x + noise, with H (m, n) and the noise's covariance N (m, m), Omega = H P H' + N.
 
     Where a measurement is precise, N far below Omega, the difference has lost the digits of what is left:
-    (1 + (m + 2) eps) P - K C is eps Omega / N too large. There P+ = (I - K H) P (I - K H)' + K N K', a sum of squares,
-    which an error dK of the gain changes by dK Omega dK' alone. It takes three times the products, so it is computed
-    for all runs where any needs it, and not otherwise; each run's own numbers decide which of the two it gets.
-
-    Source: Bucy and Joseph, Filtering for stochastic processes (1968).
+    (1 + (m + 2) eps) P - K C is eps Omega / N too large. There `precise_update` takes one component after another. It
+    takes several times the products, so it is computed for all runs where any needs it, and not otherwise; each run's
+    own numbers decide which of the two it gets.
     """
-    solved = _solved(omega, cross)
-    return transpose(solved), covariance_after(prior, cross, omega, solved, output, noise)
+    return _gain_and_covariance(prior, cross, omega, _solved(omega, cross), output, noise)
 
 
 _solved = runs_last(solve)
@@ -197,7 +195,12 @@ _bound = runs_last(_difference)
 def covariance_after(
     prior: jax.Array, cross: jax.Array, omega: jax.Array, solved: jax.Array, output: jax.Array, noise: jax.Array
 ) -> jax.Array:
-    """P+ of the gain solved' = C' Omega^-1, in the form that keeps its digits (`gain_and_covariance`)."""
+    """P+ of the gain solved' = C' Omega^-1, in the form that keeps its digits (`gain_and_covariance`).
+
+    (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK of the gain changes by dK Omega dK' alone.
+
+    Source: Bucy and Joseph, Filtering for stochastic processes (1968).
+    """
     return _covariance_after(prior, cross, omega, solved, output, noise)
 
 
@@ -210,12 +213,35 @@ def _covariance(
     output: jax.Array,
     noise: jax.Array,
 ) -> jax.Array:
-    own = [noise[i, i] < rounding(PRECISE, prior, 1000) * omega[i, i] for i in range(len(omega))]
     return pick(
-        jnp.any(jnp.stack(own), axis=0),
+        _is_precise(omega, noise),
         lambda: sum_of_squares(prior, transpose(solved), output, noise),
         lambda: _difference(prior, cross, solved),
     )
 
 
 _covariance_after = runs_last(partial(_covariance, where_any), partial(_covariance, where_each))
+
+
+def _by_precision(
+    pick: Pick,
+    prior: jax.Array,
+    cross: jax.Array,
+    omega: jax.Array,
+    solved: jax.Array,
+    output: jax.Array,
+    noise: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    return pick(
+        _is_precise(omega, noise),
+        lambda: precise_update(prior, output, noise),
+        lambda: (transpose(solved), _difference(prior, cross, solved)),
+    )
+
+
+_gain_and_covariance = runs_last(partial(_by_precision, where_any), partial(_by_precision, where_each))
+
+
+def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
+    own = [noise[i, i] < rounding(PRECISE, omega, 1000) * omega[i, i] for i in range(len(omega))]
+    return jnp.any(jnp.stack(own), axis=0)

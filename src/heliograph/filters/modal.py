@@ -2,7 +2,8 @@
 
 With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its step and what is heard of it are linear and their noises
 white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so that a
-Kalman filter of zeta is the best linear filter of x = sum_j zeta^j.
+Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1), c = E[x]
+without data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
 """
 
 from typing import NamedTuple
@@ -49,12 +50,15 @@ class Heard(Module):
 class ModalBelief(NamedTuple):
     """Estimate of zeta, mode after mode, its error's covariance, E[x~ x~' 1{mode}] before any data, and if it moved.
 
-    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1).
+    centre c = E[x] without data; P(mode) c is part of the mean, whose sum over the modes is that of x.
+
+    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1), centre (n,).
     """
 
     mean: Float[jax.Array, " N"]
     covariance: Float[jax.Array, "N N"]
     moments: Float[jax.Array, "M n1 n1"]
+    centre: Float[jax.Array, " n"]
     moved: Bool[jax.Array, ""]
 
 
@@ -79,13 +83,10 @@ class ModalFilter(AbstractFilter):
 
     @in_float64
     def init(self) -> ModalBelief:
-        """The prior, independent of the mode: Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x x~_0 x~_0'."""
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
-        spread, square = padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
-        covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
-        moments = law[:, None, None] * (spread + square)
-        return ModalBelief(jnp.kron(law, mean), covariance, moments, jnp.asarray(False))
+        """The prior, independent of the mode."""
+        law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        moments = law[:, None, None] * second
+        return ModalBelief(jnp.kron(law, jnp.append(centre, 1.0)), covariance, moments, centre, jnp.asarray(False))
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
@@ -93,7 +94,7 @@ class ModalFilter(AbstractFilter):
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """
-        step, move, noise, rows = self._moves(state, u, k)
+        step, move, noise, centre, rows = self._moves(state, u, k)
         modes, size = len(state.moments), len(move)
         carried = move @ state.moments @ move.T
         added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
@@ -101,7 +102,9 @@ class ModalFilter(AbstractFilter):
         chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
         fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
         covariance = symmetrize(step @ state.covariance @ step.T + fresh)
-        return ModalBelief(step @ state.mean, covariance, moments, jnp.asarray(True))
+        law = state.moments[:, -1, -1]
+        mean = step @ (state.mean - known_part(law, state.centre)) + known_part(law @ rows, centre)
+        return ModalBelief(mean, covariance, moments, centre, jnp.asarray(True))
 
     @corrects
     def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
@@ -109,25 +112,27 @@ class ModalFilter(AbstractFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
-        heard, added = self._hears(state, k)
-        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, jnp.asarray(z))
+        heard, added, common = self._hears(state, k)
+        expected = common + heard @ (state.mean - known_part(state.moments[:, -1, -1], state.centre))
+        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
-        """F, the plant's A~ and Q~, and the rows of the chain."""
-        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
+        """F, the plant's A~ and Q~, where c moves, and the rows of the chain."""
+        move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
-        return jnp.kron(rows.T, move), move, noise, rows
+        return jnp.kron(rows.T, move), move, noise, centre, rows
 
-    def _hears(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array]:
-        """What is heard of zeta, and Cov(z - E[z | zeta])."""
+    def _hears(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """What is heard of zeta beyond what all modes send, Cov(z - E[z | zeta]), and what all modes send."""
         channel = at(self.channel, k)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(at(self.sensor, k))
+        gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
         law = state.moments[:, -1, -1]
         second = measure @ state.moments @ measure.T + law[:, None, None] * noise
         added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
         added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
-        return jnp.concatenate(list(gains @ measure), axis=1), added
+        heard, common = beside_common(gains @ measure, law)
+        return joined(heard), added, common
 
     @in_float64
     def estimate(self, state: ModalBelief) -> Estimate:
@@ -146,7 +151,7 @@ class ModalFilter(AbstractFilter):
         k: Step,
     ) -> AbstractRetained:
         """The update of zeta itself."""
-        output, _ = self._hears(prior, k)
+        output, _, _ = self._hears(prior, k)
         return linear_retained(
             after,
             prior,
@@ -174,12 +179,14 @@ def heard_linearly(
     covariance: Float[jax.Array, "N N"],
     heard: Float[jax.Array, "m N"],
     added: Float[jax.Array, "m m"],
-    z: Float[jax.Array, " m"],
+    expected: Float[jax.Array, " m"],
+    z: ArrayLike,
 ) -> tuple[jax.Array, jax.Array, Innovation]:
     """Mean and covariance of zeta after what arrived of z, whose covariance given zeta is `added`."""
+    z = jnp.asarray(z)
     present = ~jnp.isnan(z)
     both = present[:, None] & present
-    cross, expected = heard @ covariance, heard @ mean
+    cross = heard @ covariance
     total = cross @ heard.T + added
     gain, after = gain_and_covariance(
         covariance,
@@ -202,6 +209,45 @@ def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
     """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
     measure = padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
     return measure, padded(jnp.asarray(sensor.noise.covariance))
+
+
+def prior_of_modes(start: LinearPlant, law: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """c, Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1), and E[x~ x~'], at the start."""
+    spread, law = padded(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    square = jnp.zeros_like(spread).at[-1, -1].set(1.0)
+    covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
+    return jnp.asarray(start.initial_mean), covariance, spread + square
+
+
+def known_part(law: jax.Array, centre: jax.Array) -> jax.Array:
+    """P(mode) c, mode after mode."""
+    return jnp.kron(law, jnp.append(centre, 0.0))
+
+
+def moved_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A~ and Q~ of x - c, which no known input moves, and c one step later."""
+    move, noise = move_matrix(plant, jnp.asarray(u))
+    return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
+
+
+def measured_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """C~ and R~ of the same: y = C (x - c) + C c + E v."""
+    measure, noise = measure_matrix(sensor)
+    return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
+
+
+def beside_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the modes send beside what is sent on average (the indicators sum to 1: it tells nothing of them), and that.
+
+    Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
+    """
+    common = law @ output[:, :, -1] / jnp.sum(law)
+    return output.at[:, :, -1].add(-common), common
+
+
+def joined(output: jax.Array) -> jax.Array:
+    """(M, m, n + 1) as one matrix (m, N) that reads zeta."""
+    return jnp.concatenate(list(output), axis=1)
 
 
 def padded(a: jax.Array) -> jax.Array:

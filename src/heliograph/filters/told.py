@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import absent, gain_and_bound
 from heliograph.filters.innovation import log_density
-from heliograph.filters.modal import measure_matrix, move_matrix, padded, sum_of_modes
+from heliograph.filters.modal import beside_common, joined, measured_about, moved_about, padded, sum_of_modes
 from heliograph.filters.scheduled import pseudo_solve
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -109,9 +109,7 @@ class ToldFilter(AbstractFilter):
     def predict(self, state: ToldBelief, u: ArrayLike = (), k: Step = 0) -> ToldBelief:
         """s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
         plant, channel = at(self.plant, k), at(self.channel, k)
-        shifted, noise = move_matrix(plant, jnp.asarray(u))
-        centre = shifted[:-1] @ jnp.append(state.centre, 1.0)
-        move = shifted.at[:-1, -1].set(0.0)
+        move, noise, centre = moved_about(plant, u, state.centre)
         modes, size = len(state.moments), len(move)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
@@ -181,23 +179,20 @@ def _used(
     state: ToldBelief, sensor: LinearSensor, mean: jax.Array, spread: jax.Array, z: jax.Array, there: jax.Array
 ) -> tuple[ToldBelief, jax.Array, jax.Array]:
     """The update with what arrived, e+ = (I - K H) e - K noise; what was not expected, and its covariance."""
-    measure, noise = measure_matrix(sensor)
-    measure = measure.at[:-1, -1].add(measure[:-1, :-1] @ state.centre)
+    measure, noise = measured_about(sensor, state.centre)
     size = measure.shape[1]
     law = state.moments[:, size - 1, size - 1]
     second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
     added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
-    output = mean @ measure
-    common = law @ output[:, :, -1] / jnp.sum(law)  # the modes sum to 1: what is sent in all tells nothing of them
-    output = jnp.where(law[:, None, None] > 0, output.at[:, :, -1].add(-common), 0.0)
-    joined = jnp.concatenate(list(output), axis=1)
+    output, common = beside_common(mean @ measure, law)
+    output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
     prior = state.covariance
-    cross, value = joined @ prior, z - common - joined @ state.mean
-    total = cross @ joined.T + jnp.sum(added, axis=0)
+    cross, value = output @ prior, z - common - output @ state.mean
+    total = cross @ output.T + jnp.sum(added, axis=0)
     seen = jnp.where(there[:, None] & there, total, 0.0) + absent(there)
     gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
     both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
-    change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ joined)
+    change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ output)
     moments = change @ state.moments @ change.T
     moments = moments.at[:, size:, size:].add(both @ added @ both.T)
     after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)

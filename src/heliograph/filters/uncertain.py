@@ -15,12 +15,15 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.modal import (
     Heard,
+    beside_common,
     claim_of_modes,
     heard_linearly,
     heard_over,
-    measure_matrix,
-    move_matrix,
-    padded,
+    joined,
+    known_part,
+    measured_about,
+    moved_about,
+    prior_of_modes,
     sum_of_modes,
 )
 from heliograph.filters.plan import plan
@@ -39,12 +42,15 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 class UncertainBelief(NamedTuple):
     """Estimate of zeta, a bound on its error's covariance, E[x~ x~'], and between what the modes' probabilities are.
 
-    Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), law, low and high (M,).
+    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`.
+
+    Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), centre (n,), law, low and high (M,).
     """
 
     mean: Float[jax.Array, " N"]
     covariance: Float[jax.Array, "N N"]
     second: Float[jax.Array, "n1 n1"]
+    centre: Float[jax.Array, " n"]
     law: Float[jax.Array, " M"]
     low: Float[jax.Array, " M"]
     high: Float[jax.Array, " M"]
@@ -69,17 +75,15 @@ class UncertainModalFilter(AbstractFilter):
     @in_float64
     def init(self) -> UncertainBelief:
         """The prior, independent of the mode, whose initial law is known."""
-        start, law = at(self.plant, 0), jnp.asarray(self.initial)
-        mean = jnp.append(jnp.asarray(start.initial_mean), 1.0)
-        spread, square = padded(jnp.asarray(start.initial_covariance)), jnp.outer(mean, mean)
-        covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
-        return UncertainBelief(jnp.kron(law, mean), covariance, spread + square, law, law, law, jnp.asarray(False))
+        law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        mean = jnp.kron(law, jnp.append(centre, 1.0))
+        return UncertainBelief(mean, covariance, second, centre, law, law, law, jnp.asarray(False))
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
         """Sigma- from above; at the first use the mode has its initial law."""
         channel = at(self.channel, k)
-        move, noise = move_matrix(at(self.plant, k), jnp.asarray(u))
+        move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         modes = len(state.law)
         rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
         radius = jnp.where(state.moved, jnp.asarray(channel.radius), 0.0)
@@ -94,18 +98,22 @@ class UncertainModalFilter(AbstractFilter):
         young = jnp.sqrt(_ratio(jnp.trace(apart), jnp.trace(known)))
         extra = jnp.where(young > 0, apart + apart / jnp.where(young > 0, young, 1.0), 0.0)
         covariance = symmetrize((1 + young) * known + extra + fresh)
-        after = carried + noise
-        return UncertainBelief(step @ state.mean, covariance, after, state.law @ rows, low, high, jnp.asarray(True))
+        after, law = carried + noise, state.law @ rows
+        mean = step @ (state.mean - known_part(state.law, state.centre)) + known_part(law, centre)
+        return UncertainBelief(mean, covariance, after, centre, law, low, high, jnp.asarray(True))
 
     @corrects
     def correct(self, state: UncertainBelief, z: ArrayLike, k: Step = 0) -> tuple[UncertainBelief, Innovation]:
         """Use what arrived of z; the covariance of z given zeta is bounded over the laws of the modes."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        gains, (measure, noise) = jnp.asarray(channel.mean), measure_matrix(sensor)
+        gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
         each = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
-        added, heard = _worst(each, *_middle(state.low, state.high)), jnp.concatenate(list(gains @ measure), axis=1)
-        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, z)
+        added = _worst(each, *_middle(state.low, state.high))
+        output, common = beside_common(gains @ measure, state.law)
+        heard = joined(output)
+        expected = common + heard @ (state.mean - known_part(state.law, state.centre))
+        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     @in_float64
@@ -125,7 +133,7 @@ class UncertainModalFilter(AbstractFilter):
         k: Step,
     ) -> AbstractRetained:
         """The moments of zeta around the update; what is proved of the filter's bound is not of theirs."""
-        move, _ = move_matrix(at(self.plant, k), jnp.asarray(u))
+        move, _, _ = moved_about(at(self.plant, k), u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
         want = sum_of_modes(len(self.states), len(self.initial))

@@ -7,7 +7,7 @@ feed a kernel like that. Larger matrices go to the library.
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -68,18 +68,23 @@ def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
     return call
 
 
-Pick = Callable[[jax.Array, Callable[[], jax.Array], Callable[[], jax.Array]], jax.Array]
+class Pick(Protocol):
+    """`where_any` or `where_each`."""
+
+    def __call__(self, needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
+        """One array or several, with the runs last."""
 
 
-def where_any(needed: jax.Array, costly: Callable[[], jax.Array], cheap: Callable[[], jax.Array]) -> jax.Array:
+def where_any(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
     """`costly` for runs that need it and `cheap` for the others; `costly` is computed only where any run needs it."""
-    result: jax.Array = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
+    result: R = jax.lax.cond(jnp.any(needed), lambda: where_each(needed, costly, cheap), cheap)
     return result
 
 
-def where_each(needed: jax.Array, costly: Callable[[], jax.Array], cheap: Callable[[], jax.Array]) -> jax.Array:
+def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R]) -> R:
     """The same by computing both."""
-    return jnp.where(needed, costly(), cheap())
+    result: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
+    return result
 
 
 def _to_last(x: Array, is_batched: bool) -> jax.Array:
@@ -156,12 +161,16 @@ def with_rounding(p: A, terms: int) -> A:
 
 
 def sum_of_squares(prior: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array) -> jax.Array:
-    """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added."""
+    """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added.
+
+    By a root of P, so that what I - K H takes off leaves the square of its rounding alone.
+    """
     n = len(prior)
     kept = jnp.eye(n).reshape(n, n, *[1] * (prior.ndim - 2)) - times(gain, output)
     own = jnp.stack([prior[i, i] for i in range(n)])
     rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own)
-    return symmetric(congruence(kept, prior) + congruence(gain, noise)) + rounded
+    left = times(kept, root(prior))
+    return symmetric(times(left, transpose(left)) + congruence(gain, noise)) + rounded
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -229,6 +238,13 @@ def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.asarray(solve_triangular(lower, forward, lower=True, trans=1))
 
 
+def root(a: jax.Array) -> jax.Array:
+    """R, lower, with R R' = A for a positive semidefinite A, a column of zeros where a component adds nothing."""
+    if len(a) > UNROLL_LIMIT:
+        return _each(lambda a, _: long_factor(a), a, a)
+    return jnp.stack(factor(a)[0], axis=1)
+
+
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
@@ -239,7 +255,7 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     own = jnp.stack([a[i, i] for i in range(n)])
     reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own, 0.0)) + OFF_VALUE * jnp.abs(size)
     if n > UNROLL_LIMIT:
-        lower = _each(lambda a, _: long_factor(a), a, a)
+        lower = root(a)
         columns, scales = list(jnp.moveaxis(lower, 1, 0)), [lower[i, i] for i in range(n)]
         scales = [jnp.where(s == 0, 0.0, 1 / jnp.where(s == 0, 1.0, s)) for s in scales]
     else:

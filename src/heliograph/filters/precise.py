@@ -1,0 +1,98 @@
+"""Precise measurements: what little they leave of a variance, to as many digits as the prior has.
+
+One component after another on a root of the covariance, since of two precise components together the innovation's
+covariance H P H' + N keeps neither what tells them apart nor N.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.numerics.small_matrix import (
+    UNROLL_LIMIT,
+    congruence,
+    inner,
+    pivot_scale,
+    root,
+    sum_of_squares,
+    times,
+    transpose,
+)
+
+LEFT = 100  # times its rounding: a variance below has lost its digits
+
+
+class Heard(NamedTuple):
+    """After the first components of T z, whose rows make their noises uncorrelated: m + G (T z - T H m), P = R R'.
+
+    Shapes: root R (n, n), gain G (n, m), turn T (m, m), output T H (m, n), noise T N T' (m, m); runs last.
+    """
+
+    root: jax.Array
+    gain: jax.Array
+    turn: jax.Array
+    output: jax.Array
+    noise: jax.Array
+
+
+def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """K (n, m) and P+ of z = H x + v, Cov v = N, by its components one after another; of runs that are last.
+
+    f = R' h', s = f' f + d, k = R f / s, R+ = R (I - f f' / (s + root(s d))); with K of all
+    P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. A component of
+    which nothing but rounding is unknown is left out. The prior itself is known to eps |P|, with which P+ is
+    eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a variance, as where a wide prior
+    or a singular noise ties states together to the last digit, it has no digits, and P+ is NaN.
+
+    Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
+    Filtering for stochastic processes (1968).
+    """
+    n, m = len(prior), len(output)
+    runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
+
+    def over_runs(a: jax.Array) -> jax.Array:
+        return jnp.broadcast_to(a.reshape(*a.shape, *[1] * (2 + len(runs) - a.ndim)), (*a.shape[:2], *runs))
+
+    parts = root(prior), jnp.zeros((n, m)), jnp.eye(m), output, noise
+    state = Heard(*(over_runs(jnp.asarray(a, prior.dtype)) for a in parts))
+    own = jnp.stack([noise[j, j] for j in range(m)])
+    if m > UNROLL_LIMIT:
+        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, own, j), state)
+    else:
+        for j in range(m):
+            state = _heard(state, own, j)
+    gain = times(state.gain, state.turn)
+    kept = over_runs(jnp.eye(n)) - times(gain, output)
+    after, lost = sum_of_squares(prior, gain, output, noise), congruence(jnp.abs(kept), jnp.abs(prior))
+    units = LEFT * float(jnp.finfo(prior.dtype).eps)
+    digits = jnp.stack([units * lost[i, i] <= after[i, i] for i in range(n)])
+    return gain, jnp.where(jnp.all(digits, axis=0), after, jnp.nan)
+
+
+def _heard(state: Heard, own: jax.Array, j: int | jax.Array) -> Heard:
+    """With component j too, whose noise is first taken off those after it."""
+    before, gain, turn, output, noise = state
+    n, m, runs = len(before), len(output), [1] * (before.ndim - 2)
+    scale = pivot_scale(noise[j, j], own[j])
+    variance = jnp.where(scale == 0, 0.0, noise[j, j])
+    later, here = ((jnp.arange(m) > j).reshape(m, 1, *runs), (jnp.arange(m) == j).reshape(1, m, *runs))
+    share = jnp.where(later, (noise[:, j] * scale**2)[:, None], 0.0)
+    turn, output, noise = (part - share * part[j][None] for part in (turn, output, noise))
+
+    row = output[j][None]
+    f, reach = times(row, before), times(jnp.abs(row), jnp.abs(before))
+    least = ((n + 2) * float(jnp.finfo(f.dtype).eps)) ** 2 * inner(reach, reach)
+    total = inner(f, f) + variance
+    used = total > least
+    safe = jnp.where(used, total, 1.0)
+    column = jnp.where(used, times(before, transpose(f)) / safe, 0.0)
+    both = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, safe * variance, 1.0)), 0.0)
+    turned = f * jnp.where(used, 1 / (safe + both), 0.0)
+    return Heard(
+        before - times(times(before, transpose(f)), turned),
+        gain - times(column, times(row, gain)) + column * here,
+        turn,
+        output,
+        noise,
+    )
