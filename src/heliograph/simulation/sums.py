@@ -82,7 +82,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         dealt = jax.tree.map(lambda leaf: leaf.reshape(steps // width, width, *leaf.shape[1:]), rows)
 
         def some(state: tuple[Sums, jax.Array], row: PyTree) -> tuple[tuple[Sums, jax.Array], None]:
-            following, bad = _added(state[0], *row, runs[0] % BATCHES, valid)
+            following, bad = _added(state[0], row[0], row[1], runs[0] % BATCHES, valid)
             return (following, state[1] | jnp.any(bad, axis=0)), None
 
         begin = carry, jnp.zeros((2, carry.pairs.shape[1], len(runs)), dtype=bool)
@@ -224,7 +224,9 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
     sums = _by_batch(carry.count, carry.pairs, carry.nees, carry.claimed)
-    count, pairs, nees, own = (np.moveaxis(part, -1, 0) for part in sums)  # views: in memory the batches are last
+    count, pairs, nees, own = (
+        np.moveaxis(np.asarray(part), -1, 0) for part in sums
+    )  # views: in memory the batches are last
     own = own / np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
