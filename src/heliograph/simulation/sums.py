@@ -224,9 +224,7 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
     sums = _by_batch(carry.count, carry.pairs, carry.nees, carry.claimed)
-    count, pairs, nees, own = (
-        np.moveaxis(np.asarray(part), -1, 0) for part in sums
-    )  # views: in memory the batches are last
+    count, pairs, nees, own = (np.moveaxis(np.asarray(part), -1, 0) for part in sums)  # views: they are last in memory
     own = own / np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
