@@ -29,6 +29,7 @@ from .h_infinity import (
 )
 from .innovation import (
     gaussian_innovation as gaussian_innovation,
+    mixed_innovation as mixed_innovation,
 )
 from .linear import (
     as_current_filter as as_current_filter,

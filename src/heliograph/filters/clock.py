@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.belief import Belief
 from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, GaussianFilter, gaussian_filter, signal_of
+from heliograph.filters.gaussian import GaussianFilter, gaussian_filter, signal_of
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.transform import AbstractTransform, PolynomialMoments
 from heliograph.filters.update import Polytope

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, GaussianFilter, corrected, gaussian_filter, signal_of
+from heliograph.filters.belief import Belief
+from heliograph.filters.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.filters.update import AbstractUpdate
 from heliograph.model.channel import Channel

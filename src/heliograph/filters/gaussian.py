@@ -1,30 +1,30 @@
 """The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
 
 from dataclasses import replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.base import AbstractFilter, Step, corrects
+from heliograph.filters.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.correction import Signal
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
-from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, Transformed, linear_transform
+from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link, mean_gain
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.fading import memory_matters, without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
-from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant, check_plant
+from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
-from heliograph.numerics.angle import Angles, continued, nearest, wrapped
-from heliograph.numerics.check import array, covariance, instance
-from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.angle import Angles, continued, nearest
+from heliograph.numerics.check import instance
 from heliograph.numerics.small_matrix import runs_last, times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
@@ -33,14 +33,7 @@ from heliograph.random_affine.second_moments import SecondOrder, has_random_gain
 Each = TypeVar("Each", AbstractRandomAffine, SecondOrder)
 
 
-class Belief(NamedTuple):
-    """Mean (n,) and covariance (n, n) of the state given the data so far."""
-
-    mean: Float[jax.Array, " n"]
-    covariance: Float[jax.Array, "n n"]
-
-
-class GaussianFilter(AbstractFilter):
+class GaussianFilter(AbstractBeliefFilter):
     """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
 
     A linear plant or sensor needs no transform: its moments are exact.
@@ -52,40 +45,17 @@ class GaussianFilter(AbstractFilter):
     data. `heard_angles`: which components of z are angles; z is then read within half a turn of what is expected.
     """
 
-    plant: AnyPlant
     sensor: AnySensor
     channel: SecondOrder | OverTime
-    transform: AbstractTransform
     update: AbstractUpdate
-    initial_mean: Array
-    initial_covariance: Array
     linear: bool = eqx.field(static=True)
     heard_angles: Angles = eqx.field(static=True)
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    @in_float64
-    def init(self) -> Belief:
-        """The prior."""
-        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
-
-    @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
-        """Mean and covariance of f(x, u) + w."""
-        return Belief(*predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))[:2])
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.heard_angles)
-
-    @in_float64
-    def estimate(self, state: Belief) -> Estimate:
-        """The belief, angles between -pi and pi."""
-        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def retain(
         self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
@@ -105,15 +75,6 @@ class GaussianFilter(AbstractFilter):
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""
         return plan(self, inputs) if self.linear else self
-
-
-def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
-    """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
-    if isinstance(plant, LinearPlant):
-        moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
-    else:
-        moved = transform.apply(plant.moves(u, state.mean), *state)
-    return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)
 
 
 def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
@@ -154,18 +115,6 @@ def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime
     if isinstance(channel, OverTime):
         return over_time([update.describe(c) for c in unstack(channel)])
     return update.describe(channel)
-
-
-def prior_of(
-    plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
-) -> tuple[Array, Array, bool]:
-    """The plant's initial mean and covariance where no others are given, and whether any were."""
-    n = len(plant.states)
-    mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    spread = plant.initial_covariance
-    if initial_covariance is not None:
-        spread = covariance("filter's initial covariance", initial_covariance, n)
-    return mean, spread, initial_mean is not None or initial_covariance is not None
 
 
 def _build(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian import Belief
+from heliograph.filters.belief import Belief
 from heliograph.numerics.module import Module
 from heliograph.numerics.small_matrix import runs_last
 from heliograph.numerics.types import Bool, Float

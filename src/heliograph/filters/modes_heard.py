@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.belief import Belief
 from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, corrected
+from heliograph.filters.gaussian import corrected
 from heliograph.filters.innovation import mixed_innovation
 from heliograph.filters.told import Told, by_pattern, pattern_of
 from heliograph.filters.update import Polytope

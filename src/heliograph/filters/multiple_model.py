@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, predicted, signal_of
+from heliograph.filters.belief import Belief, predicted
+from heliograph.filters.gaussian import signal_of
 from heliograph.filters.merging import AbstractMerging, MergeAll, MergeByMode, MergeByNextMode, ModalBeliefs, merged
 from heliograph.filters.modes_heard import describe_modes, hear
 from heliograph.filters.retained import AbstractRetained

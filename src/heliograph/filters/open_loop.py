@@ -1,55 +1,26 @@
 """The filter that hears nothing: prediction only."""
 
-import equinox as eqx
 import jax.numpy as jnp
 
-from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, predicted, prior_of
+from heliograph.filters.base import Step, corrects
+from heliograph.filters.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.innovation import no_innovation
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import moments_retained
-from heliograph.filters.transform import AbstractTransform, Cubature
-from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.filters.transform import Cubature
+from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at, first
 from heliograph.model.plant import AnyPlant, LinearPlant, check_plant
-from heliograph.numerics.angle import wrapped
-from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.types import Array, ArrayLike
+from heliograph.numerics.types import ArrayLike
 
 
-class OpenLoop(AbstractFilter):
+class OpenLoop(AbstractBeliefFilter):
     """The filter that hears nothing: prediction only. What any use of the measurements has to beat."""
-
-    plant: AnyPlant
-    transform: AbstractTransform
-    initial_mean: Array
-    initial_covariance: Array
-    claim: Claim = eqx.field(static=True)
-    states: tuple[str, ...] = eqx.field(static=True)
-    inputs: tuple[str, ...] = eqx.field(static=True)
-    received: int = eqx.field(static=True)
-
-    @in_float64
-    def init(self) -> Belief:
-        """The prior."""
-        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
-
-    @predicts
-    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
-        """Mean and covariance of f(x, u) + w."""
-        plant, u = at(self.plant, k), jnp.asarray(u)
-        moved = self.transform.apply(plant.moves(u, state.mean), *state)
-        return Belief(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u))
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """z, of whatever length, is not used."""
         return state, no_innovation()
-
-    @in_float64
-    def estimate(self, state: Belief) -> Estimate:
-        """The prediction."""
-        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
     def retain(
         self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, predicted, signal_of
+from heliograph.filters.belief import Belief, predicted
+from heliograph.filters.gaussian import signal_of
 from heliograph.filters.merging import merged
 from heliograph.filters.modes_heard import describe_modes, hear
 from heliograph.filters.multiple_model import together

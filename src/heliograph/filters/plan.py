@@ -16,7 +16,7 @@ from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
 from heliograph.numerics.float64 import compiled, in_float64
 from heliograph.numerics.small_matrix import runs_last, times_vector
-from heliograph.numerics.types import Array, ArrayLike, Float, Int
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 
 class Plan(NamedTuple):
@@ -139,7 +139,7 @@ def plan(item: AbstractFilter, inputs: Float[Array, "horizon inputs"], want: Arr
 def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFilter:
     quiet = jnp.zeros(item.received)
 
-    def body(state: Any, row: tuple[jax.Array, jax.Array]) -> tuple[Any, tuple[Plan, jax.Array]]:
+    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
         one, prior, after = followed(item, state, quiet, row[1], row[0])
         return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
 
@@ -160,11 +160,11 @@ def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFil
     )
 
 
-def followed(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, Any, Any]:
+def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
     """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     none = jnp.zeros_like(state.mean)
 
-    def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], tuple[Any, ...]]:
+    def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], PyTree]:
         """What follows from each, and all that the means have no part in."""
         prior = item.predict(state._replace(mean=before), u, k)
         after, heard = item.correct(prior._replace(mean=moved), z, k)
@@ -184,7 +184,7 @@ def followed(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: St
     return one, prior, after
 
 
-def linear_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> Plan:
+def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
     """The matrices of one step of a filter of which only the mean depends on data; of z only what is missing counts.
 
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
@@ -213,7 +213,7 @@ class Linearised(NamedTuple):
     noise: jax.Array
 
 
-def linearised_step(item: AbstractFilter, state: Any, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
     """The derivatives of a filter's own correction at its prediction, with its covariance held.
 
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
@@ -239,14 +239,14 @@ def is_linear_filter(item: AbstractFilter) -> bool:
     return _is_linear(tree, tuple(map(_shape, leaves)))
 
 
-def _shape(leaf: Any) -> Any:
+def _shape(leaf: Any) -> object:
     if not eqx.is_array(leaf):
         return leaf
     return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # type: ignore[no-untyped-call]
 
 
 @lru_cache(maxsize=1024)
-def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[Any, ...]) -> bool:
+def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
     """What numbers have no part in, so that filters of one structure are traced once."""
     with jax.enable_x64(True):
         item = jax.tree.unflatten(tree, leaves)

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, GaussianFilter
+from heliograph.filters.belief import Belief
+from heliograph.filters.gaussian import GaussianFilter
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64

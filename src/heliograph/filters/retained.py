@@ -48,14 +48,14 @@ class AbstractRetained(Module):
     Shapes: mean (N,), covariance (N, N), want (n, N), shift (n,).
     """
 
-    mean: eqx.AbstractVar[Float[jax.Array, "*time N"]]
-    covariance: eqx.AbstractVar[Float[jax.Array, "*time N N"]]
-    want: eqx.AbstractVar[Float[jax.Array, "*time n N"] | None]
-    shift: eqx.AbstractVar[Float[jax.Array, "*time n"] | None]
-    surprise: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
-    heard: eqx.AbstractVar[Float[jax.Array, "*time"] | None]
-    claim: eqx.AbstractVar[Claim]
-    angles: eqx.AbstractVar[Angles]
+    mean: Float[jax.Array, "*time N"]
+    covariance: Float[jax.Array, "*time N N"]
+    want: Float[jax.Array, "*time n N"] | None
+    shift: Float[jax.Array, "*time n"] | None
+    surprise: Float[jax.Array, "*time"] | None
+    heard: Float[jax.Array, "*time"] | None
+    claim: Claim = eqx.field(static=True)
+    angles: Angles = eqx.field(static=True)
 
     def end(self) -> PyTree:
         """At this step, if it is the last."""

@@ -4,13 +4,10 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from heliograph.filters.retained import AbstractRetained, Moments, Point, applied, less
-from heliograph.model.estimate import Claim
-from heliograph.numerics.angle import Angles
 from heliograph.numerics.small_matrix import (
     Pick,
     congruence,
@@ -48,20 +45,12 @@ class RetainedLinear(AbstractRetained):
     Source: Bryson and Frazier, Smoothing for linear and nonlinear dynamic systems (1963).
     """
 
-    mean: Float[jax.Array, "*time N"]
-    covariance: Float[jax.Array, "*time N N"]
     transition: Float[jax.Array, "*time N N"]
     process: Float[jax.Array, "*time N N"] | None
     gain: Float[jax.Array, "*time N m"]
     output: Float[jax.Array, "*time m N"]
     weigh: Float[jax.Array, "*time N m"]
     innovation: Float[jax.Array, "*time m"]
-    claim: Claim = eqx.field(static=True)
-    want: Float[jax.Array, "*time n N"] | None
-    shift: Float[jax.Array, "*time n"] | None
-    surprise: Float[jax.Array, "*time"] | None
-    heard: Float[jax.Array, "*time"] | None
-    angles: Angles = eqx.field(static=True)
 
     def end(self) -> Adjoint:
         """Nothing is later."""

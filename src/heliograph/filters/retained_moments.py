@@ -2,13 +2,10 @@
 
 from dataclasses import replace
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 
 from heliograph.filters.retained import AbstractRetained, Moments, Point, applied, less
-from heliograph.model.estimate import Claim
-from heliograph.numerics.angle import Angles
 from heliograph.numerics.small_matrix import (
     runs_last,
     solve,
@@ -26,17 +23,9 @@ class RetainedMoments(AbstractRetained):
     Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
     """
 
-    mean: Float[jax.Array, "*time N"]
-    covariance: Float[jax.Array, "*time N N"]
     prior_mean: Float[jax.Array, "*time N"]
     prior_covariance: Float[jax.Array, "*time N N"]
     cross: Float[jax.Array, "*time N N"]
-    claim: Claim = eqx.field(static=True)
-    want: Float[jax.Array, "*time n N"] | None
-    shift: Float[jax.Array, "*time n"] | None
-    surprise: Float[jax.Array, "*time"] | None
-    heard: Float[jax.Array, "*time"] | None
-    angles: Angles = eqx.field(static=True)
 
     def end(self) -> Moments:
         """The filter's own."""

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.belief import Belief
 from heliograph.filters.correction import covariance_after
-from heliograph.filters.gaussian import Belief
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
 from heliograph.filters.retained import AbstractRetained

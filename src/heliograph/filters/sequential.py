@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.gaussian import Belief, GaussianFilter, predicted
+from heliograph.filters.belief import Belief, predicted
+from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import moments_retained
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest

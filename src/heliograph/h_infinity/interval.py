@@ -13,6 +13,7 @@ import numpy as np
 from jax.extend import core
 
 Numbers = np.ndarray
+Contraction = tuple[tuple[Sequence[int], Sequence[int]], tuple[Sequence[int], Sequence[int]]]  # contracted, batch
 ULPS = 4  # units in the last place: a library's sine or exponential is off by less than one, the arithmetic by a half
 MOVES = (
     "reshape", "broadcast_in_dim", "transpose", "squeeze", "slice", "concatenate", "rev", "copy", "expand_dims",
@@ -38,9 +39,9 @@ def evaluate(jaxpr: core.ClosedJaxpr, arguments: Sequence[Interval], continuous:
     Raises:
         UnknownError: an operation or a decision that cannot be followed.
     """
-    values: dict[Any, Interval] = {}
+    values: dict[core.Var, Interval] = {}
 
-    def read(atom: object) -> Interval:
+    def read(atom: core.Var | core.Literal) -> Interval:
         return exact(atom.val) if isinstance(atom, core.Literal) else values[atom]
 
     values.update(zip(jaxpr.jaxpr.invars, arguments, strict=True))
@@ -225,7 +226,7 @@ def _sum(a: Interval, axes: tuple[int, ...]) -> Interval:
     return outward(np.sum(a.low, axis=axes) - room, np.sum(a.high, axis=axes) + room)
 
 
-def _dot(a: Interval, b: Interval, dimensions: Any) -> Interval:
+def _dot(a: Interval, b: Interval, dimensions: Contraction) -> Interval:
     """Products first, then their sum over what is contracted."""
     (left, right), (left_batch, right_batch) = dimensions
 

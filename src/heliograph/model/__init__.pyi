@@ -17,6 +17,7 @@ from .clock import (
 from .estimate import (
     Estimate as Estimate,
     Innovation as Innovation,
+    weakest as weakest,
 )
 from .fading import (
     memory_matters as memory_matters,

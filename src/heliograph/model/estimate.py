@@ -45,5 +45,5 @@ class Innovation(Module):
 
 
 def weakest(claims: list[Claim]) -> Claim:
-    """The strongest claim that all of `claims` support."""
+    """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them."""
     return min(claims, key=STRENGTH.__getitem__)

@@ -91,7 +91,7 @@ def items(name: str, value: object, what: str) -> list[Any]:
     try:
         if isinstance(value, str | bytes | Mapping | AbstractSet):
             raise TypeError
-        return list(cast(Iterable[Any], value))
+        return list(cast(Iterable[object], value))
     except TypeError:
         raise fail(name, f"a list of {what}", shown(value)) from None
 

@@ -5,7 +5,7 @@ from dataclasses import fields, is_dataclass
 from functools import partial
 from html import escape
 from itertools import islice
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from heliograph.numerics.same import same
 
 T = TypeVar("T", bound=type)
+E = TypeVar("E")
 
 WIDTH, LINES, DEPTH = 110, 10, 3  # characters, lines and levels of what is shown
 FEW, SOME, MANY = 4, 8, 20  # numbers of an array, items on a line, rows of a table
@@ -48,7 +49,7 @@ def _equal(self: object, other: object) -> bool:
     return same(self, other)
 
 
-def line(value: Any, depth: int) -> str:
+def line(value: object, depth: int) -> str:
     """Any value on one line: arrays by their size, what lies deeper than `depth` by its name."""
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return _array(value)
@@ -73,7 +74,7 @@ def _ours(value: object) -> bool:
     return getattr(type(value), "__repr__", None) is _repr
 
 
-def _parts(value: object) -> Iterable[tuple[str, Any]]:
+def _parts(value: object) -> Iterable[tuple[str, object]]:
     """Names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
         return ((repr(key), each) for key, each in value.items())
@@ -84,7 +85,7 @@ def _parts(value: object) -> Iterable[tuple[str, Any]]:
     return ((name, each) for name, each in named if not name.startswith("_"))
 
 
-def _array(value: Any) -> str:
+def _array(value: np.ndarray | np.generic | jax.Array) -> str:
     if isinstance(value, jax.core.Tracer) or value.size > FEW or value.dtype.kind not in "fiub":
         return f"{value.dtype}[{','.join(map(str, value.shape))}]"
     numbers = np.asarray(value).tolist()
@@ -97,7 +98,7 @@ def _rounded(numbers: object) -> str:
     return f"{numbers:.4g}"
 
 
-def _joined(start: str, items: Iterable[object], count: int, depth: int, of: Callable[[Any], str], end: str) -> str:
+def _joined(start: str, items: Iterable[E], count: int, depth: int, of: Callable[[E], str], end: str) -> str:
     if count and depth <= 0:
         return f"{start}…{end}"
     more = [f"… {count - SOME} more"] if count > SOME else []
@@ -113,7 +114,7 @@ def _table(value: object, depth: int) -> str:
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
 
-def _entries(value: object) -> Iterable[tuple[str, Any]]:
+def _entries(value: object) -> Iterable[tuple[str, object]]:
     found = _parts(value)
     yield from islice(found, MANY)
     left = sum(1 for _ in found)

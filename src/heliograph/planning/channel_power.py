@@ -50,10 +50,10 @@ def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, An
 def by_mode(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
     """The same where the channel's modes have this law (one mode, of a channel that forgets)."""
     joint = joint_modes(channel, order=2)
-    total: dict[str, Any] = dict.fromkeys(names_of(channel), 0.0)
+    total: dict[str, Scalar] = dict.fromkeys(names_of(channel), 0.0)
     seen = dict(total)
     for weight, one in zip(law, joint.maps, strict=True):
-        powers: dict[str, Any] = {}
+        powers: dict[str, Scalar] = {}
         _send(one, second, BEGINNING, 1.0, powers)
         for name, power in powers.items():
             total[name] += weight * power
@@ -61,16 +61,16 @@ def by_mode(channel: AbstractRandomAffine, second: Second, law: Float[Array, "mo
     return {name: _over(total[name], seen[name]) for name in total}
 
 
-def _over(total: Any, seen: Any) -> Any:
+def _over(total: Scalar, seen: Scalar) -> Scalar:
     """Their quotient; zero where nothing was seen."""
     if is_traced(seen):
-        xp = library(seen)
-        return total / xp.where(seen == 0, 1.0, seen)
+        quotient: Scalar = total / library(seen).where(seen == 0, 1.0, seen)
+        return quotient
     return 0.0 if is_zero(seen) else plain(total / seen)
 
 
 def _send(
-    channel: AbstractRandomAffine, second: Second, place: Place, arrives: Scalar, powers: dict[str, Any]
+    channel: AbstractRandomAffine, second: Second, place: Place, arrives: Scalar, powers: dict[str, Scalar]
 ) -> Place:
     """Note the powers in a map that forgets, and return the place behind it."""
     match channel:
@@ -103,7 +103,7 @@ def _send(
     return place
 
 
-def _send_mixture(channel: Mixture, second: Second, place: Place, arrives: Scalar, powers: dict[str, Any]) -> Place:
+def _send_mixture(channel: Mixture, second: Second, place: Place, arrives: Scalar, powers: dict[str, Scalar]) -> Place:
     own = [not is_silent(part) for part in channel.maps]
     if sum(own) > 1:
         for i, part in enumerate(channel.maps, 1):

@@ -3,13 +3,15 @@
 A loss that is told, and the mode of a link with memory that is told, are modes; given its mode a channel forgets.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.model.channel import Channel
 from heliograph.model.over_time import OverTime, at
+from heliograph.model.sensor import AnySensor, LinearSensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.planning.channel_power import by_mode
@@ -19,6 +21,13 @@ from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import JointModes, Revealed, joint_modes
 from heliograph.random_affine.second_moments import has_known_mean, second_order
 from heliograph.random_affine.told import outcomes
+
+
+class World(NamedTuple):
+    """A sensor and the channel of what it sends, each of one step or OverTime."""
+
+    sensor: AnySensor
+    channel: Channel
 
 
 class Heard(NamedTuple):
@@ -34,14 +43,14 @@ class Heard(NamedTuple):
 class _Told(NamedTuple):
     """A channel by what is told of it: a chain (onwards from a step), its first law, and what is heard in each mode."""
 
-    onward: Any
-    initial: Any
+    onward: Array
+    initial: Array
     maps: list[AbstractRandomAffine]
     arrived: list[Bool[np.ndarray, "m"]]
     forgets: bool
 
 
-def heard(name: str, world: Any, states: Float[Array, "time n1 n1"], forever: bool, young: Any) -> Heard:
+def heard(name: str, world: World, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None) -> Heard:
     """What a node hears of states with E (x, 1)(x, 1)', in steps that repeat `forever` or begin with the first.
 
     Raises:
@@ -108,7 +117,7 @@ def _laws(
 
 
 def _span(
-    sensor: Any, channel: AbstractRandomAffine, told: _Told, states: Array, young: Any, law: Array
+    sensor: LinearSensor, channel: AbstractRandomAffine, told: _Told, states: Array, young: Array | None, law: Array
 ) -> tuple[Array, Array, Array]:
     """H, N and powers over steps with one sensor and one channel."""
     c, offset, r = (jnp.asarray(part) for part in (sensor.matrix, sensor.noise.mean, sensor.noise.covariance))
@@ -127,7 +136,7 @@ def _span(
 
 
 def _mode(
-    channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, c: Array, r: Array, young: Any
+    channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, c: Array, r: Array, young: Array | None
 ) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
     """H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""
     described, there = second_order(channel), jnp.asarray(arrived)

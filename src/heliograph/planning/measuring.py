@@ -10,18 +10,17 @@ a step of the filter with (1 + b) A X A', (1 + b) Q and another noise; b is one 
 from functools import reduce
 from itertools import product
 from math import prod
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
-from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
+from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array
 from heliograph.planning.criterion import Error
-from heliograph.planning.hearing import Heard, heard
+from heliograph.planning.hearing import Heard, World, heard
 from heliograph.planning.modes_told import Measured
 from heliograph.planning.state_power import check_constant_noise
 from heliograph.planning.transmitters import names_of
@@ -29,13 +28,6 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.node import Common, Node
 
 LISTED = 64  # modes of all nodes together
-
-
-class World(NamedTuple):
-    """A sensor and the channel of what it sends, each of one step or OverTime."""
-
-    sensor: AnySensor
-    channel: Channel
 
 
 def transmitters_of(network: Network) -> tuple[str, ...]:
@@ -82,7 +74,7 @@ def check_time(network: Network, error: Error) -> None:
         raise fail("parts that are OverTime", f"as many steps as the error's period, {error.period}", covered)
 
 
-def measured(network: Network, error: Error, young: Any = None) -> Measured:
+def measured(network: Network, error: Error, young: Array | None = None) -> Measured:
     """What the error needs. Exact noises; where probabilities are uncertain, some that dominate them.
 
     `young` is the scalar b of each step, None where the mean gains are known.
@@ -96,7 +88,7 @@ def measured(network: Network, error: Error, young: Any = None) -> Measured:
     q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
     states = _steady(plants[0], steps) if forever else _from_start(plants)
     more = 1.0 if young is None else 1 + jnp.broadcast_to(young, (steps,))
-    each = [heard(name, one, states, forever, None if young is None else more - 1)
+    each = [heard(name, one, states, forever, None if young is None else jnp.asarray(more - 1))
             for name, one in worlds_of(network).items()]  # fmt: skip
     if prod(one.law.shape[1] for one in each) > LISTED:
         raise fail("modes of a design", f"at most {LISTED} together", prod(one.law.shape[1] for one in each))

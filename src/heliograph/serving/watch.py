@@ -239,7 +239,7 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
     return found
 
 
-def _told(node: str, filter_: str, one: Surprise) -> dict[str, Any]:
+def _told(node: str, filter_: str, one: Surprise) -> dict[str, object]:
     low, high = one.band()
     numbers = {"ratio": one.ratio, "low": low, "high": high, "numbers": one.numbers}
     return {"node": node, "filter": filter_, "claim": one.claim, **numbers, "doubt": one.doubt() is not None}

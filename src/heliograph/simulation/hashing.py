@@ -6,7 +6,6 @@ number stays in a register for all of them.
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -84,16 +83,16 @@ def written_out(keys: jax.Array, programs: Sequence[ClosedJaxpr]) -> jax.Array:
 def evaluated(program: ClosedJaxpr) -> Callable[..., list[jax.Array]]:
     """A traced program as a function that takes keys of another hash than those it was traced with."""
 
-    def call(*args: object) -> list[jax.Array]:
+    def call(*args: jax.Array) -> list[jax.Array]:
         return _evaluate(program.jaxpr, program.consts, args)
 
     return call
 
 
-def _evaluate(jaxpr: Jaxpr, consts: Sequence[Any], args: Sequence[Any]) -> list[jax.Array]:
+def _evaluate(jaxpr: Jaxpr, consts: Sequence[jax.Array], args: Sequence[jax.Array]) -> list[jax.Array]:
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *args), strict=True))
 
-    def read(items: Sequence[Any]) -> list[Any]:
+    def read(items: Sequence[Var | Literal]) -> list[jax.Array]:
         return [item.val if isinstance(item, Literal) else values[item] for item in items]
 
     for operations in _stretches(jaxpr.eqns):
@@ -149,7 +148,7 @@ def _is_key(item: Var | Literal) -> bool:
 
 
 def _holds_programs(operation: JaxprEqn) -> bool:
-    def parts(value: object) -> Iterable[Any]:
+    def parts(value: object) -> Iterable[object]:
         return value if isinstance(value, tuple | list) else (value,)
 
     return any(

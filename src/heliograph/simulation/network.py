@@ -25,7 +25,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
-from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_type
+from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
@@ -85,7 +85,7 @@ class Network(Module):
         for name, node in self.nodes.items():
             check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
             for filter_, one in node.filters.items():
-                _check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
+                check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -111,7 +111,7 @@ class Network(Module):
             else:
                 check_type(f"fused {name!r}", item, AbstractFilter)
                 check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
-                _check_sizes(f"fused {name!r}", item, self.states, self.inputs)
+                check_sizes(f"fused {name!r}", item, self.states, self.inputs)
 
     @staticmethod
     def of_relays(
@@ -270,12 +270,6 @@ class Network(Module):
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
         one_of_each = [self.nodes[names[0]] for names in self.groups]  # a group's nodes cover the same steps
         check_horizon(horizon, steps_covered((self.plant, one_of_each, self.common, self.relays, self.fused)))
-
-
-def _check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
-    for what, own, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
-        if len(own) != len(theirs):
-            raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
 
 
 def _world(node: Node | Listener) -> object:

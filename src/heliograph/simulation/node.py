@@ -86,6 +86,13 @@ def check_received(name: str, item: AbstractFilter, received: int) -> None:
         raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
 
 
+def check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
+    """A filter of as many states and inputs as the plant has."""
+    for what, own, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
+        if len(own) != len(theirs):
+            raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
+
+
 def check_filters(filters: Mapping[str, object], received: int) -> None:
     """Filters that hear what arrives at their node."""
     for name, item in filters.items():

@@ -25,13 +25,15 @@ from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 from heliograph.simulation.statistics_by_name import StatisticsByName
 from heliograph.simulation.uplinks import Uplink
 
+CACHE = 2**20  # bytes of errors that are worked through at once
+
 
 class Sums(Module):
     """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
 
     Run r goes to batch r mod BATCHES; the last axis is longer, so that a block of consecutive runs lies in one piece,
     and what is beyond folds back in the end. A covariance that all runs share is summed once, without batches.
-    failed (2, time, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
+    failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
     `order`: whose estimates the parts are, kinds first and then fused ones; the first `own` have their own covariances.
     """
@@ -64,7 +66,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
             nees=jnp.zeros((steps, total, wide)),
             claimed=jnp.zeros((steps, mine, pairs, wide)),
             shared=jnp.zeros((steps, total - mine, pairs)),
-            failed=jnp.zeros((2, steps, total)),
+            failed=jnp.zeros((steps, 2, total)),
             failed_runs=jnp.zeros((2, 1, total)),
             uplinks=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["uplinks"]),
             order=order,
@@ -72,40 +74,39 @@ class Statistics(AbstractReducer[StatisticsByName]):
         )
 
     def reduce(self, carry: Sums, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[Sums, PyTree]:
-        """Add the valid runs, dealt to batches."""
-        parts, order, own = _parts(batch)
-        errors = jnp.concatenate([_error(batch["truth"], parts[i]) for i in order], axis=2)  # (n, time, part, run)
-        errors = jnp.where(valid, errors, 0.0)  # the others may hold anything
-        n, start = len(errors), runs[0] % BATCHES
-        unit = jnp.eye(n).reshape(n, n, 1, 1, 1)
-        mine = [jnp.where(valid, _claimed(parts[i]), unit) for i in order[:own]]
-        bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(parts[i]) for i in order[own:]]) if b]
-        split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
-        size = batch["truth"].transpose(2, 1, 0)[:, :, None]
-        nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
+        """Add the valid runs, dealt to batches: a few steps after another, so that what is made of them stays near."""
+        parts, order, _ = _parts(batch)
+        rows = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, -1), (batch["truth"], [parts[i] for i in order]))
+        steps, n = rows[0].shape[:2]
+        width = _steps_at_once(steps, n * carry.pairs.shape[1] * len(runs) * carry.pairs.itemsize)
+        dealt = jax.tree.map(lambda leaf: leaf.reshape(steps // width, width, *leaf.shape[1:]), rows)
+
+        def some(state: tuple[Sums, jax.Array], row: PyTree) -> tuple[tuple[Sums, jax.Array], None]:
+            following, bad = _added(state[0], row[0], row[1], runs[0] % BATCHES, valid)
+            return (following, state[1] | jnp.any(bad, axis=0)), None
+
+        begin = carry, jnp.zeros((2, carry.pairs.shape[1], len(runs)), dtype=bool)
+        firsts = jnp.arange(0, steps, width)
+        if width == steps:
+            (sums, ever), _ = some(begin, jax.tree.map(lambda leaf: leaf[0], (firsts, dealt)))
+        else:
+            (sums, ever), _ = jax.lax.scan(some, begin, (firsts, dealt))
         counted = valid.astype(float)
-        bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)]) & valid
-        failed = carry.failed + jnp.sum(bad, axis=-1)
-        failed_runs = carry.failed_runs + jnp.sum(jnp.any(bad, axis=1, keepdims=True), axis=-1)
-        claimed, shared = carry.claimed, carry.shared
-        if own:
-            claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), start)
-        if own < len(order):
-            shared = shared + _pairs(bounds[-1])[..., 0] * counted.sum()
         sent = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(valid), *x.shape[1:])), batch["uplinks"])
-        uplinks = jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent)
-        pairs = _pairs(errors[:, None] * errors[None])
-        sums = _dealt(carry.count, counted, start), _dealt(carry.pairs, pairs, start), _dealt(carry.nees, nees, start)
-        return Sums(*sums, claimed, shared, failed, failed_runs, uplinks, order, own), ()
+        return replace(
+            sums,
+            count=_dealt(carry.count, counted, 0, runs[0] % BATCHES),
+            failed_runs=carry.failed_runs + jnp.sum(ever, axis=-1)[:, None],
+            uplinks=jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent),
+        ), ()
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
         """Statistics by node and filter."""
-        parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
+        count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
         kinds = len(network.kinds)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
         axes = enumerate((-3, -2, -3, -2, -2))
         each = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
-        count = _folded(carry.count)
         result = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             result[node] = {
@@ -143,17 +144,51 @@ def _parts(batch: PyTree) -> tuple[list[Estimate], tuple[int, ...], int]:
     return parts, tuple(sorted(range(len(parts)), key=shared.__getitem__)), shared.count(False)
 
 
+def _added(
+    sums: Sums, first: jax.Array, rows: tuple[jax.Array, list[Estimate]], start: jax.Array, valid: jax.Array
+) -> tuple[Sums, jax.Array]:
+    """The sums with some steps from `first` on, of runs from batch `start` on; and where there is no estimate."""
+    truth, parts = rows
+    errors = jnp.concatenate([_error(truth, part) for part in parts], axis=2)  # (n, time, part, run)
+    errors = jnp.where(valid, errors, 0.0)  # the others may hold anything
+    unit = jnp.eye(len(errors)).reshape(len(errors), len(errors), 1, 1, 1)
+    mine = [jnp.where(valid, _claimed(part), unit) for part in parts[: sums.own]]
+    bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(part) for part in parts[sums.own :]]) if b]
+    split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
+    size = truth.transpose(1, 0, 2)[:, :, None]
+    nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
+    bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)], axis=1) & valid  # (time, 2, part, run)
+    claimed, shared = sums.claimed, sums.shared
+    if sums.own:
+        claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), first, start)
+    if sums.own < len(parts):
+        shared = _dealt(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first, 0)
+    return replace(
+        sums,
+        pairs=_dealt(sums.pairs, _pairs(errors[:, None] * errors[None]), first, start),
+        nees=_dealt(sums.nees, nees, first, start),
+        claimed=claimed,
+        shared=shared,
+        failed=_dealt(sums.failed, jnp.sum(bad, axis=-1).astype(float), first, 0),
+    ), bad
+
+
+def _steps_at_once(steps: int, size: int) -> int:
+    """As many steps as divide them all and fill no more than the cache, each of this many bytes."""
+    return max(width for width in range(1, steps + 1) if steps % width == 0 and (width == 1 or width * size <= CACHE))
+
+
 def _error(truth: jax.Array, part: Estimate) -> jax.Array:
-    """x - xhat as (n, time, part, run)."""
+    """x - xhat as (n, time, part, run), of what has the runs last."""
     mean = jnp.asarray(part.mean)
-    mean = jnp.broadcast_to(mean, (len(truth), *mean.shape[1:])).reshape(*truth.shape[:2], -1, truth.shape[2])
-    return (truth[:, :, None] - mean).transpose(3, 1, 2, 0)
+    mean = mean.reshape(len(mean), -1, *mean.shape[-2:])
+    return jnp.moveaxis(truth[:, None] - mean, 2, 0)
 
 
 def _claimed(part: Estimate) -> jax.Array:
     """The covariance as (n, n, time, part, run)."""
     value = jnp.asarray(part.covariance)
-    return value.reshape(*value.shape[:2], -1, *value.shape[-2:]).transpose(3, 4, 1, 2, 0)
+    return value.reshape(len(value), -1, *value.shape[-3:]).transpose(2, 3, 0, 1, 4)
 
 
 _squared_distance = jax.jit(squared_distance)
@@ -164,30 +199,34 @@ def _pairs(values: jax.Array) -> jax.Array:
     return jnp.stack([values[i, j] for i, j in zip(*np.triu_indices(len(values)), strict=True)], axis=2)
 
 
-def _dealt(sums: jax.Array, values: jax.Array, start: jax.Array) -> jax.Array:
-    """Add values of consecutive runs (..., run), the first of which is in batch `start`."""
-    runs, last = values.shape[-1], sums.ndim - 1
-    there = jax.lax.dynamic_slice_in_dim(sums, start, runs, last)
-    return jax.lax.dynamic_update_slice_in_dim(sums, there + values, start, last)
+def _dealt(sums: jax.Array, values: jax.Array, first: jax.Array | int, start: jax.Array | int) -> jax.Array:
+    """Add values (time, ..., run) of consecutive steps from `first` on, of consecutive runs from batch `start` on."""
+    place = (first, *[0] * (sums.ndim - 2), start) if sums.ndim > 1 else (start,)
+    there = jax.lax.dynamic_slice(sums, place, values.shape)
+    return jax.lax.dynamic_update_slice(sums, there + values, place)
 
 
-def _folded(sums: jax.Array | np.ndarray) -> np.ndarray:
-    """Sums (..., batch) of exactly BATCHES batches, (batch, ...): a view, in memory the batches are last."""
-    ahead = np.asarray(sums)
-    result = ahead[..., :BATCHES].copy()
-    result[..., : ahead.shape[-1] - BATCHES] += ahead[..., BATCHES:]
-    return np.moveaxis(result, -1, 0)
+@compiled
+def _by_batch(*sums: Array) -> list[jax.Array]:
+    """Sums (..., batch) of exactly BATCHES batches: what lies beyond belongs to the first ones."""
+
+    def folded(ahead: Array) -> jax.Array:
+        beyond = jnp.asarray(ahead)[..., BATCHES:]
+        missing = [(0, 0)] * (ahead.ndim - 1) + [(0, BATCHES - beyond.shape[-1])]
+        return jnp.asarray(ahead)[..., :BATCHES] + jnp.pad(beyond, missing)
+
+    return [folded(ahead) for ahead in sums]
 
 
-def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, ...]]:
-    """Of each kind and fused estimate: sums of pairs and of NEES by batch, mean claimed covariances by batch, failures.
+def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
+    """Runs by batch; of each kind and fused estimate sums of pairs and NEES, mean claimed covariances, and failures.
 
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
-    count, pairs, nees = _folded(carry.count), _folded(carry.pairs), _folded(carry.nees)
-    failed, failed_runs = np.asarray(carry.failed), np.asarray(carry.failed_runs)
-    own = _folded(carry.claimed)
-    own /= np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
+    sums = _by_batch(carry.count, carry.pairs, carry.nees, carry.claimed)
+    count, pairs, nees, own = (np.moveaxis(np.asarray(part), -1, 0) for part in sums)  # views: they are last in memory
+    own = own / np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
+    failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     result, place = {}, 0
     for position, i in enumerate(carry.order):
@@ -200,7 +239,7 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> list[tuple[np.ndarray, 
             for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
         )
         place = rows.stop
-    return [result[i] for i in range(len(result))]
+    return count, [result[i] for i in range(len(result))]
 
 
 def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
@@ -217,10 +256,10 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
         raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]
     sums = _of_record(record.truth, np.asarray(estimate.mean), np.asarray(estimate.covariance))
-    (parts,) = _split(sums, [])
+    count, (parts,) = _split(sums, [])
     sent = record.uplinks.get(name) if node == FUSED else None
     uplink = None if sent is None else Uplink(sent.nodes, sent.saturated.mean(axis=0), sent.symbols.mean(axis=0))
-    return replace(_statistics(_folded(sums.count), parts, estimate.claim), uplink=uplink)
+    return replace(_statistics(count, parts, estimate.claim), uplink=uplink)
 
 
 @compiled

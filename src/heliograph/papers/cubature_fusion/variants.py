@@ -8,8 +8,9 @@ import jax.numpy as jnp
 
 import heliograph as hg
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.belief import Belief
 from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import Belief, GaussianFilter, corrected
+from heliograph.filters.gaussian import GaussianFilter, corrected
 from heliograph.filters.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
