@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.numerics.small_matrix import (
     UNROLL_LIMIT,
@@ -65,7 +66,7 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     gain = times(state.gain, state.turn)
     kept = over_runs(jnp.eye(n)) - times(gain, output)
     after, lost = sum_of_squares(prior, gain, output, noise), congruence(jnp.abs(kept), jnp.abs(prior))
-    units = LEFT * float(jnp.finfo(prior.dtype).eps)
+    units = LEFT * float(np.finfo(prior.dtype).eps)
     digits = jnp.stack([units * lost[i, i] <= after[i, i] for i in range(n)])
     return gain, jnp.where(jnp.all(digits, axis=0), after, jnp.nan)
 
@@ -82,7 +83,7 @@ def _heard(state: Heard, own: jax.Array, j: int | jax.Array) -> Heard:
 
     row = output[j][None]
     f, reach = times(row, before), times(jnp.abs(row), jnp.abs(before))
-    least = ((n + 2) * float(jnp.finfo(f.dtype).eps)) ** 2 * inner(reach, reach)
+    least = ((n + 2) * float(np.finfo(f.dtype).eps)) ** 2 * inner(reach, reach)
     total = inner(f, f) + variance
     used = total > least
     safe = jnp.where(used, total, 1.0)
