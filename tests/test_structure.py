@@ -26,6 +26,7 @@ ORDER = [
         "filters.retaining",
         "filters.transform",
         "filters.scalars",
+        "filters.precise",
         "filters.correction",
         "filters.update",
     ],
