@@ -64,7 +64,7 @@ def excesses(found: Any, directions: np.ndarray, reach: np.ndarray | float = 0.0
     spread = np.sqrt(np.sum((gap - mean * count) ** 2, axis=0) * len(gap) / (len(gap) - 1)) / count.sum()
     rounding = (ROUNDING * np.sum(np.abs(directions) * reach, axis=1)) ** 2
     certain = (spread <= 1e-9 * np.abs(size)) | (np.abs(size) <= rounding)
-    off = np.where(np.abs(mean) <= 1e-6 * np.abs(size) + rounding + 1e-300, 0.0, np.inf)
+    off = np.where(np.abs(mean) <= 1e-6 * np.abs(size) + rounding + 1e-300, 0.0, np.copysign(np.inf, mean))
     return np.where(certain, off, mean / np.where(certain, 1.0, spread))
 
 

@@ -121,6 +121,22 @@ def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
     np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
 
 
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
+    """x = v a with one unknown a: the first output tells it, a second that contradicts has nothing left to say.
+
+    Of P what remains is the square of the rounding of the mean, (5 eps |v|)^2 and what K adds to it.
+    """
+    random = np.random.default_rng(seed)
+    v, h = random.normal(size=3), random.normal(size=(outputs, 3))
+    plant = hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), np.outer(v, v))
+    item = hg.kalman_filter(plant, hg.LinearSensor(h, np.zeros((outputs, outputs))))
+    found = item.estimate(item.correct(item.init(), np.arange(1.0, 1 + outputs))[0])
+    np.testing.assert_allclose(found.mean, v / (h[0] @ v), rtol=1e-12)
+    assert 0 <= np.diagonal(found.covariance).max() < 1e-28
+
+
 def test_more_precise_outputs_than_are_unrolled():
     """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
     h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14

@@ -44,7 +44,8 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. A component of
     which nothing but rounding is unknown is left out. The prior itself is known to eps |P|, with which P+ is
     eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a variance, as where a wide prior
-    or a singular noise ties states together to the last digit, it has no digits, and P+ is NaN.
+    or a singular noise ties states together to the last digit, it has no digits, and P+ is NaN. Where no more is left
+    than the square of the mean's own rounding, as of tied states behind a noise-free output, the state is known.
 
     Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
     Filtering for stochastic processes (1968).
@@ -58,21 +59,27 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     parts = root(prior), jnp.zeros((n, m)), jnp.eye(m), output, noise
     state = Heard(*(over_runs(jnp.asarray(a, prior.dtype)) for a in parts))
     own = jnp.stack([noise[j, j] for j in range(m)])
+    sizes = times(jnp.abs(state.output), jnp.abs(state.root))
     if m > UNROLL_LIMIT:
-        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, own, j), state)
+        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, own, sizes, j), state)
     else:
         for j in range(m):
-            state = _heard(state, own, j)
+            state = _heard(state, own, sizes, j)
     gain = times(state.gain, state.turn)
     kept = over_runs(jnp.eye(n)) - times(gain, output)
     after, lost = sum_of_squares(prior, gain, output, noise), congruence(jnp.abs(kept), jnp.abs(prior))
-    units = LEFT * float(np.finfo(prior.dtype).eps)
-    digits = jnp.stack([units * lost[i, i] <= after[i, i] for i in range(n)])
-    return gain, jnp.where(jnp.all(digits, axis=0), after, jnp.nan)
+    eps = float(np.finfo(prior.dtype).eps)
+    reach = times(jnp.abs(kept), jnp.abs(root(prior)))
+    known = congruence(reach, over_runs(jnp.eye(n))) + prior
+    digits = [
+        (LEFT * eps * lost[i, i] <= after[i, i]) | (after[i, i] <= (4 * (n + 2) * eps) ** 2 * known[i, i])
+        for i in range(n)
+    ]
+    return gain, jnp.where(jnp.all(jnp.stack(digits), axis=0), after, jnp.nan)
 
 
-def _heard(state: Heard, own: jax.Array, j: int | jax.Array) -> Heard:
-    """With component j too, whose noise is first taken off those after it."""
+def _heard(state: Heard, own: jax.Array, sizes: jax.Array, j: int | jax.Array) -> Heard:
+    """With component j too, whose noise is first taken off those after it; sizes |H| |R| (m, n) before all of them."""
     before, gain, turn, output, noise = state
     n, m, runs = len(before), len(output), [1] * (before.ndim - 2)
     scale = pivot_scale(noise[j, j], own[j])
@@ -82,7 +89,7 @@ def _heard(state: Heard, own: jax.Array, j: int | jax.Array) -> Heard:
     turn, output, noise = (part - share * part[j][None] for part in (turn, output, noise))
 
     row = output[j][None]
-    f, reach = times(row, before), times(jnp.abs(row), jnp.abs(before))
+    f, reach = times(row, before), times(jnp.abs(turn[j])[None], sizes)  # what earlier ones took off left its rounding
     least = ((n + 2) * float(np.finfo(f.dtype).eps)) ** 2 * inner(reach, reach)
     total = inner(f, f) + variance
     used = total > least
