@@ -76,10 +76,12 @@ def directions_of(found: Any, random: np.random.Generator) -> np.ndarray:
 
 
 def reach_of(plant: Any) -> np.ndarray:
-    """How far from zero the states may come without noise, in HORIZON steps."""
-    sizes = [np.abs(np.asarray(plant.initial_mean))]
+    """How far from zero the states may come in HORIZON steps: the mean, and a deviation of what is random."""
+    start, noise = (np.sqrt(np.diag(np.asarray(c))) for c in (plant.initial_covariance, plant.noise.covariance))
+    sizes = [np.abs(np.asarray(plant.initial_mean)) + start]
     for _ in range(HORIZON):
-        sizes.append(np.abs(plant.matrix) @ sizes[-1] if isinstance(plant, hg.LinearPlant) else sizes[-1] + 1)
+        moved = np.abs(plant.matrix) @ sizes[-1] if isinstance(plant, hg.LinearPlant) else sizes[-1] + 1
+        sizes.append(moved + noise)
     return np.asarray(np.max(sizes, axis=0))
 
 
