@@ -1,7 +1,7 @@
 """Every benchmark: ours beside its peers, as ratios of one session on one machine, in a table and in results.json.
 
 Run: python benchmarks/run.py [--without-peers] [--old SRC]; the former for machines without a network, the latter
-measures another release beside ours (benchmarks/nodes.py).
+measures another release beside ours: by number of nodes, and its programs of the same names in turn with ours.
 
 Peers and ours are programs (benchmarks/peers) that read one file of data. Their estimates are compared first; then
 each is asked for one pass in turn, ROUNDS times, and the least time of each counts. Nobody's threads are restricted,
@@ -10,8 +10,9 @@ and every program has chosen its best width of a batch before.
 results.json: date, load (of the machine, before), machine, threads, and `comparisons` and `alone` by name.
 A comparison has title, unit, runs, steps, floor (arithmetic, memory), distance (ours over the larger), ours, and peers
 by title. Each of these has best, median, how, runs and versions; a peer also difference (None: it computes something
-else, as its title says), ratio, target and met, or only absent, the reason. A benchmark alone has unit, values, at_most
-and met.
+else, as its title says), ratio, target and met, or only absent, the reason. Where another release was measured,
+old_release has its best and median, the difference, and how many times as long ours takes by either. A benchmark alone
+has unit, values, at_most and met.
 """
 
 import argparse
@@ -29,11 +30,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from peers import machine, problems
 from peers.environments import python_of
-from peers.running import Running
+from peers.running import Running, program_of
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results.json"
 ROUNDS = 15
+OTHER = "heliograph, the other release"
 AGREEMENT = 1e-8  # largest difference of any estimate; all are of order one
 ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
@@ -53,6 +55,7 @@ class Program(NamedTuple):
     environment: str | None = None
     target: float | None = None
     same: bool = True
+    source: Path | None = None  # the src folder of another release of ours
 
 
 class Comparison(NamedTuple):
@@ -103,11 +106,13 @@ COMPARISONS = {
 }
 
 
-def compare(item: Comparison, rates: dict[str, Any], with_peers: bool) -> dict[str, Any]:
+def compare(item: Comparison, rates: dict[str, Any], with_peers: bool, old: str | None = None) -> dict[str, Any]:
     """All programs on one problem, as it stands in results.json."""
     problem = item.problem()
     runs, steps = problem.arrays["z"].shape[:2]
-    found = {program: interpreter(program, with_peers) for program in (item.ours, *item.peers)}
+    other = None if old is None else earlier(item.ours, Path(old))
+    asked = (item.ours, *item.peers) if other is None else (item.ours, other, *item.peers)
+    found = {program: interpreter(program, with_peers) for program in asked}
     running = together(problem, {program: python for program, python in found.items() if isinstance(python, Path)})
     ours = running[item.ours].result()
     floor = {"arithmetic": problem.flops / rates["gflops"], "memory": problem.bytes / rates["gbytes"]}
@@ -115,10 +120,25 @@ def compare(item: Comparison, rates: dict[str, Any], with_peers: bool) -> dict[s
         peer.title: judged(peer, running[peer], running[item.ours]) if peer in running else {"absent": found[peer]}
         for peer in item.peers
     }
-    return {
+    result: dict[str, Any] = {
         "title": problem.title, "unit": "ns per step and run", "runs": runs, "steps": steps,
         "floor": {name: round(value, 2) for name, value in floor.items()},
         "distance": round(ours["best"] / max(floor.values()), 1), "ours": ours, "peers": peers,
+    }  # fmt: skip
+    return result if other is None else result | {"old_release": compared(running[other], running[item.ours])}
+
+
+def earlier(ours: Program, source: Path) -> Program | None:
+    """The same program of another release, if it has one: in turn with ours, so that a ratio means something."""
+    return ours._replace(title=OTHER, source=source) if program_of(source, ours.file).exists() else None
+
+
+def compared(its: Running, ours: Running) -> dict[str, Any]:
+    """Another release's times, and how many times as long ours takes."""
+    found, own = its.result(), ours.result()
+    return {
+        "best": found["best"], "median": found["median"], "difference": difference(its, ours),
+        "ours over it": round(own["best"] / found["best"], 3), "medians": round(own["median"] / found["median"], 3),
     }  # fmt: skip
 
 
@@ -130,7 +150,7 @@ def together(problem: problems.Problem, pythons: dict[Program, Path]) -> dict[Pr
         np.savez(data, **problem.arrays)
         try:
             for program, python in pythons.items():
-                running[program] = Running(program.file, python, data)
+                running[program] = Running(program.file, python, data, program.source)
             ours, *peers = running
             for peer in peers:
                 if peer.same:
@@ -197,6 +217,10 @@ def show_comparison(c: dict[str, Any]) -> None:
         gap = "other model" if p["difference"] is None else f"{p['difference']:.0e}"
         print(f"  {title:<36}{p['best']:>11,.1f}{p['median']:>11,.1f}{p['ratio']:>9.1f}{p['target'] or '-':>8}"
               f"{word(p['met']):>5}{gap:>12}  {p['how']}")  # fmt: skip
+    if "old_release" in c:
+        old = c["old_release"]
+        times = f"ours takes {old['ours over it']} and {old['medians']} times as long"
+        print(f"  {OTHER:<36}{old['best']:>11,.1f}{old['median']:>11,.1f}  {times}; difference {old['difference']:.0e}")
     floor = c["floor"]
     print(
         f"  floor: arithmetic {floor['arithmetic']}, memory {floor['memory']}; ours takes {c['distance']} times as long"
@@ -217,14 +241,14 @@ def word(met: bool | None) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Run every benchmark and write benchmarks/results.json.")
     parser.add_argument("--without-peers", action="store_true", help="leave out what needs a peer's environment")
-    parser.add_argument("--old", help="the src folder of another release, measured beside ours by number of nodes")
+    parser.add_argument("--old", help="the src folder of another release, measured beside ours")
     chosen = parser.parse_args()
     with_peers = not chosen.without_peers
     load, rates = os.getloadavg()[0], machine.describe()
     print(f"{rates['cpu']}, {rates['cores']} cores, {rates['gflops']} Gflop/s, {rates['gbytes']} GB/s; load {load:.1f}")
     comparisons, others = {}, {}
     for name, item in COMPARISONS.items():
-        comparisons[name] = compare(item, rates, with_peers)
+        comparisons[name] = compare(item, rates, with_peers, chosen.old)
         show_comparison(comparisons[name])
     for name in (*ALONE, *(BESIDE if with_peers else ())):
         others[name] = alone(name, chosen.old)

@@ -1,6 +1,7 @@
 """The driver's side of `timed`: a program in a process of its own, asked for one time after another."""
 
 import json
+import os
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -10,13 +11,26 @@ import numpy as np
 HERE = Path(__file__).resolve().parent
 
 
+def program_of(source: Path, file: str) -> Path:
+    """Where a release, whose src folder this is, keeps its program of this name."""
+    return source.resolve().parent / "benchmarks" / "peers" / f"{file}.py"
+
+
 class Running:
     """A program in its own process, which has written its estimates and waits to be asked for times."""
 
-    def __init__(self, file: str, python: Path, data: Path):
-        self.file, written = file, data.with_name(f"{file}.npy")
-        command = [str(python), str(HERE / f"{file}.py"), str(data), str(written)]
-        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    def __init__(self, file: str, python: Path, data: Path, source: Path | None = None):
+        """`source` is the src folder of another release, whose own program of this name is run."""
+        self.file, written = file, data.with_name(f"{file}{'' if source is None else '_old'}.npy")
+        program = HERE / f"{file}.py" if source is None else program_of(source, file)
+        environment = os.environ | ({} if source is None else {"PYTHONPATH": str(source)})
+        self.process = subprocess.Popen(
+            [str(python), str(program), str(data), str(written)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
         self.about = self._read()
         self.means = np.load(written)
         self.times: list[float] = []
