@@ -144,3 +144,9 @@ def test_nothing_outside_papers_knows_a_paper():
     for path in FILES:
         if "papers" not in path.parts and "cli" not in path.parts:
             assert not any(name.startswith("papers") for name in imports(path)), path.name
+
+
+def test_eigenvalues_of_a_batch_are_taken_one_after_another():
+    """A batch at once is dealt out to threads by calls that wait on them: two filters side by side wait for ever."""
+    direct = [p.relative_to(SOURCE).as_posix() for p in SOURCE.rglob("*.py") if "jnp.linalg.eigh(" in p.read_text()]
+    assert direct == ["numerics/linalg.py"]

@@ -22,7 +22,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.angle import nearest, wrapped
 from heliograph.numerics.check import fail, items
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import eigh, symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.second_moments import SecondOrder
 
@@ -150,7 +150,7 @@ def _share(square: jax.Array, place: int) -> jax.Array:
     correlations = scale[:, None] * square * scale
     others = [i for i in range(square.shape[0]) if i != place]
     among, own = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), place]
-    values, vectors = jnp.linalg.eigh(among)
+    values, vectors = eigh(among)
     used = values > RANK * values[-1]
     known = jnp.sum(jnp.where(used, (vectors.T @ own) ** 2 / jnp.where(used, values, 1.0), 0.0))
     return jnp.where(size[place] > 0, 1 - known, 0.0)

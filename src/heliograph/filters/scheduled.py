@@ -22,6 +22,7 @@ from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import instance, names
 from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import eigh
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
 
 
@@ -206,7 +207,7 @@ def pseudo_solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:
     """O^+ C as in heliograph.linear.recursion; rows of zeros (absent components) are skipped."""
     deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(innovation), 0.0))
     scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
-    values, vectors = jnp.linalg.eigh(scale[:, None] * innovation * scale)
+    values, vectors = eigh(scale[:, None] * innovation * scale)
     used = values > RANK_TOLERANCE * values[-1]
     inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
     root = scale[:, None] * vectors

@@ -35,7 +35,7 @@ from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.linalg import eigh, symmetrize
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 
 
@@ -171,7 +171,7 @@ def _middle(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 def _worst(each: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
     """Above sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
-    values, vectors = jnp.linalg.eigh(each - jnp.mean(each, axis=0))
+    values, vectors = jax.vmap(eigh)(each - jnp.mean(each, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
     return jnp.einsum("i,iab->ab", middle, each) + jnp.einsum("i,iab->ab", reach, sizes)
 
