@@ -56,7 +56,8 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     def over_runs(a: jax.Array) -> jax.Array:
         return jnp.broadcast_to(a.reshape(*a.shape, *[1] * (2 + len(runs) - a.ndim)), (*a.shape[:2], *runs))
 
-    parts = root(prior), jnp.zeros((n, m)), jnp.eye(m), output, noise
+    start = root(prior)
+    parts = start, jnp.zeros((n, m)), jnp.eye(m), output, noise
     state = Heard(*(over_runs(jnp.asarray(a, prior.dtype)) for a in parts))
     own = jnp.stack([noise[j, j] for j in range(m)])
     sizes = times(jnp.abs(state.output), jnp.abs(state.root))
@@ -66,16 +67,20 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
         for j in range(m):
             state = _heard(state, own, sizes, j)
     gain = times(state.gain, state.turn)
-    kept = over_runs(jnp.eye(n)) - times(gain, output)
-    after, lost = sum_of_squares(prior, gain, output, noise), congruence(jnp.abs(kept), jnp.abs(prior))
-    eps = float(np.finfo(prior.dtype).eps)
-    reach = times(jnp.abs(kept), jnp.abs(root(prior)))
-    known = congruence(reach, over_runs(jnp.eye(n))) + prior
+    kept, after = over_runs(jnp.eye(n)) - times(gain, output), sum_of_squares(prior, gain, output, noise)
+    return gain, jnp.where(_has_digits(prior, start, kept, after), after, jnp.nan)
+
+
+def _has_digits(prior: jax.Array, start: jax.Array, kept: jax.Array, after: jax.Array) -> jax.Array:
+    """Whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the square of the mean's rounding."""
+    n, eps = len(prior), float(np.finfo(prior.dtype).eps)
+    lost, reach = congruence(jnp.abs(kept), jnp.abs(prior)), times(jnp.abs(kept), jnp.abs(start))
     digits = [
-        (LEFT * eps * lost[i, i] <= after[i, i]) | (after[i, i] <= (4 * (n + 2) * eps) ** 2 * known[i, i])
+        (LEFT * eps * lost[i, i] <= after[i, i])
+        | (after[i, i] <= (4 * (n + 2) * eps) ** 2 * (inner(reach[i][None], reach[i][None]) + prior[i, i]))
         for i in range(n)
     ]
-    return gain, jnp.where(jnp.all(jnp.stack(digits), axis=0), after, jnp.nan)
+    return jnp.all(jnp.stack(digits), axis=0)
 
 
 def _heard(state: Heard, own: jax.Array, sizes: jax.Array, j: int | jax.Array) -> Heard:

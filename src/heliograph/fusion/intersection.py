@@ -121,7 +121,7 @@ def _weighted(
 def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     """One step for g - s + m 1 = 0, sum w = 1, w s = target: eliminate s, then the multiplier m.
 
-    The target is aimed at from where the step with target 0 would end (Mehrotra's predictor and corrector).
+    The target follows from where the step with target 0 would end (Mehrotra's predictor and corrector).
     """
     w, slack, gradient = point.weights, point.slack, point.gradient
     root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish

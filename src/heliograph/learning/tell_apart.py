@@ -30,7 +30,7 @@ HORIZON, RUNS = 500, 32  # steps and runs that are simulated under each law
 class SamplesToTell(NamedTuple):
     """How many steps the likelihood ratio needs, and what it gains in each.
 
-    samples: steps after which both errors are as small as asked; infinite where the laws look alike. information: mean
+    samples: steps after which both errors are at most `error`; infinite where the laws look alike. information: mean
     of log p_own - log p_other per step under the first law and under the second, nats; deviation: of that, in the long
     run.
     """

@@ -36,7 +36,7 @@ def large_program(function: Callable[P, R], donate: Literal["none", "all-except-
 def understood() -> dict[str, bool | int]:
     """The options, if this release of the compiler has them: they are not part of its promises.
 
-    Without the level where the user has asked JAX for next to no optimisation: an option goes before that.
+    Without the level where JAX's flag jax_disable_most_optimizations is set, which an option would overrule.
     """
     least = jax.config.values["jax_disable_most_optimizations"]
     options = {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL)}

@@ -1,4 +1,4 @@
-"""A service as it was asked for: what it reads from, where it keeps its state, who shares it, and who may look."""
+"""A service by its options: what it reads from, where it keeps its state, who shares it, and who may look."""
 
 import asyncio
 import os
