@@ -60,3 +60,14 @@ def test_bad_input():
         hg.simulation.memory_test(np.zeros(50))
     with pytest.raises(ValueError, match=r"^measurements"):
         hg.simulation.memory_test(np.zeros((200, 3)), hg.linear_filter(PLANT, SENSOR, bursts()))
+
+
+def test_what_an_output_says_again_is_no_surprise():
+    """A sensor that reads the state twice without noise: the second reading has nothing new to say."""
+    plant = hg.LinearPlant([[0.8]], noise=hg.Gaussian([[1.0]]), initial_mean=[0.0], initial_covariance=[[1.0]])
+    twice = hg.LinearSensor([[1.0], [2.0]], noise=hg.Gaussian(np.zeros((2, 2))))
+    x = np.random.default_rng(3).normal(size=(400, 1)).cumsum(axis=0)
+    white = hg.simulation.whitened_innovations(x * [1.0, 2.0], hg.kalman_filter(plant, twice))
+    alone = hg.simulation.whitened_innovations(x, hg.kalman_filter(plant, hg.LinearSensor([[1.0]], [[0.0]])))
+    np.testing.assert_allclose(white[:, :1], alone, rtol=1e-12)
+    assert np.all(np.isnan(white[:, 1]))

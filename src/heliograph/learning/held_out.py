@@ -2,8 +2,6 @@
 
 from dataclasses import dataclass
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy.special import ndtr
 
@@ -12,12 +10,11 @@ from heliograph.learning.choice import Comparison, compared
 from heliograph.learning.foretelling import predictive
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError
-from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
-from heliograph.numerics.types import Array, Float, PyTree
+from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.whiteness import MemoryTest, memory_of
+from heliograph.simulation.whiteness import MemoryTest, heard_by, memory_of
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 
@@ -107,27 +104,7 @@ def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> 
 
 
 def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    likelihood, white = (np.asarray(part)[cut:] for part in _heard(item, z, u))
+    likelihood, white = (np.asarray(part)[cut:] for part in heard_by(item, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)
-
-
-@compiled
-def _heard(
-    item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
-) -> tuple[jax.Array, jax.Array]:
-    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance; NaN where nothing came."""
-
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
-        k, z_k, u_k = row
-        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
-        there = ~jnp.isnan(heard.value)
-        covariance = jnp.where(there[:, None] & there, heard.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
-        root = jnp.linalg.cholesky(covariance)
-        white = jax.scipy.linalg.solve_triangular(root, jnp.where(there, heard.value, 0.0), lower=True)
-        return after, (jnp.asarray(heard.log_likelihood), jnp.where(there, white, jnp.nan))
-
-    start = jax.tree.map(jnp.asarray, item.init())
-    found = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return found[0], found[1]

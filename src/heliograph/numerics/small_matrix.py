@@ -251,9 +251,23 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
     say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
     """
-    n = a.shape[0]
-    own = jnp.stack([a[i, i] for i in range(n)])
+    own = jnp.stack([a[i, i] for i in range(a.shape[0])])
     reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own, 0.0)) + OFF_VALUE * jnp.abs(size)
+    total: list[jax.Array] = []
+    for i, (rest, scale) in enumerate(_substituted(a, x)):
+        agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
+        total.append(jnp.where(scale == 0, agrees, (rest * scale) ** 2))
+    return add(total)
+
+
+def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
+    """L^-1 x for a positive semidefinite A = L L'; NaN for a component that those before it determine."""
+    return jnp.stack([jnp.where(scale == 0, jnp.nan, rest * scale) for rest, scale in _substituted(a, x)])
+
+
+def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
+    """Of each component what those before it do not say, x_i - sum_j L_ij y_j, and 1 / L_ii: y_i is their product."""
+    n = a.shape[0]
     if n > UNROLL_LIMIT:
         lower = root(a)
         columns, scales = list(jnp.moveaxis(lower, 1, 0)), [lower[i, i] for i in range(n)]
@@ -261,13 +275,11 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     else:
         columns, scales = factor(a)
     forward: list[jax.Array] = []
-    total: list[jax.Array] = []
+    rests: list[jax.Array] = []
     for i in range(n):  # L y = x
-        rest = add([x[i], *(-columns[j][i] * forward[j] for j in range(i))])
-        forward.append(rest * scales[i])
-        agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
-        total.append(jnp.where(scales[i] == 0, agrees, forward[i] ** 2))
-    return add(total)
+        rests.append(add([x[i], *(-columns[j][i] * forward[j] for j in range(i))]))
+        forward.append(rests[i] * scales[i])
+    return list(zip(rests, scales, strict=True))
 
 
 def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:

@@ -12,6 +12,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.numerics.check import array, check_count, fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.readable import readable
+from heliograph.numerics.small_matrix import whiten
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
 from heliograph.simulation.likelihood import rows
 
@@ -96,7 +97,7 @@ def whitened_innovations(
 ) -> Float[np.ndarray, "steps m"]:
     """Innovations of a recording in units of what the filter claims: white and of variance 1 where the claim holds.
 
-    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived.
+    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could.
 
     Shapes: data (steps, received), inputs (steps, inputs).
 
@@ -109,7 +110,7 @@ def whitened_innovations(
         raise fail("filter", "one that claims a covariance", "one that claims none")
     z = rows("measurements", data, None, item.received, missing=True)
     given = np.zeros((len(z), 0)) if inputs is None else inputs
-    return np.asarray(_whitened(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False)))
+    return np.asarray(heard_by(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False))[1])
 
 
 def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -130,18 +131,22 @@ def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 @compiled
-def _whitened(item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
-    """L^-1 (z - E z) with L L' the innovation's covariance, component by component; NaN where it did not arrive."""
+def heard_by(
+    item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> tuple[jax.Array, jax.Array]:
+    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance, by component.
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
+    NaN where it did not arrive, or the components before it determine it.
+    """
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
         k, z_k, u_k = row
         after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
         there = ~jnp.isnan(heard.value)
         covariance = jnp.where(there[:, None] & there, heard.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
-        root = jnp.linalg.cholesky(covariance)
-        white = jax.scipy.linalg.solve_triangular(root, jnp.where(there, heard.value, 0.0), lower=True)
-        return after, jnp.where(there, white, jnp.nan)
+        white = whiten(covariance, jnp.where(there, heard.value, 0.0))
+        return after, (jnp.asarray(heard.log_likelihood), jnp.where(there, white, jnp.nan))
 
     start = jax.tree.map(jnp.asarray, item.init())
-    result: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return result
+    found = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return found[0], found[1]
