@@ -1,0 +1,78 @@
+"""A network, its data and how the command is called with them."""
+
+import sys
+from types import ModuleType
+
+from heliograph import cli
+
+NETWORK = """
+import jax.numpy as jnp
+import numpy as np
+
+import heliograph as h
+
+
+def move(x, u):
+    return x + u[1] * jnp.array([x[1], u[0]])
+
+
+plant = h.Plant(move, 0.01 * np.eye(2), [0, 0], np.eye(2), states=["p", "v"], inputs=["push", "dt"])
+sensor = h.LinearSensor([[1.0, 0.0]], 0.1, outputs=["pos"])
+link = h.hop(h.Discrete([0.8, 1.2], [0.5, 0.5]), 0.1)
+filters = {
+    "aware": h.cubature_filter(plant, sensor, link),
+    "trusting": h.mean_gain_filter(plant, sensor, link),
+}
+network = h.Network(plant, {"remote": h.Node(sensor, link, filters)})
+"""
+LOSING = """
+import equinox as eqx
+
+
+class Losing(h.filters.AbstractFilter):
+    claim: str = eqx.field(static=True, default="nominal")
+    states: tuple = eqx.field(static=True, default=("p", "v"))
+    inputs: tuple = eqx.field(static=True, default=("push", "dt"))
+    received: int = eqx.field(static=True, default=1)
+
+    def init(self):
+        return jnp.ones(2)
+
+    def predict(self, state, u=(), k=0):
+        return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
+
+    def correct(self, state, z, k=0):
+        return state, h.model.Innovation(z, jnp.eye(1), 0.0)
+
+    def estimate(self, state):
+        return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
+
+
+network = h.Network(plant, {"remote": h.Node(sensor, link, {"losing": Losing()})})
+"""
+DATA = "time,push,pos\n0,0,0.5\n0.5,1,\n0.5,0,0.7\n2,0.5,nan\n"
+
+
+def contents(folder):
+    return {str(p.relative_to(folder)): p.is_file() and p.read_bytes() for p in folder.rglob("*")}
+
+
+def run_arguments(network="net.py", measurements="data.csv", out="out.csv") -> list[str]:
+    return ["run", network, "--measurements", measurements, "--out", out]
+
+
+def refused(folder, capsys, arguments, *fragments) -> None:
+    before = contents(folder)
+    assert cli.main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("heliograph: ") and said.err.endswith("\n") and said.err.count("\n") == 1
+    for fragment in fragments:
+        assert fragment in said.err
+    assert contents(folder) == before
+
+
+def demo_module(monkeypatch, example) -> None:
+    module = ModuleType("heliograph.examples.demo")
+    module.example = example
+    monkeypatch.setitem(sys.modules, "heliograph.examples.demo", module)

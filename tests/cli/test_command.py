@@ -1,0 +1,156 @@
+"""The command's options, hints, and what it says of itself; what it loads for that."""
+
+import subprocess
+import sys
+
+import pytest
+
+import heliograph as h
+from heliograph import cli
+from heliograph.numerics.check import InputError
+from tests.cli.example import contents, demo_module, refused, run_arguments
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["rnu"], ["rnu", 'Did you mean "run"']),
+        (["run", "net.py"], ["--measurements"]),
+        (["completion", "csh"], ["csh"]),
+        (["new"], ["FILE"]),
+        ([*run_arguments(), "--bogus", "3"], ["--bogus"]),
+        (["demo", "--out", "out", "--seed", "many"], ["--seed", "many"]),
+    ],
+)
+def test_a_command_line_that_is_none(folder, capsys, arguments, fragments):
+    refused(folder, capsys, arguments, *fragments)
+
+
+def test_demo_takes_folder_and_seed(folder, monkeypatch):
+    calls = []
+    demo_module(monkeypatch, lambda out, seed, drive="plaza2": calls.append((str(out), seed, drive)))
+    assert cli.main(["demo", "--out", "results", "--seed", "3"]) == 0
+    assert cli.main(["demo", "--out", "results", "--recording", "plaza1"]) == 0
+    assert cli.main(["example", "demo", "--out", "results", "--seed", "4"]) == 0
+    assert calls == [("results", 3, "plaza2"), ("results", 0, "plaza1"), ("results", 4, "plaza2")]
+
+
+def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
+    def lacking(*_):
+        raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot")
+
+    demo_module(monkeypatch, lacking)
+    refused(folder, capsys, ["demo", "--out", "results"], "matplotlib", sys.executable, '[report]"')
+    for name in ("pyarrow", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, name, None)
+    refused(folder, capsys, run_arguments(out="out.parquet"), "pyarrow", ' -m pip install "', '[tables]"')
+    assert cli.main(run_arguments()) == 0  # CSV does without
+
+
+def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
+    def wrong(*_):
+        raise InputError("thing: expected\n  one, got\n  two")
+
+    demo_module(monkeypatch, wrong)
+    refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")
+
+
+@pytest.mark.parametrize(
+    "bug",
+    [
+        RuntimeError("bug"),
+        ValueError("bug: not said by a check"),
+        ModuleNotFoundError("bug", name="heliograph.nowhere"),
+    ],
+)
+def test_a_bug_keeps_its_traceback(folder, monkeypatch, bug):
+    def broken(*_):
+        raise bug
+
+    demo_module(monkeypatch, broken)
+    with pytest.raises(type(bug), match="bug"):
+        cli.main(["demo", "--out", "results"])
+
+
+def test_version_and_help(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{h.__version__}\n"
+    assert cli.main(["run", "--help"]) == 0
+    assert "--measurements" in capsys.readouterr().out
+
+
+def without_jax(arguments) -> str:
+    """What the command prints in a process of its own, which must not load JAX."""
+    code = (
+        f"import sys; from heliograph.cli import main; code = main({arguments}); "
+        "assert not {'jax', 'numpy', 'equinox', 'scipy'} & set(sys.modules); sys.exit(code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_help_does_not_load_jax():
+    said = without_jax(["--help"])
+    assert "run" in said and "demo" in said and "example" in said
+
+
+def test_lists_do_not_load_jax():
+    lines = without_jax(["example"]).splitlines()
+    assert [line.split()[0] for line in lines] == [
+        *(
+            "delays",
+            "demo",
+            "fusion",
+            "late-data",
+            "learning",
+            "links-with-memory",
+            "live",
+            "motor-drive",
+            "network-design",
+            "range-bearing",
+            "smoothing",
+        )
+    ]
+    assert all(len(line.split()) > 5 for line in lines)
+    assert "cubature-fusion" in without_jax(["reproduce"]).splitlines()
+
+
+def test_a_refusal_in_a_process_of_its_own(folder):
+    (folder / "data.csv").write_text("time,push,poss\n0,0,1\n")
+    before = contents(folder)
+    command = [sys.executable, "-m", "heliograph", *run_arguments()]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=folder)
+    assert done.returncode == 2
+    assert done.stderr.startswith("heliograph: data.csv, header: expected only the columns time, push, dt, pos, got")
+    assert done.stderr.count("\n") == 1 and done.stdout == ""
+    assert contents(folder) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["reproduce", "cubatur", "--out", "o"], ["method: expected one of cubature-fusion", "or all, got 'cubatur'"]),
+        (["reproduce", "cubature-fusion"], ["reproduce: expected a folder for the results (--out DIR), got none"]),
+        (["reproduce", "all", "--out", "o", "--runs", "0"], ["--runs: expected a positive whole number, got 0"]),
+        (["reproduce", "all", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
+        (
+            ["example", "dmeo", "--out", "o"],
+            ["example: expected one of delays, demo, fusion, late-data", "smoothing, got 'dmeo'"],
+        ),
+        (["demo", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0 to 4294967295, got 111"]),
+        (["demo", "--out", "o", "--seed", "-1"], ["--seed: expected a whole number from 0 to 4294967295, got -1"]),
+        (["reproduce", "all", "--out", "o", "--seed", "1" * 23], ["--seed: expected a whole number from 0"]),
+        (["reproduce", "all", "--out", "o", "--runs", "1" * 23], ["--runs: expected at most 4294967295, got 111"]),
+        (["reproduce", "all", "--out", "o", "--runs", "150.7"], ["--runs: expected a whole number, got '150.7'"]),
+        (["reproduce", "all", "--out", "o", "--runs", "1_000"], ["--runs: expected a whole number, got '1_000'"]),
+        (["reproduce", "all", "--out", "o", "--runs", "0x100"], ["--runs: expected a whole number, got '0x100'"]),
+        (["demo", "--out", ""], ["--out: expected a path, got ''"]),
+        (["demo", "--out", "o\0"], ["--out: expected a path, got 'o\\x00'"]),
+        (["run", "\x1b[31m.py", "--measurements", "data.csv", "--out", "o.csv"], ["network \\x1b[31m.py: expected"]),
+        (["example", "demo"], ["example: expected a folder for the results (--out DIR), got none"]),
+        (["example", "demo", "--out", "net.py"], ["output folder net.py: expected a folder, got a file"]),
+    ],
+)
+def test_bad_reproductions_and_examples(folder, capsys, arguments, fragments):
+    refused(folder, capsys, arguments, *fragments)

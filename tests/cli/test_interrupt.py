@@ -1,0 +1,111 @@
+"""Ctrl-C at any moment ends with 130, one line at most, and nothing half written."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from heliograph import cli
+from heliograph.files.table import read_table
+from tests.cli.example import NETWORK, contents, demo_module, run_arguments
+
+START = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'heliograph'; "
+
+
+@pytest.mark.parametrize(
+    ("signal_number", "code"), [(signal.SIGINT, cli.INTERRUPTED), (signal.SIGTERM, cli.TERMINATED)]
+)
+def test_nothing_is_left_after_an_interrupt(folder, monkeypatch, signal_number, code):
+    before, handler = contents(folder), signal.getsignal(signal.SIGTERM)
+
+    def interrupt(*_):
+        assert len(contents(folder)) == len(before) + 1
+        signal.raise_signal(signal_number)
+
+    monkeypatch.setattr(os, "replace", interrupt)
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)  # a background job inherits "ignore"
+    try:
+        assert cli.main(run_arguments()) == code
+    except SystemExit as stopped:
+        assert stopped.code == code
+    finally:
+        signal.signal(signal.SIGINT, inherited)
+    assert contents(folder) == before
+    assert signal.getsignal(signal.SIGTERM) is handler
+
+
+def in_a_callback():
+    class Removed:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)  # an exception in here is swallowed, with a word on stderr
+
+    item = Removed()
+    del item
+    for _ in range(500):  # of its own, a sleep of 5 s would be over first
+        time.sleep(0.01)
+    raise AssertionError("it went on")
+
+
+def told_as_something_else():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise RuntimeError("INTERNAL: KeyboardInterrupt") from None
+
+
+def kept_quiet():
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        return
+
+
+@pytest.mark.parametrize("interrupt", [in_a_callback, told_as_something_else, kept_quiet])
+def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
+    demo_module(monkeypatch, lambda out, seed, recording: interrupt())
+    inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert cli.main(["demo", "--out", "results"]) == cli.INTERRUPTED
+    finally:
+        signal.signal(signal.SIGINT, inherited)
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.2])
+def test_ctrl_c_in_a_process_of_its_own(folder, delay):
+    """From when the network's file is read: then all is loaded, traced and compiled."""
+    (folder / "net.py").write_text("print('ready', flush=True)\n" + NETWORK)
+    before = contents(folder)
+    program = START + "from heliograph.__main__ import command; command()"
+    process = subprocess.Popen([sys.executable, "-c", program, *run_arguments()], cwd=folder, text=True,
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE)  # fmt: skip
+    assert process.stdout.readline() == "ready\n"
+    time.sleep(delay)
+    process.send_signal(signal.SIGINT)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode in (0, cli.INTERRUPTED) and said.count("\n") <= 1
+    if process.returncode == 0:  # it was done
+        assert len(read_table(folder / "out.csv")["time"]) == len(read_table(folder / "data.csv")["time"])
+    else:
+        assert contents(folder) == before
+
+
+@pytest.mark.parametrize("module", ["cyclopts", "heliograph.cli"])
+def test_ctrl_c_while_the_command_is_imported(folder, module):
+    program = (
+        START
+        + f"""
+class Interrupted:
+    def find_spec(self, name, path=None, target=None):
+        if name == "{module}":
+            signal.raise_signal(signal.SIGINT)
+
+from heliograph.__main__ import command
+sys.meta_path.insert(0, Interrupted())
+command()"""
+    )
+    done = subprocess.run([sys.executable, "-c", program, "--help"], capture_output=True, text=True, cwd=folder)
+    assert (done.returncode, done.stderr, done.stdout) == (130, "", "")

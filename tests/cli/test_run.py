@@ -1,0 +1,139 @@
+"""What `heliograph run` writes, and what it refuses."""
+
+import os
+
+import numpy as np
+import pytest
+
+import heliograph as h
+from heliograph import cli
+from heliograph.files.network_file import load_network
+from heliograph.files.recording import read_recording
+from heliograph.files.table import read_table
+from tests.cli.example import LOSING, NETWORK, contents, refused, run_arguments
+
+
+def test_run_writes_what_the_library_computes(folder, capsys):
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr()
+    assert said.out == "out.csv: 4 rows of remote/aware (nominal), remote/trusting (nominal)\n"
+    assert said.err == ""
+    assert sorted(contents(folder)) == ["data.csv", "net.py", "out.csv"]
+    net = load_network("net.py")
+    recording, table = read_recording("data.csv", net), read_table("out.csv")
+    np.testing.assert_array_equal(table["time"], [0, 0.5, 0.5, 2])
+    for name in ("aware", "trusting"):
+        stream = h.Stream(net.nodes["remote"].filters[name])
+        for k in range(4):
+            estimate = stream.push(recording.measurements["remote"][k], recording.inputs[k])
+            row = {key: table[f"{name}.{key}"][k] for key in ("p", "v", "p.sd", "v.sd", "cov.p.v", "valid")}
+            found = [row["p"], row["v"], row["p.sd"] ** 2, row["v.sd"] ** 2, row["cov.p.v"]]
+            bound = estimate.covariance
+            expected = [*estimate.mean, bound[0, 0], bound[1, 1], bound[0, 1]]
+            # compiled apart, and the variance went through a root and back: rounding only
+            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+            assert row["valid"] == 1
+
+
+def test_run_writes_what_later_rows_say_too(folder, capsys):
+    assert cli.main([*run_arguments(), "--smooth", "1", "--report", "page"]) == 0
+    assert (folder / "page" / "smoothed_0.png").is_file() and "given later data too" in (
+        folder / "page" / "report.html"
+    ).read_text()
+    net, table = load_network("net.py"), read_table("out.csv")
+    found = h.run(net, *read_recording("data.csv", net), smooth=h.smoothing.FixedLag(1)).smoothed
+    for name, estimate in found.estimates["remote"].items():
+        np.testing.assert_allclose(table[f"{name}.smoothed.p"], estimate.mean[:, 0], rtol=1e-12)
+        assert table[f"{name}.smoothed.v.sd"][1] < table[f"{name}.v.sd"][1]
+    assert cli.main([*run_arguments(), "--smooth", "soon"]) == 2
+    assert "--smooth: expected all, or how many later rows, got 'soon'" in capsys.readouterr().err
+
+
+def test_names_do_not_act_on_the_terminal(folder, capsys):
+    (folder / "net.py").write_text(NETWORK.replace('"aware"', '"\\x1b[31maware"'))
+    assert cli.main(run_arguments()) == 0
+    said = capsys.readouterr()
+    assert "\x1b" not in said.out and "\\x1b[31maware" in said.out
+
+
+def test_a_lost_covariance_is_said_and_flagged(folder, capsys):
+    (folder / "net.py").write_text(NETWORK + LOSING)
+    assert cli.main(run_arguments()) == 0
+    expected = "heliograph: warning: remote/losing: no valid covariance from step 2 in 1 of 1 runs\n"
+    assert capsys.readouterr().err == expected
+    table = read_table("out.csv")
+    np.testing.assert_array_equal(table["valid"], [1, 1, 0, 0])
+    np.testing.assert_array_equal(table["v.sd"], [1, 1, np.nan, np.nan])
+
+
+LAST = "network = "
+MODELS = {
+    "wrong shape": ("np.eye(2), states", "np.eye(3), states", ["initial covariance", "(2, 2)", "(3, 3)", "line 12"]),
+    "sum of probabilities": ("[0.5, 0.5]", "[0.5, 0.6]", ["gain probabilities", "sum to 1", "1.1", "line 14"]),
+    "negative probability": ("[0.5, 0.5]", "[-0.5, 1.5]", ["gain probabilities", "negative", "-0.5", "line 14"]),
+    "asymmetric covariance": (
+        "np.eye(2), states", "[[1, 0.5], [0, 1]], states", ["initial covariance", "symmetric", "0.5", "line 12"]),
+    "indefinite covariance": (
+        "np.eye(2), states", "[[1, 2], [2, 1]], states", ["initial covariance", "semidefinite", "eigenvalue -1"]),
+    "not finite": ("[0, 0]", "[0, np.nan]", ["initial mean", "finite numbers", "1 that are not finite", "line 12"]),
+    "no network": (LAST, "_ = lambda: ", ["net.py", "a heliograph.Network", "none in the module"]),
+    "two networks": (LAST, 'other = h.Network(plant, {"a": h.Node(sensor, link, {})})\nnetwork = ', [
+        "net.py:other or net.py:network", "2 networks"]),
+    "an error": (LAST, "raise OSError('one\\ntwo')\nnetwork = ", ["net.py", "OSError in line 19: one two"]),
+    "no filters": ("link, filters", "link, {}", ["net.py", "at least one filter", "none"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", MODELS)
+def test_a_model_that_is_none(folder, capsys, case):
+    old, new, fragments = MODELS[case]
+    assert NETWORK.count(old) == 1
+    (folder / "net.py").write_text(NETWORK.replace(old, new))
+    refused(folder, capsys, run_arguments(), "expected", "got", *fragments)
+
+
+TABLES = {
+    "empty file": ("", ["data.csv", "an empty file"]),
+    "no rows": ("time,push,pos\n", ["data.csv", "at least one row", "none"]),
+    "unknown column": ("time,push,poss\n0,0,1\n", ["only the columns time, push, dt, pos", "'poss'", "'pos'"]),
+    "missing column": ("time,pos\n0,0\n", ["one column 'push'", "only time, pos"]),
+    "doubled column": ("time,push,pos,pos\n0,0,0,0\n", ["distinct columns", "'pos'"]),
+    "time goes backwards": (
+        "time,push,pos\n0,0,1\n2,0,1\n1,0,1\n", ["row 3, column 'time'", "does not go backwards", "1 after 2"]),
+    "text in a cell": ("time,push,pos\n0,0,1\n1,0,far\n", ["row 2, column 'pos'", "a number", "'far'"]),
+    "infinite": ("time,push,pos\n0,0,inf\n", ["row 1, column 'pos'", "a finite number", "inf"]),
+    "missing input": ("time,push,pos\n0,,1\n", ["row 1, column 'push'", "a finite number", "an empty cell"]),
+    "short row": ("time,push,pos\n0,0\n", ["row 1", "3 cells", "got 2"]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TABLES)
+def test_measurements_that_are_none(folder, capsys, case):
+    text, fragments = TABLES[case]
+    (folder / "data.csv").write_text(text)
+    refused(folder, capsys, run_arguments(), "data.csv", "expected", "got", *fragments)
+
+
+def test_places(folder, capsys):
+    (folder / "file").touch()
+    refused(folder, capsys, run_arguments(network="no.py"), "no.py", "a Python file", "nothing of that name")
+    refused(folder, capsys, run_arguments(measurements="no.csv"), "no.csv", "a file", "nothing of that name")
+    refused(folder, capsys, run_arguments(out="no/out.csv"), "output folder no", "existing", "nothing of that name")
+    refused(folder, capsys, run_arguments(out="file/out.csv"), "output folder file", "a folder", "a file")
+    refused(folder, capsys, run_arguments(out="out.txt"), "out.txt", ".csv or .parquet", "'.txt'")
+    refused(folder, capsys, run_arguments(out="./data.csv"), "data.csv", "another file than the measurements")
+    refused(folder, capsys, ["demo", "--out", "file"], "output folder", "file", "a folder")
+
+
+def test_the_output_is_checked_before_the_network_runs(folder, capsys):
+    (folder / "net.py").write_text("raise SystemError('ran')")
+    refused(folder, capsys, run_arguments(out="no/out.csv"), "output folder no")
+
+
+def test_nothing_is_left_when_the_disk_fills(folder, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(28, "No space left on device", "out.csv")
+
+    (folder / "out.csv").write_text("before")
+    monkeypatch.setattr(os, "replace", full)
+    refused(folder, capsys, run_arguments(), "out.csv: No space left on device")
