@@ -158,3 +158,18 @@ def test_a_noise_free_output_has_a_gradient():
 
     with jax.enable_x64(True):
         assert float(jax.grad(mean)(2.0)) == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("channel", "left"), [(hg.perfect(1), 1e-28), (hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 1e-9), 1.0)]
+)
+def test_a_premise_about_the_mean_is_not_used_where_the_law_is_known(channel, left):
+    """Then nothing hangs on it: the same numbers, and of a noise-free reading no rounding of the prior either."""
+    plant, sensor = hg.LinearPlant([[-1.2]], 1e-5, [-7e-4], 5e-6), hg.LinearSensor([[-6.5e-3]], 0.0)
+    found = []
+    for update in (None, hg.filters.ZeroMean()):
+        item = hg.cubature_filter(plant, sensor, channel, update)
+        found.append(item.estimate(item.correct(item.predict(item.init()), [4e-6])[0]))
+    np.testing.assert_array_equal(found[0].mean, found[1].mean)
+    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
+    assert 0 <= found[1].covariance[0, 0] < left * (1.2**2 * 5e-6 + 1e-5)  # of the prediction

@@ -82,23 +82,37 @@ def young_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Array
 ) -> tuple[jax.Array, jax.Array]:
     """The update of `Polytope` for any description of the channel; scalars (2,), NaN where they are to be found."""
+    if not channel.uncertain:
+        return _known_gain_correction(prior, signal, channel, present)
     w = homogeneous(signal.second, signal.mean, 1.0)
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
-    cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
-    if not channel.uncertain:
-        spread = _of_known_gain(channel, w, present)
-        if signal.matrix is None or signal.noise is None:
-            return gain_and_bound(prior, cross, spread + mean_part)
-        heard = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
-        noise = spread + jnp.where(both, congruence(channel.mean_gain, signal.noise), 0.0)
-        return gain_and_covariance(prior, cross, spread + mean_part, heard, noise)
+    cross = _cross(signal, channel, present)
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 
     beta = smallest_scalars(young_sweep, scalars, (base, shift, mean_part, power, trace(prior)))
     gain, bound = gain_and_bound(prior, cross, young_omega(beta, base, shift, mean_part))
     return gain, bound + beta[0] * prior
+
+
+def _known_gain_correction(
+    prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """The best linear update, and its covariance."""
+    both = present[:, None] & present[None, :]
+    mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
+    spread = _of_known_gain(channel, homogeneous(signal.second, signal.mean, 1.0), present)
+    cross = _cross(signal, channel, present)
+    if signal.matrix is None or signal.noise is None:
+        return gain_and_bound(prior, cross, spread + mean_part)
+    heard = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
+    noise = spread + jnp.where(both, congruence(channel.mean_gain, signal.noise), 0.0)
+    return gain_and_covariance(prior, cross, spread + mean_part, heard, noise)
+
+
+def _cross(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
+    return jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
 
 
 @runs_last
@@ -119,12 +133,11 @@ def zero_mean_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: Array
 ) -> tuple[jax.Array, jax.Array]:
     """The update of `ZeroMean`; scalar (1,), NaN where it is to be found."""
+    if not channel.uncertain:  # power(Pyy) = M Pyy M' + spread(Pyy): no other than Young's
+        return _known_gain_correction(prior, signal, channel, present)
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
     own = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
-    cross = jnp.where(present[:, None], times(channel.mean_gain, transpose(signal.cross)), 0.0)
-    if not channel.uncertain:
-        omega_known = channel.power.middle(own, present) + channel.spread.middle(known_part, present)
-        return gain_and_bound(prior, cross, omega_known + absent(present))
+    cross = _cross(signal, channel, present)
     base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
     shift, power = channel.shift(own, present), times(cross, transpose(cross))
     used = heard(channel, present)
