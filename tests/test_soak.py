@@ -23,11 +23,11 @@ def soak() -> Any:
         yield module
 
 
-def statistics(ratio: float, claim: str = "exact", runs: int = 5000) -> ErrorStatistics:
+def statistics(ratio: float, claim: str = "exact", runs: int = 5000, seed: int = 0) -> ErrorStatistics:
     """Gaussian errors whose second component has `ratio` times the claimed variance, at three steps."""
     covariance = np.array([[1.0, 0.3], [0.3, 1e-12]]) * np.array([[1.0, 1e-6], [1e-6, 1.0]])
     actual = covariance * np.sqrt(np.array([[1.0, ratio], [ratio, ratio**2]]))
-    errors = np.random.default_rng(0).multivariate_normal(np.zeros(2), actual, size=(runs, 3))
+    errors = np.random.default_rng(seed).multivariate_normal(np.zeros(2), actual, size=(runs, 3))
     deal = (np.arange(runs)[:, None] % BATCHES == np.arange(BATCHES)).astype(float)
     i, j = np.triu_indices(2)
     pairs = np.einsum("rb,rtp->btp", deal, errors[..., i] * errors[..., j])
@@ -59,6 +59,17 @@ def test_a_state_that_is_known_may_be_off_by_rounding_of_its_size(soak: ModuleTy
         pairs, nothing = np.full((4, 1, 1), 64 * error**2), np.zeros((4, 1, 1))
         known = ErrorStatistics(np.full(4, 64.0), pairs, nothing, np.zeros((4, 1)), "exact")
         assert np.isinf(soak.excesses(known, np.eye(1), np.array([500.0]))).any() == wrong
+
+
+def test_chance_is_looked_at_again_and_what_is_broken_stays_broken(soak: ModuleType) -> None:
+    """Ten suspects of a true claim end at the first look; a variance 1.3 times the claimed one goes through both."""
+    for ratio, ends in ((1.0, soak.AGAIN[0]), (1.3, soak.AGAIN[1])):
+        for seed in range(10):
+            found = {"a": {"b": statistics(ratio, runs=5000, seed=seed)}}
+            place = soak.Place(5.0, 1, np.array([0.0, 1.0]))
+            z, runs = soak.looked_at_again(place, "exact", lambda _, found=found: found, ("a", "b"), np.zeros(2))
+            assert runs == ends and (abs(z) > soak.SUSPECT) == (ends == soak.AGAIN[1])
+    assert soak.looked_at_again(soak.Place(-5.0, 1, np.ones(2)), "upper", {}.get, ("a", "b"), np.zeros(2)) == (-5.0, 0)
 
 
 def test_what_is_no_number_and_not_told_is_hidden(soak: ModuleType) -> None:
