@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MARGIN = 1e-7  # strictness of every inequality, relative to the level squared; solvers leave some 1e-9
 Objective = Literal["trace", "largest_eigenvalue", "log_determinant", "none"]
 Solver = Literal["clarabel", "scs"]
-TIE = 1e-6  # relative, of a largest eigenvalue that counts as the smallest one
+TIES = 1e-6, 1e-5, 1e-4  # relative, of a largest eigenvalue that counts as the smallest one: the first that is solved
 SCS_ACCURACY = 1e-9  # its own default, 1e-4, is coarser than MARGIN
 SCS_ITERATIONS = 100_000
 
@@ -110,12 +110,18 @@ class StepProblem:
     def solve(self, fixed: Float[np.ndarray, "q q"]) -> tuple[str, Unknowns | None]:
         """The status, and a solution if there is one; fixed = S - diag(P, 0) at level 1."""
         self.fixed.value = fixed
-        for problem in self.problems:
-            status = run_solver(problem, self.solver)
-            if not status.startswith("optimal") or self.unknowns.value is None:
-                return status, None
-            self.reached.value = (1 - TIE) * float(problem.value)
-        return status, self.layout.unpack(np.asarray(self.unknowns.value))
+        first, *others = self.problems
+        status = run_solver(first, self.solver)
+        if not status.startswith("optimal") or self.unknowns.value is None:
+            return status, None
+        found, best = np.asarray(self.unknowns.value), float(first.value)
+        for problem in others:  # next to no room is left to them, which a solver may find too narrow
+            for tie in TIES:
+                self.reached.value = (1 - tie) * best
+                if run_solver(problem, self.solver) == "optimal":
+                    found = np.asarray(self.unknowns.value)
+                    break
+        return status, self.layout.unpack(found)
 
 
 def _goals(
