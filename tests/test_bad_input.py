@@ -1,12 +1,11 @@
 """Bad input is a ValueError at construction: one line that names the thing, what was expected and what came."""
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import heliograph as h
-from heliograph.model.estimate import Claim
+from tests.losing import Losing
 
 EYE = np.eye(2)
 SKEWED = [[1.0, 0.5], [0.4, 1.0]]
@@ -206,27 +205,6 @@ def test_one_line_that_names_it(make, name, came):
     assert "\n" not in message
     assert message.startswith(f"{name}: expected ")
     assert came in "got " + message.split(", got ", 1)[1]
-
-
-class Losing(h.filters.AbstractFilter):
-    """A filter whose covariance is indefinite from its third step."""
-
-    claim: Claim = eqx.field(static=True, default="nominal")
-    states: tuple[str, ...] = eqx.field(static=True, default=("p", "v"))
-    inputs: tuple[str, ...] = eqx.field(static=True, default=())
-    received: int = eqx.field(static=True, default=1)
-
-    def init(self):
-        return jnp.ones(2)
-
-    def predict(self, state, u=(), k=0):
-        return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
-
-    def correct(self, state, z, k=0):
-        return state, h.model.Innovation(z, jnp.eye(1), 0.0)
-
-    def estimate(self, state):
-        return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
 
 
 def test_a_covariance_that_is_lost_is_flagged_and_kept():

@@ -26,29 +26,10 @@ filters = {
 network = h.Network(plant, {"remote": h.Node(sensor, link, filters)})
 """
 LOSING = """
-import equinox as eqx
+from tests.losing import Losing
 
-
-class Losing(h.filters.AbstractFilter):
-    claim: str = eqx.field(static=True, default="nominal")
-    states: tuple = eqx.field(static=True, default=("p", "v"))
-    inputs: tuple = eqx.field(static=True, default=("push", "dt"))
-    received: int = eqx.field(static=True, default=1)
-
-    def init(self):
-        return jnp.ones(2)
-
-    def predict(self, state, u=(), k=0):
-        return jnp.stack([1.0, jnp.where(k >= 2, -1.0, 1.0)])
-
-    def correct(self, state, z, k=0):
-        return state, h.model.Innovation(z, jnp.eye(1), 0.0)
-
-    def estimate(self, state):
-        return h.model.Estimate(0 * state, jnp.diag(state), self.claim)
-
-
-network = h.Network(plant, {"remote": h.Node(sensor, link, {"losing": Losing()})})
+losing = {"losing": Losing(inputs=("push", "dt"))}
+network = h.Network(plant, {"remote": h.Node(sensor, link, losing)})
 """
 DATA = "time,push,pos\n0,0,0.5\n0.5,1,\n0.5,0,0.7\n2,0.5,nan\n"
 
