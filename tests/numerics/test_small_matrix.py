@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from heliograph.numerics import linalg, small_matrix
-from heliograph.numerics.small_matrix import UNROLL_LIMIT, runs_last
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import UNROLL_LIMIT
 
 RUNS, NODES = 5, 3
 ROUNDING = 1e-12  # of a few hundred operations on well conditioned matrices

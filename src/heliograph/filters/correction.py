@@ -14,22 +14,19 @@ from heliograph.filters.precise import precise_update
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
+from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
     PRECISE,
-    Pick,
     congruence,
     diagonal,
     rounding,
-    runs_last,
     solve,
     sum_of_squares,
     symmetric,
     times,
     trace,
     transpose,
-    where_any,
-    where_each,
     with_rounding,
 )
 from heliograph.numerics.types import Array

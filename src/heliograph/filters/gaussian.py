@@ -25,7 +25,8 @@ from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
 from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
 from heliograph.numerics.angle import Angles, continued, nearest
 from heliograph.numerics.check import instance
-from heliograph.numerics.small_matrix import runs_last, times_vector
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import times_vector
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import SecondOrder, has_random_gain

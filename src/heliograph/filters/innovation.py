@@ -6,6 +6,7 @@ import numpy as np
 
 from heliograph.filters.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import (
     NEGATIVE_TOLERANCE,
     OFF_SUPPORT,
@@ -14,7 +15,6 @@ from heliograph.numerics.small_matrix import (
     UNROLL_LIMIT,
     congruence,
     rounding,
-    runs_last,
 )
 from heliograph.numerics.types import Array, Float
 from heliograph.random_affine.second_moments import SecondOrder

@@ -28,7 +28,8 @@ from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
-from heliograph.numerics.small_matrix import congruence, runs_last, times, times_vector, transpose
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import congruence, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.second_moments import SecondOrder, has_known_mean

@@ -8,7 +8,7 @@ import numpy as np
 
 from heliograph.filters.belief import Belief
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import runs_last
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Bool, Float
 
 

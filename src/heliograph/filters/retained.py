@@ -12,13 +12,8 @@ import jax
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.angle import Angles, wrapped
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import (
-    congruence,
-    runs_last,
-    symmetric,
-    times_vector,
-    with_rounding,
-)
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import congruence, symmetric, times_vector, with_rounding
 from heliograph.numerics.types import Float, PyTree
 
 

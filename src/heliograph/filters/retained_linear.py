@@ -8,19 +8,16 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.retained import AbstractRetained, Moments, Point, applied, less
+from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
 from heliograph.numerics.small_matrix import (
-    Pick,
     congruence,
     inner,
-    runs_last,
     solve,
     sum_of_squares,
     symmetric,
     times,
     times_vector,
     transpose,
-    where_any,
-    where_each,
     with_rounding,
 )
 from heliograph.numerics.types import Float

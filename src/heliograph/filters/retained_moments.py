@@ -6,12 +6,8 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.retained import AbstractRetained, Moments, Point, applied, less
-from heliograph.numerics.small_matrix import (
-    runs_last,
-    solve,
-    times,
-    transpose,
-)
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import solve, times, transpose
 from heliograph.numerics.types import Float
 
 

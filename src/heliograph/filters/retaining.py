@@ -12,13 +12,8 @@ from heliograph.filters.retained_linear import RetainedLinear
 from heliograph.filters.retained_moments import RetainedMoments
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
-from heliograph.numerics.small_matrix import (
-    diagonal,
-    runs_last,
-    squared_distance,
-    times,
-    transpose,
-)
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import diagonal, squared_distance, times, transpose
 from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Array, Float
 

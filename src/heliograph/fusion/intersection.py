@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.small_matrix import (
     add,
     diagonal,
     factor,
     inner,
     rounding,
-    runs_last,
     solve,
     symmetric,
     times,

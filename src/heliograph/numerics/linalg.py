@@ -5,13 +5,8 @@ import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
 
-from heliograph.numerics.small_matrix import (
-    UNROLL_LIMIT,
-    factor,
-    long_factor,
-    runs_last,
-    solve,
-)
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import UNROLL_LIMIT, factor, long_factor, solve
 
 
 def symmetrize(a: Float[Array, "... n n"]) -> Float[Array, "... n n"]:

@@ -18,7 +18,8 @@ from heliograph.live.tape import Ears
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import understood
-from heliograph.numerics.small_matrix import runs_last, squared_distance
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import squared_distance
 from heliograph.numerics.types import Float, PyTree
 from heliograph.serving.flat import Flat, flat_like, row_of
 from heliograph.simulation.by_name import by_name

@@ -11,7 +11,7 @@ from heliograph.filters.retained import AbstractRetained, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_count, instance
 from heliograph.numerics.float64 import compiled
-from heliograph.numerics.small_matrix import runs_last
+from heliograph.numerics.over_runs import runs_last
 from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
 
 T = TypeVar("T")
