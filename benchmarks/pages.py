@@ -1,6 +1,6 @@
-"""Write the times of results.json where README.md and docs/ state them.
+"""Write the figures of results.json and soak.json where README.md and docs/ state them.
 
-Run: python benchmarks/pages.py, after benchmarks/run.py with all peers. A place is a sentence that stands once in its
+Run: python benchmarks/pages.py, after benchmarks/run.py with all peers, or after benchmarks/soak.py. A place is a sentence that stands once in its
 page, with {} for each figure. tests/test_docs.py compares the pages with what this would write.
 """
 
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results.json"
+RESULTS, SOAK = ROOT / "benchmarks" / "results.json", ROOT / "benchmarks" / "soak.json"
 FIGURE = r"\d[\d,.]*(?<![,.])"
 TABLE = re.compile(r"(\| problem \| ours \|.*\n\|-.*\n)(?:\|.*\n)+")
 
@@ -103,6 +103,18 @@ def learning(measured: dict[str, Any]) -> dict[str, list[Place]]:
     }
 
 
+def claims(soaked: dict[str, Any]) -> list[Place]:
+    """What the random networks said of the claims."""
+    said = whole(soaked["networks"], soaked["comparisons"])
+    return [
+        Place("`make soak` draws {} random networks", said[:1]),
+        Place("{} comparisons of a simulated with a claimed variance", said[1:]),
+        Place("more than {} standard errors", (f"{soaked['limit in standard errors']:.1f}",)),
+        Place("{} of the networks are computed again in other units", whole(soaked["rescaled"])),
+        Place("In {} networks a filter flagged its own result", whole(soaked["networks with flagged failures"])),
+    ]
+
+
 def places(measured: dict[str, Any]) -> dict[str, list[Place]]:
     """Every place by page."""
     gradient = measured["alone"]["network_design"]["values"]["error and gradient, 6 sensors"]
@@ -111,6 +123,7 @@ def places(measured: dict[str, Any]) -> dict[str, list[Place]]:
         "README.md": readme(measured) + learned["README.md"],
         "docs/comparisons.md": comparisons(measured) + learned["docs/comparisons.md"],
         "docs/network_design.md": [Place("three states and twelve hops take {} ms", (f"{gradient:.1f}",))],
+        "docs/theory.md": claims(json.loads(SOAK.read_text(encoding="utf-8"))),
     }
 
 

@@ -1,5 +1,6 @@
 """What the soak looks for it finds; the soak itself is not run here."""
 
+import json
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -102,3 +103,11 @@ def test_the_summary_counts_what_is_wrong(soak: ModuleType) -> None:
     assert [s["again"] for s in found["broken claims"]] == [8.0]
     assert found["unflagged"] == [{"index": 2, "at": ["a/c"]}] and len(found["depend on units"]) == 1
     assert found["limit in standard errors"] == pytest.approx(5.1, abs=0.2)
+
+
+def test_the_last_soak_tried_all_and_found_every_promise_kept(soak: ModuleType) -> None:
+    """What benchmarks/soak.json says, which docs/theory.md tells."""
+    found = json.loads(soak.RESULTS.read_text())
+    assert (found["networks"], found["seed"], found["runs"]) == (soak.COUNT, soak.SEED, soak.RUNS)
+    assert found["rescaled"] >= 200 and set(found["estimates by claim"]) == {"exact", "upper", "nominal"}
+    assert [found[name] for name in ("errors", "broken claims", "unflagged", "depend on units")] == [[], [], [], []]
