@@ -86,7 +86,7 @@ class LinearFilter(AbstractFilter):
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
         """Use what arrived of z."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
-        y = signal(state, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+        y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
         mean, covariance, expected = used(
@@ -126,7 +126,7 @@ class LinearFilter(AbstractFilter):
             return moments_retained(after, prior, cross, "nominal")
         total = heard.covariance
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
-            y = signal(prior, sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
+            y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
             total = known_gain_covariance(y, channel, ~jnp.isnan(z))
         output = heard_through(channel.mean_gain, sensor.matrix)
         process = at(self.plant, k).noise_covariance(jnp.asarray(u))
@@ -146,11 +146,18 @@ def moved(
 
 
 @runs_last
-def signal(state: LinearBelief, c: jax.Array, noise_mean: jax.Array, noise: jax.Array) -> Signal:
-    """y = C x + v: its mean before any data, the covariance of what is not known of it, E[y y']."""
-    cross = times(state.covariance, transpose(c))
-    mean = times_vector(c, state.state_mean) + noise_mean
-    second = congruence(c, state.state_covariance) + noise + mean[:, None] * mean[None]
+def signal(
+    known: tuple[jax.Array, jax.Array, jax.Array], c: jax.Array, noise_mean: jax.Array, noise: jax.Array
+) -> Signal:
+    """y = C x + v: its mean before any data, the covariance of what is not known of it, E[y y'].
+
+    Of what is known before data alone, error covariance and the state's own moments: derivatives with respect to the
+    estimate pass it by.
+    """
+    covariance, state_mean, state_covariance = known
+    cross = times(covariance, transpose(c))
+    mean = times_vector(c, state_mean) + noise_mean
+    second = congruence(c, state_covariance) + noise + mean[:, None] * mean[None]
     return Signal(mean, times(c, cross) + noise, cross, second)
 
 

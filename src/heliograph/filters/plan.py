@@ -165,24 +165,34 @@ def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k:
     """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
     none = jnp.zeros_like(state.mean)
 
-    def means(before: jax.Array, moved: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, ...], PyTree]:
-        """What follows from each, and all that the means have no part in."""
-        prior = item.predict(state._replace(mean=before), u, k)
-        after, heard = item.correct(prior._replace(mean=moved), z, k)
-        values = jnp.asarray(prior.mean), jnp.asarray(after.mean), jnp.asarray(heard.value)
-        return values, (values, prior, after, heard)
+    def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
+        prior = item.predict(state._replace(mean=mean), u, k)
+        return jnp.asarray(prior.mean), prior
 
-    derivatives, found = jax.jacfwd(means, (0, 1, 2), has_aux=True)(none, none, z)
-    (drift, _, unexpected), prior, after, heard = found
+    transition, prior = jax.jacfwd(predict, has_aux=True)(none)
+    (_, gain), (output, _), after, heard = _corrected(item, prior, none, z, k)
     one = Plan(
-        transition=derivatives[0][0],
-        drift=drift,
-        gain=derivatives[1][2],
-        output=-derivatives[2][1],
-        offset=-unexpected,
+        transition=transition,
+        drift=jnp.asarray(prior.mean),
+        gain=gain,
+        output=-output,
+        offset=-jnp.asarray(heard.value),
         innovation=jnp.asarray(heard.covariance),
     )
     return one, prior, after
+
+
+def _corrected(
+    item: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
+    """Derivatives of the corrected mean and of the innovation, each by prior mean and by z, and both themselves."""
+
+    def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
+        after, heard = item.correct(prior._replace(mean=mean), z, k)
+        return (jnp.asarray(after.mean), jnp.asarray(heard.value)), (after, heard)
+
+    (of_mean, of_innovation), (after, heard) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    return of_mean, of_innovation, after, heard
 
 
 def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
@@ -220,18 +230,11 @@ def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Ar
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
     """
     prior = item.predict(state, u, k)
-
-    def unexpected(mean: jax.Array) -> jax.Array:
-        return jnp.asarray(item.correct(prior._replace(mean=mean), z, k)[1].value)
-
-    def used(z: jax.Array) -> jax.Array:
-        return jnp.asarray(item.correct(prior, z, k)[0].mean)
-
+    (_, gain), (output, _), _, heard = _corrected(item, prior, jnp.asarray(prior.mean), z, k)
     present = ~jnp.isnan(z)
-    output = jnp.where(present[:, None], -jax.jacfwd(unexpected)(prior.mean), 0.0)
-    total = jnp.where(present[:, None] & present, item.correct(prior, z, k)[1].covariance, 0.0)
-    gain = jnp.where(present, jax.jacfwd(used)(z), 0.0)
-    return Linearised(prior.mean, gain, output, total - output @ prior.covariance @ output.T)
+    output = jnp.where(present[:, None], -output, 0.0)
+    total = jnp.where(present[:, None] & present, heard.covariance, 0.0)
+    return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
 
 
 def is_linear_filter(item: AbstractFilter) -> bool:

@@ -130,7 +130,7 @@ def _use(
 ) -> tuple[LinearBelief, jax.Array, jax.Array]:
     """The update, what was expected and the innovation's covariance."""
     of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
-    y = signal(prior, *of, jnp.asarray(sensor.noise.covariance))
+    y = signal(prior[1:], *of, jnp.asarray(sensor.noise.covariance))
     gain, bound = Polytope().correct(prior.covariance, y, described, ~jnp.isnan(z))
     through = jnp.asarray(described.mean_gain), jnp.asarray(described.offset)
     mean, covariance, expected = used(prior.mean, prior.covariance, gain, bound, *of, *through, z)
