@@ -1,7 +1,8 @@
 """Write the figures of results.json and soak.json where README.md and docs/ state them.
 
-Run: python benchmarks/pages.py, after benchmarks/run.py with all peers, or after benchmarks/soak.py. A place is a sentence that stands once in its
-page, with {} for each figure. tests/test_docs.py compares the pages with what this would write.
+Run: python benchmarks/pages.py, after benchmarks/run.py with all peers, or after benchmarks/soak.py. A place is a
+sentence that stands once in its page, with {} for each figure. tests/test_docs.py compares the pages with what this
+would write.
 """
 
 import json

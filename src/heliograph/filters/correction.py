@@ -20,6 +20,7 @@ from heliograph.numerics.small_matrix import (
     PRECISE,
     congruence,
     diagonal,
+    own,
     rounding,
     solve,
     sum_of_squares,
@@ -133,10 +134,10 @@ def zero_mean_correction(
     if not channel.uncertain:  # power(Pyy) = M Pyy M' + spread(Pyy): no other than Young's
         return _known_gain_correction(prior, signal, channel, present)
     known_part = homogeneous(signal.second - signal.covariance, signal.mean, 1.0)
-    own = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
+    unknown_part = homogeneous(signal.covariance, jnp.zeros_like(signal.mean), 0.0)
     cross = _cross(signal, channel, present)
-    base = channel.power(own, present) + channel.spread(known_part, present) + absent(present)
-    shift, power = channel.shift(own, present), times(cross, transpose(cross))
+    base = channel.power(unknown_part, present) + channel.spread(known_part, present) + absent(present)
+    shift, power = channel.shift(unknown_part, present), times(cross, transpose(cross))
     used = heard(channel, present)
     among = jnp.where(used[:, None] & used[None], signal.covariance, 0.0)
     of_used = jnp.where(used, signal.cross, 0.0)
@@ -253,5 +254,4 @@ _gain_and_covariance = runs_last(partial(_by_precision, where_any), partial(_by_
 
 
 def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
-    own = [noise[i, i] < rounding(PRECISE, omega, 1000) * omega[i, i] for i in range(len(omega))]
-    return jnp.any(jnp.stack(own), axis=0)
+    return jnp.any(own(noise) < rounding(PRECISE, omega, 1000) * own(omega), axis=0)

@@ -12,11 +12,13 @@ import numpy as np
 
 from heliograph.numerics.small_matrix import (
     UNROLL_LIMIT,
-    congruence,
+    identity,
     inner,
+    own,
     pivot_scale,
     root,
     sum_of_squares,
+    summed,
     times,
     transpose,
 )
@@ -57,41 +59,40 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
         return jnp.broadcast_to(a.reshape(*a.shape, *[1] * (2 + len(runs) - a.ndim)), (*a.shape[:2], *runs))
 
     start = root(prior)
-    parts = start, jnp.zeros((n, m)), jnp.eye(m), output, noise
+    parts = start, np.zeros((n, m)), np.eye(m), output, noise
     state = Heard(*(over_runs(jnp.asarray(a, prior.dtype)) for a in parts))
-    own = jnp.stack([noise[j, j] for j in range(m)])
+    whole = own(noise)
     sizes = times(jnp.abs(state.output), jnp.abs(state.root))
     if m > UNROLL_LIMIT:
-        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, own, sizes, j), state)
+        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, whole, sizes, j), state)
     else:
         for j in range(m):
-            state = _heard(state, own, sizes, j)
+            state = _heard(state, whole, sizes, j)
     gain = times(state.gain, state.turn)
-    kept, after = over_runs(jnp.eye(n)) - times(gain, output), sum_of_squares(prior, gain, output, noise)
+    after = sum_of_squares(prior, gain, output, noise)
+    kept = jnp.asarray(identity(n, gain)) - times(gain, output)
     return gain, jnp.where(_has_digits(prior, start, kept, after), after, jnp.nan)
 
 
 def _has_digits(prior: jax.Array, start: jax.Array, kept: jax.Array, after: jax.Array) -> jax.Array:
     """Whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the square of the mean's rounding."""
     n, eps = len(prior), float(np.finfo(prior.dtype).eps)
-    lost, reach = congruence(jnp.abs(kept), jnp.abs(prior)), times(jnp.abs(kept), jnp.abs(start))
-    digits = [
-        (LEFT * eps * lost[i, i] <= after[i, i])
-        | (after[i, i] <= (4 * (n + 2) * eps) ** 2 * (inner(reach[i][None], reach[i][None]) + prior[i, i]))
-        for i in range(n)
-    ]
-    return jnp.all(jnp.stack(digits), axis=0)
+    kept, left = jnp.abs(kept), own(after)
+    lost, reach = summed(times(kept, jnp.abs(prior)) * kept, 1), times(kept, jnp.abs(start))
+    of_mean = summed(reach * reach, 1) + own(prior)
+    return jnp.all((LEFT * eps * lost <= left) | (left <= (4 * (n + 2) * eps) ** 2 * of_mean), axis=0)
 
 
-def _heard(state: Heard, own: jax.Array, sizes: jax.Array, j: int | jax.Array) -> Heard:
+def _heard(state: Heard, whole: jax.Array, sizes: jax.Array, j: int | jax.Array) -> Heard:
     """With component j too, whose noise is first taken off those after it; sizes |H| |R| (m, n) before all of them."""
     before, gain, turn, output, noise = state
     n, m, runs = len(before), len(output), [1] * (before.ndim - 2)
-    scale = pivot_scale(noise[j, j], own[j])
+    scale = pivot_scale(noise[j, j], whole[j])
     variance = jnp.where(scale == 0, 0.0, noise[j, j])
-    later, here = ((jnp.arange(m) > j).reshape(m, 1, *runs), (jnp.arange(m) == j).reshape(1, m, *runs))
-    share = jnp.where(later, (noise[:, j] * scale**2)[:, None], 0.0)
-    turn, output, noise = (part - share * part[j][None] for part in (turn, output, noise))
+    later, here = ((np.arange(m) > j).reshape(m, 1, *runs), (np.arange(m) == j).reshape(1, m, *runs))
+    if m > 1:
+        share = jnp.where(later, (noise[:, j] * scale**2)[:, None], 0.0)
+        turn, output, noise = (part - share * part[j][None] for part in (turn, output, noise))
 
     row = output[j][None]
     f, reach = times(row, before), times(jnp.abs(turn[j])[None], sizes)  # what earlier ones took off left its rounding

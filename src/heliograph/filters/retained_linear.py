@@ -11,9 +11,10 @@ from heliograph.filters.retained import AbstractRetained, Moments, Point, applie
 from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
 from heliograph.numerics.small_matrix import (
     congruence,
-    inner,
+    own,
     solve,
     sum_of_squares,
+    summed,
     symmetric,
     times,
     times_vector,
@@ -135,14 +136,14 @@ def _left_by(
     pick: Pick, p: jax.Array, matrix: jax.Array, transition: jax.Array, process: jax.Array, later: jax.Array
 ) -> jax.Array:
     half = times(p, matrix)
-    own = [p[i, i] - inner(half[i : i + 1], p[i : i + 1]) < SHARP * p[i, i] for i in range(len(p))]
+    sharp = jnp.any(own(p) - summed(half * p, 1) < SHARP * own(p), axis=0)
 
     def squares() -> jax.Array:
         moved = times(transition, p)
         back = transpose(solve(times(moved, transpose(transition)) + process, moved))
         return sum_of_squares(p, back, transition, process + later)
 
-    return pick(jnp.any(jnp.stack(own), axis=0), squares, lambda: symmetric(with_rounding(p, len(p)) - times(half, p)))
+    return pick(sharp, squares, lambda: symmetric(with_rounding(p, len(p)) - times(half, p)))
 
 
 _left = runs_last(partial(_left_by, where_any), partial(_left_by, where_each))

@@ -113,7 +113,9 @@ def at(tree: PyTree, k: int | np.integer | np.ndarray | Int[Array, ""]) -> PyTre
 
 
 def _entry(values: PyTree, k: PyTree) -> object:
-    return jnp.asarray(values)[k] if isinstance(k, jax.Array) else values[k, ...]  # the dots keep a number an array
+    if isinstance(k, jax.Array):
+        return jax.lax.dynamic_index_in_dim(jnp.asarray(values), k, keepdims=False, allow_negative_indices=False)
+    return values[k, ...]  # the dots keep a number an array
 
 
 def steps_covered(tree: object) -> int | None:

@@ -73,8 +73,10 @@ def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R
 
 
 def _to_last(x: Array, is_batched: bool) -> jax.Array:
-    return jnp.moveaxis(x, 0, -1) if is_batched else jnp.asarray(x)[..., None]
+    x = jnp.asarray(x)
+    return jax.lax.transpose(x, (*range(1, x.ndim), 0)) if is_batched else jax.lax.expand_dims(x, (x.ndim,))
 
 
 def _to_first(x: jax.Array, size: int) -> jax.Array:
-    return jnp.moveaxis(jnp.broadcast_to(x, (*x.shape[:-1], size)), -1, 0)
+    x = jnp.broadcast_to(x, (*x.shape[:-1], size))
+    return jax.lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1)))

@@ -5,12 +5,15 @@ are innermost in memory, a[i, j] is a contiguous vector over them, and loops ove
 feed a kernel like that. Larger matrices go to the library.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from functools import reduce
+from operator import sub
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.scipy.linalg import solve_triangular
 
 from heliograph.numerics.types import Array
@@ -40,18 +43,28 @@ def add(terms: Sequence[Array]) -> jax.Array:
     return jnp.asarray(sum(terms[1:], terms[0]))
 
 
+def minus(whole: jax.Array, parts: Iterable[jax.Array]) -> jax.Array:
+    """What is left of a whole without some parts, one by one."""
+    return reduce(sub, parts, whole)
+
+
+def summed(a: jax.Array, axis: int) -> jax.Array:
+    """Sum over a short axis, one by one."""
+    return jnp.asarray(lax.squeeze(reduce(lax.add, lax.split(a, (1,) * a.shape[axis], axis)), (axis,)))
+
+
 def times(a: Array, b: jax.Array) -> jax.Array:
     """A B, as a sum of columns of A times rows of B."""
     inner = b.shape[0]
     if not 0 < inner <= 2 * UNROLL_LIMIT:  # twice: cubature has two points for each state
         return jnp.einsum("ij...,jk...->ik...", a, b)
-    columns, rows = jnp.split(a, inner, axis=1), jnp.split(b, inner)
+    columns, rows = lax.split(a, (1,) * inner, 1), lax.split(b, (1,) * inner)
     return add([column * row for column, row in zip(columns, rows, strict=True)])
 
 
 def times_vector(a: Array, x: jax.Array) -> jax.Array:
     """A x."""
-    return times(a, x[:, None])[:, 0]
+    return jnp.asarray(lax.squeeze(times(a, lax.expand_dims(x, (1,))), (1,)))
 
 
 def congruence(a: Array, p: jax.Array) -> jax.Array:
@@ -62,18 +75,28 @@ def congruence(a: Array, p: jax.Array) -> jax.Array:
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
     """tr(A' B)."""
     products = a * b
-    return add(jnp.split(products.reshape(-1, *products.shape[2:]), products.shape[0] * products.shape[1]))[0]
+    return summed(products.reshape(-1, *products.shape[2:]), 0)
 
 
 def trace(a: jax.Array) -> jax.Array:
     """tr A."""
-    return add([a[i, i] for i in range(a.shape[0])])
+    return summed(own(a), 0)
+
+
+def own(a: jax.Array) -> jax.Array:
+    """The diagonal of A, (n, ...): each component's own entry."""
+    n = a.shape[0]
+    return lax.slice_in_dim(a.reshape(n * n, *a.shape[2:]), 0, n * n, n + 1)
+
+
+def identity(n: int, like: jax.Array) -> np.ndarray:
+    """I (n, n, 1, ...) of as many axes and of the precision of another array."""
+    return np.eye(n, dtype=like.dtype).reshape(n, n, *[1] * (like.ndim - 2))
 
 
 def diagonal(d: jax.Array) -> jax.Array:
     """diag(d)."""
-    n = d.shape[0]
-    return d[None] * jnp.eye(n).reshape(n, n, *[1] * (d.ndim - 1))
+    return d[None] * identity(d.shape[0], d[None])
 
 
 def rounding(tolerance: float, like: jax.Array, units: int = 10) -> float:
@@ -96,9 +119,8 @@ def sum_of_squares(prior: jax.Array, gain: jax.Array, output: jax.Array, noise: 
     By a root of P, so that what I - K H takes off leaves the square of its rounding alone.
     """
     n = len(prior)
-    kept = jnp.eye(n).reshape(n, n, *[1] * (prior.ndim - 2)) - times(gain, output)
-    own = jnp.stack([prior[i, i] for i in range(n)])
-    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own)
+    kept = identity(n, prior) - times(gain, output)
+    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own(prior))
     left = times(kept, root(prior))
     return symmetric(times(left, transpose(left)) + congruence(gain, noise)) + rounded
 
@@ -112,20 +134,20 @@ def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
     columns: list[jax.Array] = []
     scales: list[jax.Array] = []
     for j in range(a.shape[0]):
-        rest = add([a[j:, j], *(-c[j:] * c[j] for c in columns)])
+        rest = minus(a[j:, j], (c[j:] * c[j] for c in columns))
         scales.append(pivot_scale(rest[0], a[j, j]))
         columns.append(jnp.concatenate([jnp.zeros_like(a[:j, j]), rest * scales[j]]))
     return columns, scales
 
 
-def pivot_scale(pivot: jax.Array, own: jax.Array) -> jax.Array:
-    """1 / root of a pivot; 0 for one that is zero up to rounding of the diagonal entry `own`, NaN for a negative one.
+def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
+    """1 / root of a pivot; 0 for one that is zero up to rounding of the whole diagonal entry, NaN for a negative one.
 
     The root is taken of a positive number in any case, so that what a zero pivot leaves out has the derivative 0.
     """
-    positive = pivot > rounding(PIVOT_TOLERANCE, pivot) * own
+    positive = pivot > rounding(PIVOT_TOLERANCE, pivot) * whole
     scale = 1 / jnp.sqrt(jnp.where(positive, pivot, 1.0))
-    none = jnp.where(pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * own, 0.0, jnp.nan)
+    none = jnp.where(pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole, 0.0, jnp.nan)
     return jnp.where(positive, scale, none)
 
 
@@ -140,20 +162,20 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
     columns, scales = factor(a)
     forward: list[jax.Array] = []
     for i in range(n):  # L Y = B
-        forward.append(add([b[i], *(-columns[j][i] * forward[j] for j in range(i))]) * scales[i])
+        forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
     backward = forward[:]
     for i in reversed(range(n)):  # L' X = Y
-        backward[i] = add([forward[i], *(-columns[i][j] * backward[j] for j in range(i + 1, n))]) * scales[i]
+        backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
     return jnp.stack(backward)
 
 
 def long_factor(a: jax.Array) -> jax.Array:
     """The lower factor of one larger matrix by the same rule."""
-    n, own = a.shape[-1], jnp.diagonal(a)
+    n, whole = a.shape[-1], jnp.diagonal(a)
 
     def eliminate(j: jax.Array, carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         a, done = carry
-        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], own[j]), 0.0)
+        column = jnp.where(jnp.arange(n) >= j, a[:, j] * pivot_scale(a[j, j], whole[j]), 0.0)
         return a - jnp.outer(column, column), done.at[:, j].set(column)  # a: the Schur complement of the pivot
 
     result: jax.Array = jax.lax.fori_loop(0, n, eliminate, (jnp.asarray(a), jnp.zeros_like(a)))[1]
@@ -181,8 +203,7 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
     A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
     say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
     """
-    own = jnp.stack([a[i, i] for i in range(a.shape[0])])
-    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own, 0.0)) + OFF_VALUE * jnp.abs(size)
+    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own(a), 0.0)) + OFF_VALUE * jnp.abs(size)
     total: list[jax.Array] = []
     for i, (rest, scale) in enumerate(_substituted(a, x)):
         agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
@@ -207,7 +228,7 @@ def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]
     forward: list[jax.Array] = []
     rests: list[jax.Array] = []
     for i in range(n):  # L y = x
-        rests.append(add([x[i], *(-columns[j][i] * forward[j] for j in range(i))]))
+        rests.append(minus(x[i], (columns[j][i] * forward[j] for j in range(i))))
         forward.append(rests[i] * scales[i])
     return list(zip(rests, scales, strict=True))
 
@@ -227,5 +248,4 @@ def contract(tensor: Array, matrix: jax.Array) -> jax.Array:
     if n > UNROLL_LIMIT // 2:
         return jnp.einsum("ijab...,ab...->ij...", tensor, matrix)
     flat = jnp.asarray(tensor).reshape(*tensor.shape[:2], n * n, *tensor.shape[4:])
-    parts = zip(jnp.split(flat, n * n, axis=2), jnp.split(matrix.reshape(n * n, *matrix.shape[2:]), n * n), strict=True)
-    return add([part[:, :, 0] * weight for part, weight in parts])
+    return summed(flat * matrix.reshape(n * n, *matrix.shape[2:]), 2)

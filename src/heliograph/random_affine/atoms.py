@@ -53,7 +53,7 @@ class GainAndNoise(AbstractRandomAffine):
             [self.law.sample(gain_key) * jnp.asarray(self.matrix), self.noise.sample(noise_key)[:, None]],
             axis=1,
         )
-        return jnp.concatenate([top, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
+        return jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
     @property
     def remembers(self) -> bool:

@@ -218,7 +218,7 @@ class Stack(_Parts):
         """Draw each map and stack the rows."""
         state, drawn = self._draw_each(state, jax.random.split(key, len(self.maps)))
         rows = [h[:-1] for h in drawn]
-        return state, jnp.concatenate([*rows, jnp.eye(1, self.inputs + 1, self.inputs)], axis=0)
+        return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
     @kept
     def moments(self, order: int) -> Moments:

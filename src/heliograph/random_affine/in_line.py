@@ -65,7 +65,7 @@ class Held(AbstractRandomAffine):
             jnp.pad(one[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size))) for t, one in enumerate(each)
         ]
         top = jnp.concatenate([jnp.concatenate(rows), each[..., -1].reshape(-1, 1)], axis=1)
-        return (inner, each[:-1]), jnp.concatenate([top, jnp.eye(1, self.inputs + 1, self.inputs)])
+        return (inner, each[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
 class Relayed(AbstractOfLine):

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from heliograph.numerics.kept import kept
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import add, contract, diagonal
+from heliograph.numerics.small_matrix import contract, diagonal, own, summed
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
@@ -43,9 +43,8 @@ class QuadraticMap(Module):
         mask = present[:, None] & present[None, :]
         center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        m = range(entries.shape[0])
-        own = jnp.stack([jnp.sqrt(_or_one(jnp.abs(center[i, i]) + entries[i, i])) for i in m])
-        return center + diagonal(own * add([entries[:, j] / own[j] for j in m]))
+        unit = jnp.sqrt(_or_one(jnp.abs(own(center)) + own(entries)))
+        return center + diagonal(unit * summed(entries / unit, 1))
 
     def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
         """C:W alone, which is all where the law is known."""
