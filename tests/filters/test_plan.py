@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.plan import PlannedFilter
+from heliograph.filters.plan import PlannedFilter, followed
 
 STEPS = 7
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]], [[0.0], [1.0]])
@@ -43,6 +43,19 @@ def test_its_steps_are_the_originals(name):
         for expected, found in ((left, right), predicted, heard, (left, planned.estimate(b))):
             for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
                 np.testing.assert_allclose(y, x, rtol=0, atol=1e-12 * max(1.0, np.abs(x).max()))
+
+
+@pytest.mark.parametrize("name", ["linear", "Kalman", "cubature", "tighter"])
+def test_covariances_are_not_differentiated(name, monkeypatch):
+    """With respect to a mean or a measurement they are constant: their kernels have no part in the derivatives."""
+    item, of, jvp = ORIGINALS[name], set(), jax.jvp
+    monkeypatch.setattr(
+        jax, "jvp", lambda kernel, *given: (of.add(getattr(kernel, "__name__", "a part")), jvp(kernel, *given))[1]
+    )
+    with jax.enable_x64(True):
+        z, u = np.zeros(item.received), np.zeros(len(item.inputs))
+        jax.make_jaxpr(lambda state: followed(item, state, jax.numpy.asarray(z), u, 1))(item.init())
+    assert of and of <= {"moved", "used", "_use", "log_density"}
 
 
 def test_what_depends_on_data_stays_as_it_is():

@@ -48,6 +48,10 @@ class Signal(NamedTuple):
     matrix: jax.Array | None = None
     noise: jax.Array | None = None
 
+    def about_mean(self) -> "Signal":
+        """y - E y: all that the update behind a known gain depends on, whatever was estimated before."""
+        return self._replace(mean=jnp.zeros_like(self.mean), second=self.covariance)
+
 
 @readable
 class Scalars(Module):

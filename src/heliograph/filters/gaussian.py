@@ -56,7 +56,8 @@ class GaussianFilter(AbstractBeliefFilter):
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
-        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.heard_angles)
+        unknown = signal.about_mean() if self.linear else signal
+        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.heard_angles, unknown)
 
     def retain(
         self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
@@ -91,14 +92,24 @@ def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractT
 
 
 def corrected(
-    prior: Belief, signal: Signal, channel: SecondOrder, update: AbstractUpdate, z: jax.Array, angles: Angles = ()
+    prior: Belief,
+    signal: Signal,
+    channel: SecondOrder,
+    update: AbstractUpdate,
+    z: jax.Array,
+    angles: Angles = (),
+    unknown: Signal | None = None,
 ) -> tuple[Belief, Innovation]:
-    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing."""
+    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing.
+
+    `unknown`: what of the signal decides gain and covariance, where that is less than all.
+    """
+    unknown = signal if unknown is None else unknown
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
-    gain, bound = update.correct(prior.covariance, signal, channel, ~jnp.isnan(z))
+    gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))
     after = _use(prior, gain, bound, signal.mean, channel, z)
-    return after, gaussian_innovation(z, expected, innovation_covariance(signal, channel))
+    return after, gaussian_innovation(z, expected, innovation_covariance(unknown, channel))
 
 
 @runs_last
