@@ -142,7 +142,8 @@ def _result(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         for n in (FUSED, MEAN_GAIN, WIRED)
     ]
     headers = ["filter", "flux (mVs)", "of rated", "speed (rad/s)", "of rated",
-               "current, actual / claimed", "flux", "speed", "NEES / dim"]  # fmt: skip
+               "current, actual / claimed", "flux, actual / claimed", "speed, actual / claimed",
+               "NEES / dim"]  # fmt: skip
     caption = (
         f"Loaded drive, process noise as stated, {outcome.seeds} seeds of sensors and relays. Root mean square errors "
         "over all steps; **actual / claimed** above 1 is too sure, below 1 too cautious; NEES per dimension is 1 if "
@@ -158,8 +159,8 @@ def _result(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
 
 
 def _why(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
-    headers = ["case", "flux, of rated", "speed, of rated", "flux, actual / claimed", "speed",
-               "flux, from the model", "speed", "NEES / dim", "mean gain", "no relay"]  # fmt: skip
+    headers = ["case", "flux, of rated", "speed, of rated", "flux, actual / claimed", "speed, actual / claimed",
+               "flux, from the model", "speed, from the model", "NEES / dim", "mean gain", "no relay"]  # fmt: skip
     blocks: list[Text | Points | Table | Picture] = [
         Points([f"**{CASE_LABELS[name]}**: {what}." for name, what in CASES.items()])
     ]
