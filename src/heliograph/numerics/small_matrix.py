@@ -143,12 +143,11 @@ def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
 def pivot_scale(pivot: jax.Array, whole: jax.Array) -> jax.Array:
     """1 / root of a pivot; 0 for one that is zero up to rounding of the whole diagonal entry, NaN for a negative one.
 
-    The root is taken of a positive number in any case, so that what a zero pivot leaves out has the derivative 0.
+    The root is taken of a positive number in any case, of infinity where nothing is left: the derivative there is 0.
     """
-    positive = pivot > rounding(PIVOT_TOLERANCE, pivot) * whole
-    scale = 1 / jnp.sqrt(jnp.where(positive, pivot, 1.0))
-    none = jnp.where(pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole, 0.0, jnp.nan)
-    return jnp.where(positive, scale, none)
+    singular = pivot >= -rounding(NEGATIVE_TOLERANCE, pivot) * whole
+    beyond = jnp.where(singular, jnp.inf, jnp.nan)
+    return 1 / jnp.sqrt(jnp.where(pivot > rounding(PIVOT_TOLERANCE, pivot) * whole, pivot, beyond))
 
 
 def solve(a: jax.Array, b: jax.Array) -> jax.Array:
