@@ -217,6 +217,23 @@ def test_a_scheduler_that_dies_is_one_line_and_the_next_run_goes_on(tmp_path, ex
     assert result.already >= 2 and contents(out) == expected
 
 
+def test_a_client_that_cannot_close_does_not_hide_why_the_work_ended(tmp_path, monkeypatch):
+    import distributed
+
+    class Ending:
+        def __init__(self, *args, **options):
+            pass
+
+        def close(self, timeout):
+            raise RuntimeError("Cannot change state of expiring Timeout")
+
+    monkeypatch.setattr(distributed, "Client", Ending)
+    with engines.on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+        pass
+    with pytest.raises(ValueError, match="the reason"), engines.on_cluster("", tmp_path, "tcp://127.0.0.1:1"):
+        raise ValueError("the reason")
+
+
 def test_leftovers_of_killed_processes_go_with_the_next_run(tmp_path, expected):
     campaign, out = write(tmp_path), tmp_path / "out"
     run_campaign(campaign, out, workers=0, only=[(0, 0)])

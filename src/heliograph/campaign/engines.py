@@ -178,6 +178,12 @@ def on_cluster(campaign: str, store: Path, address: str, timeout: float = math.i
     try:
         yield lambda jobs: _submit(client, campaign, str(store), deque(jobs), timeout)
     finally:
+        _leave(client)
+
+
+def _leave(client: Untyped) -> None:
+    """Say goodbye; a client that ends by itself, its scheduler gone, may object, and why it ended is told already."""
+    with suppress(OSError, RuntimeError, TimeoutError):
         client.close(timeout=CONNECT)
 
 
