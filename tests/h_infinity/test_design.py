@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.h_infinity import design
 from tests.h_infinity.h_infinity_problems import channel, linear_system, node
 from tests.oracles import h_infinity_fusion as paper
 
@@ -66,6 +67,20 @@ def test_the_recursion_cannot_look_ahead():
     np.testing.assert_allclose(found.level, 0.02696, rtol=5e-4)
     assert found.level > HORIZON[0]
     assert hg.h_infinity.certify_level(node(0), found.gains, found.weights, found.multipliers, found.level).certified
+
+
+def test_steps_that_are_the_same_are_compiled_once(monkeypatch):
+    """The best predictor's gain, near which a step is searched, settles within a few steps; it made each its own."""
+    made = []
+
+    class Counted(design.StepProblem):
+        def __init__(self, *args):
+            made.append(self)
+            super().__init__(*args)
+
+    monkeypatch.setattr(design, "StepProblem", Counted)
+    assert hg.h_infinity.recursive_design(node(0), 1.8).feasible
+    assert len(made) == 1
 
 
 @pytest.mark.parametrize("i", range(4))

@@ -5,7 +5,7 @@ congruence of itself. The sizes are those that the system gives its own signals:
 are white noises of variance 1, x_0 and e_0 have the covariances of the initial weight, f and h are noises as large as
 their growth allows, and e is the error of the best predictor, near whose gain the design's is searched for. Where no
 growth is a ratio of norms, S1 and S2 are factors of covariances; else they are numbers, powers of 4, so that nothing is
-rounded and steps that differ little are the same problem.
+rounded and steps that differ little are the same problem, compiled once.
 """
 
 from typing import NamedTuple
@@ -18,6 +18,7 @@ from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 
+SETTLED = 0.1  # more of each error's variance: what the gain of the step before may cost to be searched near again
 SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
 
 
@@ -72,10 +73,12 @@ def scale(
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     x, e = initial[:n, :n], initial[n:, n:]
     sizes, heard, forms, scaled, wanted = [_sizes(x, e, plain)], [], [], [], 0.0
+    nominal = steps[0].nominal
     for k, step in enumerate(steps):
         spread = _signals(system, k, step, x, e)
         wanted = max(wanted, float(np.trace(step.wanted @ spread)))
-        x, e, measured, nominal = _moved(step, spread, None if gains is None else gains[k])
+        x, e, measured, best = _moved(step, spread, None if gains is None else gains[k])
+        nominal = best if gains is not None or k == 0 else _settled(nominal, best, measured, e)
         sizes.append(_sizes(x, e, plain))
         heard.append(_kept(np.sqrt(np.diagonal(measured))))
         unit = _coordinates(system, k, step, sizes[k])
@@ -142,6 +145,12 @@ def _moved(
     after = left @ spread @ left.T + gain @ (heard - step.heard @ spread @ step.heard.T) @ gain.T
     floor = SMALLEST**2 * np.diag(np.diagonal(before))
     return step.state @ spread @ step.state.T, _symmetric(after) + floor, heard, gain
+
+
+def _settled(last: np.ndarray, best: np.ndarray, heard: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The last gain where it leaves little more than the best one, which is (K - K0) heard (K - K0)'."""
+    more = (last - best) @ heard @ (last - best).T
+    return last if np.all(np.diagonal(more) <= SETTLED * np.diagonal(after)) else best
 
 
 def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
