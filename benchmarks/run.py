@@ -11,7 +11,7 @@ results.json: date, load (of the machine, before), machine, threads, and `compar
 A comparison has title, unit, runs, steps, floor (arithmetic, memory), distance (ours over the larger), ours, and peers
 by title. Each of these has best, median, how, runs and versions; a peer also difference (None: it computes something
 else, as its title says), ratio, target and met, or only absent, the reason. Where another release was measured,
-old_release has its best and median, the difference, and how many times as long ours takes by either. A benchmark alone
+old_release has its best and median, the difference, and how many times as long ours takes. A benchmark alone
 has unit, values, at_most and met.
 """
 
@@ -134,11 +134,15 @@ def earlier(ours: Program, source: Path) -> Program | None:
 
 
 def compared(its: Running, ours: Running) -> dict[str, Any]:
-    """Another release's times, and how many times as long ours takes."""
+    """Another release's times, and how many times as long ours takes: of the best, and from one pass to the next.
+
+    The latter is the median over the passes: what the machine does beside them slows both of a pair.
+    """
     found, own = its.result(), ours.result()
+    ratios = np.divide(ours.times, its.times)
     return {
         "best": found["best"], "median": found["median"], "difference": difference(its, ours),
-        "ours over it": round(own["best"] / found["best"], 3), "medians": round(own["median"] / found["median"], 3),
+        "ours over it": round(own["best"] / found["best"], 3), "in turn": round(float(np.median(ratios)), 3),
     }  # fmt: skip
 
 
@@ -219,7 +223,7 @@ def show_comparison(c: dict[str, Any]) -> None:
               f"{word(p['met']):>5}{gap:>12}  {p['how']}")  # fmt: skip
     if "old_release" in c:
         old = c["old_release"]
-        times = f"ours takes {old['ours over it']} and {old['medians']} times as long"
+        times = f"ours takes {old['ours over it']} (best) and {old['in turn']} (in turn) times as long"
         print(f"  {OTHER:<36}{old['best']:>11,.1f}{old['median']:>11,.1f}  {times}; difference {old['difference']:.0e}")
     floor = c["floor"]
     print(
