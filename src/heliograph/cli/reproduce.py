@@ -32,5 +32,9 @@ def reproduce(
     if runs is not None:
         check_count("--runs", runs)
     check_seed("--seed", seed)
+    import jax
+
     for name in chosen:
         import_module(METHODS[name]).reproduce(target, runs, seed)
+        # One publication's programs are no other's: kept, those of all are gigabytes.
+        jax.clear_caches()  # type: ignore[no-untyped-call]
