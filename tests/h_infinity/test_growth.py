@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.h_infinity import certify_level, check_growth, check_size
-from heliograph.h_infinity.interval import Interval, evaluate
+from heliograph.h_infinity.interval import ARITHMETIC, Interval, evaluate
 from heliograph.h_infinity.slope_bound import slope_bound
 
 REFUTED = {
@@ -24,6 +24,16 @@ def test_evidence_of_its_own_refutes(name):
     found = check_growth(function, constant, [-1.0], [1.0])
     assert found.refuted and not found.proved
     assert text in found.text
+
+
+@pytest.mark.parametrize(("low", "high"), [(-0.5, 0.9), (0.2, 0.7), (-3.0, -1.0)])
+def test_one_less_a_square_holds_every_sample(low, high):
+    """JAX 0.12 writes a slope of tanh so; earlier releases never do."""
+    found = ARITHMETIC["one_minus_square"](Interval(np.array(low), np.array(high)))
+    points = np.linspace(low, high, 1001)
+    assert found.low <= np.min(1 - points**2) and np.max(1 - points**2) <= found.high
+    nearest, farthest = (0.0 if low < 0 < high else min(abs(low), abs(high))), max(abs(low), abs(high))
+    np.testing.assert_allclose((found.low, found.high), (1 - farthest**2, 1 - nearest**2), rtol=1e-14, atol=1e-15)
 
 
 SMOOTH = {

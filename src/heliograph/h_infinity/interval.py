@@ -256,6 +256,7 @@ ARITHMETIC: dict[str, Callable[..., Interval]] = {
     "min": lambda a, b: Interval(np.minimum(a.low, b.low), np.minimum(a.high, b.high)),
     "abs": _absolute,
     "square": _square,
+    "one_minus_square": lambda a: ARITHMETIC["sub"](exact(np.ones_like(a.low)), _square(a)),  # a slope of tanh
     "exp": _rising(np.exp, 0.0),
     "log": _rising(lambda x: np.where(x > 0, np.log(np.maximum(x, 0.0)), np.nan)),
     "log1p": _rising(lambda x: np.where(x > -1, np.log1p(np.maximum(x, -1.0)), np.nan)),
