@@ -8,6 +8,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -167,7 +168,7 @@ async def until(holds) -> None:
 
 def owners(folder: Path) -> dict[str, int]:
     """How many parts each process has."""
-    with sqlite3.connect(folder / "store.sqlite") as store:
+    with closing(sqlite3.connect(folder / "store.sqlite")) as store:
         try:
             return dict(store.execute("SELECT process, count(*) FROM parts GROUP BY process").fetchall())
         except sqlite3.OperationalError:
