@@ -41,7 +41,12 @@ def pytest_unconfigure(config):
 
 
 def pytest_collection_finish():
-    """What is imported stays: the collector need not look at it again and again while JAX traces, nor at each trace."""
+    """What is imported stays: the collector need not look at it again and again while JAX traces, nor at each trace.
+
+    The folder is for commands that tests start: in here hardly a program comes twice, and keeping each costs a tenth.
+    """
+    if "jax" in sys.modules:
+        sys.modules["jax"].config.update("jax_enable_compilation_cache", False)
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
