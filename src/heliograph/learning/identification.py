@@ -16,7 +16,7 @@ from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, produ
 from heliograph.learning.routes import route_sentences
 from heliograph.learning.surface import Surface
 from heliograph.numerics.check import check_count, check_seed, fail
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import factor
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -177,7 +177,7 @@ def _drawn(objective: Objective, x: np.ndarray, u: np.ndarray, seed: int) -> Flo
         return np.asarray(_expected(objective, x, u, jax.random.key(seed)))
 
 
-@large_program
+@quickly_compiled
 def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.Array:
     item = objective.filter(jnp.asarray(x))
 

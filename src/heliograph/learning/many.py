@@ -15,7 +15,7 @@ from heliograph.learning.parameters import Parameters
 from heliograph.learning.surface import DIFFERENCE
 from heliograph.learning.transforms import unlink
 from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -110,7 +110,7 @@ def fit_each(
     return FitEach(parameters, best.x, hessian, np.asarray(top.score), inside)
 
 
-@large_program
+@quickly_compiled
 def _each(objective: Objective, x: Array, z: Array, u: Array) -> Found:
     found: Found = jax.vmap(lambda point, one: one_recording(objective, point, one, u))(x, z)
     return found

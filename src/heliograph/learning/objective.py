@@ -22,7 +22,7 @@ from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.sensor import is_linear
 from heliograph.numerics.check import fail
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.small_matrix import solve
 from heliograph.numerics.types import Array, Float, PyTree
@@ -183,13 +183,13 @@ def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data
     return Found(*(np.stack(each) for each in zip(*(every[i] for i in range(len(x))), strict=True)))
 
 
-@large_program
+@quickly_compiled
 def _many(objective: Objective, x: Array, z: Array, u: Array) -> Found:
     one: Found = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
     return one
 
 
-@large_program
+@quickly_compiled
 def _settling(objective: Objective, x: Array, z: Array) -> tuple[Found, jax.Array]:
     def numbers(x: Array) -> PyTree:
         return eqx.filter(objective.filter(x), eqx.is_inexact_array)

@@ -16,6 +16,7 @@ from heliograph.live.mould import Mould, cast
 from heliograph.live.tape import Ears, Tape, at_step, interval
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.gathering import Fused
@@ -96,7 +97,7 @@ def sweep_back(mould: Mould, dt: int | None) -> Callable[..., PyTree]:
         _, steps, later = jax.lax.fori_loop(0, count + 1, one, begun)
         return item.told(steps, later)
 
-    return jax.jit(run)
+    return jax.jit(run, compiler_options=understood())
 
 
 def _into_row(dt: int) -> Into:

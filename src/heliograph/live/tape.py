@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.mould import Mould
+from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
@@ -96,7 +97,7 @@ def replay(mould: Mould, dt: int | None) -> Replay:
         tape = jax.lax.fori_loop(start, stop, one, tape._replace(rows=tape.rows.at[slot].set(row)))
         return tape, [leaf[order[stop - 1]] for leaf in tape.told]
 
-    return jax.jit(run, donate_argnums=1)
+    return jax.jit(run, donate_argnums=1, compiler_options=understood())
 
 
 Moved = tuple[PyTree, jax.Array, jax.Array, list[jax.Array]]  # after a row: states, inputs held, step, what is told

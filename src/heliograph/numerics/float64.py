@@ -4,11 +4,11 @@ from collections.abc import Callable
 from functools import wraps
 from typing import ParamSpec, TypeVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import PyTree
 
@@ -52,7 +52,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
     Numbers in the arguments become arrays first, so that a step counter does not compile anew at each step. Inside a
     trace it is the plain function.
     """
-    jitted = eqx.filter_jit(function)
+    jitted = quickly_compiled(function)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:

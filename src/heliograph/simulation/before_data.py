@@ -12,7 +12,7 @@ from heliograph.fusion.informed import MatrixWeights
 from heliograph.fusion.rules import Fusion
 from heliograph.fusion.weights import factored_weights, matrix_weights
 from heliograph.numerics.check import array, check_horizon, fail, instance
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float, PyTree
@@ -163,7 +163,7 @@ def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple
     return plan(filters, u), u
 
 
-@large_program
+@quickly_compiled
 def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     (centre,) = filters.informed
 
@@ -182,7 +182,7 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     return result
 
 
-@large_program
+@quickly_compiled
 def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
     def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         (own, known), (k, u_k) = carry, row

@@ -4,11 +4,11 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from heliograph.numerics.check import check_count, fail, shown
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 
@@ -72,6 +72,6 @@ def _filled(part: np.ndarray, count: int) -> np.ndarray:
     return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
 
 
-@eqx.filter_jit
+@quickly_compiled
 def _blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
     return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

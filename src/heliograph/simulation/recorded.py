@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import check_times, fail, instance, table
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
 from heliograph.simulation.given import inputs_of, measurement_of
@@ -66,7 +66,7 @@ def run(
     return found_record(network, part, found, clock)
 
 
-@large_program
+@quickly_compiled
 def _run_filters(
     filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
 ) -> PyTree:

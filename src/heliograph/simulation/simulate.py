@@ -12,7 +12,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import check_count, fail, instance, shown
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.module import Module
 from heliograph.simulation.air import air_of
@@ -156,13 +156,13 @@ def _kept(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress |
     return lanes.total(), jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
 
 
-@large_program
+@quickly_compiled
 def _initial(job: _Job) -> PyTree:
     """What the reducer holds before the first block; compiled, so that shapes are worked out once a network."""
     return job.reducer.initial(eqx.filter_eval_shape(_block, job, np.arange(BLOCK)))
 
 
-@partial(large_program, donate="all-except-first")
+@partial(quickly_compiled, donate="all-except-first")
 def _lane(todo: tuple[_Job, PyTree], carry: PyTree) -> tuple[PyTree, PyTree]:
     return _blocks(*todo, carry)
 
@@ -176,7 +176,7 @@ def _blocks(job: _Job, blocks: PyTree, carry: PyTree) -> tuple[PyTree, PyTree]:
     return jax.lax.scan(body, carry, jnp.asarray(blocks))
 
 
-@large_program
+@quickly_compiled
 def _all_lanes(job: _Job, blocks: PyTree, carries: PyTree) -> tuple[PyTree, PyTree]:
     """Every lane's blocks, with a leading axis for the lanes."""
     result: tuple[PyTree, PyTree] = jax.vmap(partial(_blocks, job))(blocks, carries)

@@ -18,7 +18,7 @@ from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
 from heliograph.numerics.check import fail
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
@@ -183,7 +183,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     return cast(AllFilters, to_numpy(result))
 
 
-@large_program
+@quickly_compiled
 def _plan(
     alike: tuple[Alike, ...], central: dict[str, AbstractFilter], retains: bool, u: jax.Array
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:

@@ -17,7 +17,7 @@ from heliograph.model.estimate import Claim
 from heliograph.model.over_time import first
 from heliograph.model.plant import AnyPlant
 from heliograph.numerics.check import array, check_count, fail, instance
-from heliograph.numerics.compiler import large_program
+from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
@@ -121,7 +121,7 @@ class Level(NamedTuple):
     own: Float[Array, "node n n"]
 
 
-@large_program
+@quickly_compiled
 def _followed(
     leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
 ) -> tuple[Array, Array, Level]:
@@ -158,7 +158,7 @@ def _followed(
     return _spread(level), weights, above
 
 
-@large_program
+@quickly_compiled
 def _relay(children: Level) -> tuple[jax.Array, Level]:
     """Weights of a relay for its children, and its own error."""
     return _fuse(children)
