@@ -46,7 +46,10 @@ def pytest_collection_finish():
     The folder is for commands that tests start: in here hardly a program comes twice, and keeping each costs a tenth.
     """
     if "jax" in sys.modules:
+        from jax.experimental.compilation_cache.compilation_cache import reset_cache
+
         sys.modules["jax"].config.update("jax_enable_compilation_cache", False)
+        reset_cache()  # whether there is one is asked once, and what is collected may have asked
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
