@@ -7,8 +7,6 @@ made-up numbers in place of the second example.
 import json
 from dataclasses import replace
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -21,8 +19,6 @@ from heliograph.papers.h_infinity_fusion import (
     indices,
     levels,
     losses,
-    one_step,
-    published_level,
     run,
     setting,
     structured,
@@ -30,9 +26,9 @@ from heliograph.papers.h_infinity_fusion import (
     worst_disturbance,
 )
 from heliograph.papers.h_infinity_fusion.statements import statements
-from heliograph.papers.statement import Sampled
+from tests.papers.h_infinity_fusion_verdicts import VERDICTS
 from tests.papers.readme import said_of
-from tests.papers.verdicts import both, check_verdicts
+from tests.papers.verdicts import check_verdicts
 
 RECURSIVE = example.RECURSIVE
 pytest.importorskip("cvxpy")
@@ -133,36 +129,6 @@ def test_separate_multipliers_have_a_closed_form(nodes):
     assert nodes[0].separate.level == pytest.approx(expected, rel=3e-6)
 
 
-def test_with_the_papers_start_only_the_start_counts():
-    level = hg.h_infinity.horizon_design(setting.system(0), initial=10 * np.eye(4)).level
-    assert level == pytest.approx(np.sqrt(10 / 15), rel=2e-6)  # (19), with the solver's margin
-
-
-def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(monkeypatch):
-    assert all(one_step.enumeration_gap(i) < 1e-14 for i in range(4))  # rounding
-    honest = one_step.theorem_matrix
-    off = setting.system(1, hop=lambda uplink, noise: setting.lossy(uplink, noise if uplink else 1.01 * noise))
-    monkeypatch.setattr(one_step, "theorem_matrix", lambda system, *rest: honest(off, *rest))
-    assert one_step.enumeration_gap(1) > 1e-6  # one noise's variance 1 % too large
-
-
-def test_the_growth_constant_is_false_for_differences_and_true_for_sizes():
-    f, side = setting.dynamics(15), np.full(2, 2.0)
-    found = hg.h_infinity.check_growth(f, 0.7, -side, side)
-    assert found.refuted and 15 < found.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
-    x, y = found.pair
-    with jax.enable_x64(True):
-        moved = np.linalg.norm(np.asarray(f(jnp.asarray(x))) - np.asarray(f(jnp.asarray(y))))
-    assert moved / np.linalg.norm(x - y) == pytest.approx(found.ratio, rel=1e-9)
-    assert not hg.h_infinity.check_size(f, 0.7, -side, side).refuted
-
-
-def test_fused_levels():
-    weights = hg.fusion.level_weights(setting.LEVELS)
-    np.testing.assert_allclose(weights, [0.248842, 0.278979, 0.248842, 0.223337], atol=5.1e-7)  # printed digits
-    assert published_level.published_fused_level(setting.LEVELS, weights) == pytest.approx(2.539682, abs=5.1e-7)
-
-
 @pytest.fixture(scope="module")
 def outcome(nodes):
     """128 runs of the H-infinity filters."""
@@ -220,58 +186,6 @@ def test_losses_are_read_off_what_was_received(outcome):
     relayed = seen[..., 1] * (np.nan_to_num(seen[..., 0]) * y + n[:, 0]) + n[:, 1]
     np.testing.assert_allclose(z[..., 0], relayed, atol=1e-14)
     np.testing.assert_allclose(z[..., 1], np.sqrt(2) * seen[..., 2] * y + n[:, 2], atol=1e-14)
-
-
-def test_the_search_finds_the_norm_of_a_linear_system():
-    """With phi = 0 and no gain, the largest ratio is a singular value."""
-    rotation, steps = structured.ROTATION, structured.STEPS
-    nothing = hg.h_infinity.GrowthSystem(*structured.system("1"))
-    design = hg.h_infinity.HInfinityDesign(
-        1.0, np.zeros((steps, 2, 2)), np.zeros((steps + 1, 4, 4)), np.zeros((steps, 2)), True, ""
-    )
-
-    def transition(x, u):
-        return jnp.where(u[1] > 0, rotation @ x, x)
-
-    plant = hg.Plant(transition, np.zeros((2, 2)), np.zeros(2), np.eye(2), inputs=structured.INPUTS)
-    item = hg.filters.h_infinity_filter(plant, structured.sensor("1"), nothing, design)
-    world = worst_disturbance.World(
-        lambda x, k: rotation @ x, lambda x: x[:1], structured.DISTURBANCE, np.zeros((1, 1)), np.eye(2), np.eye(4),
-        structured.inputs("bias"),
-    )  # fmt: skip
-    draws = structured.draws(2, 0)
-    found = worst_disturbance.worst_disturbance(item, world, draws, draws, [1.0], rounds=200)
-    powers = [np.linalg.matrix_power(rotation, k) for k in range(steps)]
-    toeplitz = np.block([
-        [powers[k], *(powers[k - 1 - j] @ structured.DISTURBANCE if j < k else np.zeros((2, 1)) for j in range(steps))]
-        for k in range(steps)
-    ])  # fmt: skip
-    top = np.linalg.svd(toeplitz, compute_uv=False)[0]
-    assert found.level <= top * (1 + 1e-12) and found.level == pytest.approx(
-        top, rel=1e-3
-    )  # 200 rounds of power method
-
-
-def test_the_second_example_is_certified_and_beats_a_kalman_filter_where_it_should():
-    system = structured.system("1")
-    design = hg.h_infinity.horizon_design(system, separate=True)
-    side = np.full(2, structured.BOX)
-    finding = hg.h_infinity.check_growth(structured.slight, structured.GROWTH, -side, side, "phi")
-    assert not finding.refuted and levels.certify(system, design, [finding]).certified
-    assert design.level == pytest.approx(7.2565, rel=1e-4)  # of which margins in a large system's units cost 1.7e-4
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(discriminating, "filters", lambda node, designs: {"ekf": kalman(node)})
-        patch.setattr(discriminating, "ENERGIES", (1000.0,))
-        patch.setattr(discriminating, "SEARCH_DRAWS", 16)
-        patch.setattr(discriminating, "JUDGE_DRAWS", 1_000)
-        worst = discriminating.worst_cases({})["ekf"]
-    assert worst.level - 4 * worst.standard_error > design.level
-    assert hg.h_infinity.horizon_design(structured.system("1", False), separate=True).level > 4 * design.level
-
-
-def kalman(node):
-    believed, sensor = structured.plant(False), structured.sensor(node)
-    return example.prediction_of(hg.extended_filter(believed, sensor, structured.channel()))
 
 
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
@@ -381,72 +295,5 @@ def test_claims_follow_the_numbers(result):
     ] == "fails"
 
 
-def sampled(value, error=0.01):
-    return Sampled(value, error)
-
-
-SHARE = both("largest_share_of_runs", 0.0, 0.1)
-DIFFERENCE = both("difference", sampled(-0.1), sampled(-0.02))
-VERDICTS = [
-    ("the inequalities", both("fewest_steps_certified", 16, 15)),
-    ("the levels measure", {"holds": {"level_of_hearing_nothing": 2.0},
-                            "holds_vacuously": {"level_of_hearing_nothing": 0.1}}),
-    ("the smallest level", {"holds": {"best_gains": 0.9, "no_gains": 1.0}, "fails": {"best_gains": 1, "no_gains": 1}}),
-    ("one multiplier", both("largest_ratio", 1.0, 1.01)),
-    ("J_1", {"holds": {"largest": -1.0, "largest_without_measurements": 1.0},
-             "holds_vacuously": {"largest": -1.0, "largest_without_measurements": -1.0}, "fails": {"largest": 1.0}}),
-    ("J_2", {"holds": {"index": -1.0, "without_measurements": 1.0},
-             "holds_vacuously": {"index": -1.0, "without_measurements": -1.0}, "fails": {"index": 1.0}}),
-    ("the estimates track", {"holds": {"own": sampled(0.4), "without_measurements": sampled(1.0)},
-                             "holds_vacuously": {"own": sampled(0.6), "without_measurements": sampled(1.0)}}),
-    ("losses", both("standard_errors_off", 2.0, 5.0)),
-    ("the fused error stays", {"holds": {"dynamic": sampled(1.1), "unquantized": sampled(1.0)},
-                               "fails": {"dynamic": sampled(1.3), "unquantized": sampled(1.0)}}),
-    ("dynamic quantization", DIFFERENCE),
-    ("it does so", {"holds": {"even": sampled(1.0), "odd": sampled(0.6)},
-                    "fails": {"even": sampled(1.0), "odd": sampled(0.4)}}),
-    ("v_s", both("first_divisor", 1.0, 0.0)),
-    ("|f(x)| <=", both("largest_ratio", 0.7, 0.71)),
-    ("|f(x) - f(xhat)|", {"holds": {"largest_slope": 0.7, "steps_that_break_it": 0},
-                          "fails": {"largest_slope": 0.7, "steps_that_break_it": 1}}),
-    ("the guarantee", {"holds": {"guaranteed": 1.0, "found": sampled(1.02)},
-                       "fails": {"guaranteed": 1.0, "found": sampled(1.04)}}),
-    ("levels can be", {"holds": {"largest_level": 1.0, "certified": 1}, "fails": {"certified": 0}}),
-    ("(18)", both("gap", 0.0, 1e-3)),
-    ("any solution", {"holds": {"nodes_stuck": 0, "nodes_stuck_with_an_objective": 0}, "fails": {"nodes_stuck": 1}}),
-    ("(32)", both("least_divisor", 0.1, 0.0)),
-    ("the fused level", both("level", 2.54192, 2.542)),
-    ("the printed weights", {"holds": {"printed": 1.0, "best": 1.0}, "fails": {"printed": 1.1, "best": 1.0}}),
-    ("the minimum", both("largest_eigenvalue", -0.1, 0.0)),
-    ("fusing", {"holds": {"fused": 0.9, "best_node": 1.0}, "fails": {"fused": 1.1, "best_node": 1.0}}),
-    ("|mu|", both("largest_ratio", 1.0, 1.1)),
-    ("the quantization terms", SHARE),
-    ("the fused error obeys", SHARE),
-    ("the fusion centre", both("receiver_off_by", 0.0, 0.1)),
-    ("the second example", both("not_certified", 0, 1)),
-    ("H-infinity design", {
-        "holds": {"guaranteed": 1.0, "statistics": sampled(1.1), "ignoring": sampled(1.1)},
-        "fails": {"guaranteed": 1.0, "statistics": sampled(1.1), "ignoring": sampled(1.02)}}),
-    ("it errs less under a resonant", DIFFERENCE),
-    ("it errs less under white", DIFFERENCE),
-    ("it errs less under a constant", DIFFERENCE),
-    ("knowing A", {"holds": {"known": 0.4, "by_growth": 1.0}, "fails": {"known": 0.6, "by_growth": 1.0}}),
-]  # fmt: skip
-
-
 def test_verdicts_follow_from_evidence(result):
     check_verdicts(statements(result), VERDICTS)
-
-
-@pytest.mark.parametrize("runs", [0, 99, 100.5])
-def test_too_few_runs_are_refused(tmp_path, runs):
-    with pytest.raises(ValueError, match="runs: expected a whole number of at least 100"):
-        run.reproduce(tmp_path, runs)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
-    (tmp_path / "h-infinity-fusion").mkdir()
-    (tmp_path / "h-infinity-fusion" / "thesis.tex").write_text("mine")
-    with pytest.raises(ValueError, match="other files"):
-        run.reproduce(tmp_path, 100)

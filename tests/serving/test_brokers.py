@@ -1,11 +1,10 @@
 """Messages through real brokers: in order, acknowledged after the commit, and again if they were not."""
 
 import asyncio
-import contextlib
 import logging
 import shutil
 import subprocess
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 
 import pytest
 
@@ -13,79 +12,20 @@ pytest.importorskip("nats")
 pytest.importorskip("paho")
 import nats
 import nats.js.errors
-from paho.mqtt.client import Client
-from paho.mqtt.enums import CallbackAPIVersion
 
 from heliograph.examples.live.server import Server
-from heliograph.serving.contract import check_transport
 from heliograph.serving.mqtt import Mqtt
 from heliograph.serving.nats import Nats
 from heliograph.serving.output import Output
 from heliograph.serving.partition import Part, part_of, word
 from heliograph.serving.transport import TakenOverError, Transport
 from heliograph.serving.url import Address, address
+from tests.serving.brokers import at, made, numbered, published, received, running, sent, silent
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
-    one = Server(tmp_path_factory.mktemp("server"))
-    one.start()
-    yield one
-    one.kill()
-
-
-def at(server: Server, kind: str, topic: str) -> Address:
-    return address(f"{kind}://127.0.0.1:{getattr(server, kind)}/{topic}", {})
-
-
-async def received(transport: Transport, count: int, acknowledge: bool = True) -> list[bytes]:
-    """At least so many messages."""
-    found: list[bytes] = []
-    while len(found) < count:
-        batch = await asyncio.wait_for(transport.receive(), 20)
-        assert batch is not None
-        found += batch.payloads
-        if acknowledge:
-            await batch.acknowledge()
-    return found
-
-
-async def silent(transport: Transport, seconds: float = 0.3) -> bool:
-    try:
-        await asyncio.wait_for(transport.receive(), seconds)
-    except TimeoutError:
-        return True
-    return False
-
-
-async def sent(where: Address, bodies: list[bytes], plant: str = "a") -> None:
-    client = await nats.connect(f"nats://{where.host}:{where.port}")
-    stream = client.jetstream(timeout=60)
-    try:
-        await asyncio.gather(*[await stream.publish_async(f"{where.topic}.in.{word(plant)}", body) for body in bodies])
-    finally:
-        await client.close()
-
-
-def published(where: Address, bodies: list[bytes], below: str = "a") -> None:
-    client = Client(CallbackAPIVersion.VERSION2)
-    client.connect(where.host, where.port)
-    client.loop_start()
-    for one in [client.publish(f"{where.topic}/in/{below}", body, 1) for body in bodies]:
-        one.wait_for_publish(10)
-    client.disconnect()
-    client.loop_stop()
-
-
-def numbered(start: int, stop: int) -> list[bytes]:
-    return [str(i).encode() for i in range(start, stop)]
-
-
-async def made(where: Address, part: Part = Part()) -> Nats:  # noqa: B008
-    """A reader that has made its stream."""
-    reader = Nats(where, part)
-    await asyncio.wait_for(reader._reading(), 20)
-    return reader
+    yield from running(tmp_path_factory.mktemp("server"))
 
 
 def test_the_url_is_told_without_what_is_secret():
@@ -293,91 +233,3 @@ def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatc
     finally:
         server.kill()
     assert "trying again" in caplog.text and "s3cret" not in caplog.text
-
-
-class OverNats:
-    """A service through JetStream, and the sensor and the reader on the other side."""
-
-    def __init__(self, server: Server):
-        self.where, self.url = at(server, "nats", "contract"), f"nats://127.0.0.1:{server.nats}"
-
-    def transport(self) -> Transport:
-        return Nats(self.where)
-
-    async def send(self, bodies: Sequence[bytes]) -> None:
-        try:
-            await sent(self.where, list(bodies))
-        except nats.js.errors.NoStreamResponseError:  # no service was there yet
-            return
-
-    async def told(self) -> list[bytes]:
-        client = await nats.connect(self.url)
-        reader = await client.jetstream().subscribe("contract.out.*.*", ordered_consumer=True)
-        found = []
-        with contextlib.suppress(nats.errors.TimeoutError):
-            while True:
-                found.append((await reader.next_msg(0.5)).data)
-        await client.close()
-        return found
-
-
-class OverMqtt:
-    """The same through MQTT."""
-
-    def __init__(self, server: Server):
-        self.where, self.heard = at(server, "mqtt", "contract"), list[bytes]()
-        self.reader = Client(CallbackAPIVersion.VERSION2)
-        self.reader.on_message = lambda client, data, message: self.heard.append(message.payload)
-        self.reader.connect(self.where.host, self.where.port)
-        self.reader.subscribe("contract/out/#", 1)
-        self.reader.loop_start()
-
-    def transport(self) -> Transport:
-        return Mqtt(self.where)
-
-    async def send(self, bodies: Sequence[bytes]) -> None:
-        await asyncio.to_thread(published, self.where, list(bodies))
-
-    async def told(self) -> list[bytes]:
-        return list(self.heard)
-
-
-def test_jetstream_keeps_the_contract_and_sends_again_in_order(server: Server):
-    assert check_transport(OverNats(server))
-
-
-def test_mqtt_keeps_the_contract(server: Server):
-    broker = OverMqtt(server)
-    check_transport(broker)  # this server sends what is new first
-    broker.reader.disconnect()
-    broker.reader.loop_stop()
-
-
-@pytest.mark.parametrize("kind", ["nats", "mqtt"])
-def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: str):
-    make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
-    outputs = [Output(i, "a.b", "final", str(i).encode()) for i in range(300)]
-
-    async def heard(work: Callable[[], Awaitable[None]]) -> list[bytes]:
-        """What both kinds of clients find, since a topic is a subject."""
-        client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
-        subscription = await client.subscribe(f"out{kind}.out.*.a%2Eb")
-        await client.flush()
-        await work()
-        found = [(await subscription.next_msg(5)).data for _ in range(len(outputs) + 1)]
-        await client.close()
-        return found
-
-    async def work() -> None:
-        transport = make(at(server, kind, f"out{kind}"))
-        if isinstance(transport, Nats):
-            assert await silent(transport)
-        found = await heard(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
-        assert found == [b"now", *[one.body for one in outputs]]
-        if isinstance(transport, Nats):
-            await transport.publish(outputs)  # told again, as after a restart
-            info = await transport._client.jetstream().stream_info("outnats-out")
-            assert info.state.messages == len(outputs)
-        await transport.close()
-
-    asyncio.run(work())
