@@ -154,14 +154,14 @@ def _value(traces: Callable[[Steps, jax.Array], tuple[jax.Array, jax.Array, jax.
 def _receiver_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     result, n = steady(steps, gains), steps.transition.shape[-1]
     last = result.moments[1:, -n:, -n:]
-    return jnp.trace(last, axis1=1, axis2=2), is_covariance(result.moments), result.power[:, 1:].sum(axis=1)
+    return jnp.trace(last, axis1=1, axis2=2), is_covariance(result.moments), jnp.sum(result.power[:, 1:], axis=1)
 
 
 def _behind_traces(steps: Steps, gains: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     result, n = steady(steps, gains), steps.transition.shape[-1]
     spread = steady_behind(steps, gains)
     sound = is_covariance(result.moments[:, :-n, :-n]) & is_covariance(spread)
-    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, result.power[:, 1:].sum(axis=1)
+    return jnp.trace(spread[:, :n, :n], axis1=1, axis2=2), sound, jnp.sum(result.power[:, 1:], axis=1)
 
 
 _receiver_cost = _value(_receiver_traces)

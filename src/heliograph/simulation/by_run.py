@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import PyTree
 
@@ -101,7 +101,7 @@ def _needed(program: ClosedJaxpr) -> ClosedJaxpr:
 
 def _split(program: ClosedJaxpr, carried: int) -> tuple[ClosedJaxpr, ClosedJaxpr, list[Var]]:
     """A step (carry, key, row) as what is drawn, without the carry, and the rest, which is given what was drawn too."""
-    whole = program.jaxpr
+    whole: Jaxpr = program.jaxpr
     by_carry = _marked(program, [True] * carried + [False] * (len(whole.invars) - carried))
     by_key = _marked(program, [i == carried for i in range(len(whole.invars))])
     early = [e for e in whole.eqns if not any(v in by_carry for v in e.outvars)]
@@ -110,8 +110,13 @@ def _split(program: ClosedJaxpr, carried: int) -> tuple[ClosedJaxpr, ClosedJaxpr
     used = [v for e in late for v in e.invars] + whole.outvars
     drawn = list(dict.fromkeys(v for v in used if not isinstance(v, Literal) and v in made))
     unnamed = whole.debug_info.with_unknown_names()
-    ahead = whole.replace(eqns=early, invars=whole.invars[carried:], outvars=drawn, debug_info=unnamed)
-    rest = whole.replace(eqns=late, invars=[*whole.invars, *drawn], debug_info=unnamed)
+
+    def part(eqns: list[JaxprEqn], invars: list[Var], outvars: Sequence[Var | Literal]) -> Jaxpr:
+        made: Jaxpr = whole.replace(eqns=eqns, invars=invars, outvars=outvars, debug_info=unnamed)  # type: ignore[no-untyped-call]
+        return made
+
+    ahead = part(early, whole.invars[carried:], drawn)
+    rest = part(late, [*whole.invars, *drawn], whole.outvars)
     return ClosedJaxpr(ahead, program.consts), ClosedJaxpr(rest, program.consts), drawn
 
 

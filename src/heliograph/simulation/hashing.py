@@ -73,7 +73,7 @@ WRITTEN_OUT = define_prng_impl(
 
 def written_out(keys: jax.Array, programs: Sequence[ClosedJaxpr]) -> jax.Array:
     """The keys with the written-out hash where all programs can take them, else as they are."""
-    ordinary = str(jax.random.key_impl(keys)) == "threefry2x32" and bool(jax.config.jax_threefry_partitionable)  # type: ignore[attr-defined]
+    ordinary = str(jax.random.key_impl(keys)) == "threefry2x32" and jax.threefry_partitionable.value
     if not (ordinary and all(_takes_any_key(program.jaxpr) for program in programs)):
         return keys
     wrapped: jax.Array = jax.random.wrap_key_data(jax.random.key_data(keys), impl=WRITTEN_OUT)
