@@ -11,7 +11,7 @@ import tempfile
 import pytest
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
-IN_A_HURRY = "--xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+IN_A_HURRY = "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
 
 
 def pytest_configure(config):
@@ -23,9 +23,10 @@ def pytest_configure(config):
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
         # BLAS threads wait busily for matrices of a few rows: thirty times the processor time of a small L-BFGS-B.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        flags = f"{os.environ.get('XLA_FLAGS', '')} {IN_A_HURRY}"
-        if understood(flags):
-            os.environ["XLA_FLAGS"] = flags
+        for flag in IN_A_HURRY:
+            flags = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
+            if understood(flags):
+                os.environ["XLA_FLAGS"] = flags
 
 
 def understood(flags: str) -> bool:

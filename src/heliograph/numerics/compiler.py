@@ -34,14 +34,17 @@ def quickly_compiled(function: Callable[P, R], donate: Literal["none", "all-exce
 
 @cache
 def understood() -> dict[str, bool | int]:
-    """The options, if this release of the compiler has them: they are not part of its promises.
+    """Those of the options that this release of the compiler has: they are not part of its promises.
 
     Without the level where JAX's flag jax_disable_most_optimizations is set, which an option would overrule.
     """
     least = jax.config.values["jax_disable_most_optimizations"]
-    options = {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL)}
+    return {name: value for name, value in OPTIONS.items() if not (least and name == LEVEL) and _is_understood(name)}
+
+
+def _is_understood(name: str) -> bool:
     try:
-        jax.jit(lambda: jnp.zeros(()), compiler_options=options)()
+        jax.jit(lambda: jnp.zeros(()), compiler_options={name: OPTIONS[name]})()
     except jax.errors.JaxRuntimeError:
-        return {}
-    return options
+        return False
+    return True
