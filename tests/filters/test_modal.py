@@ -7,6 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.second_moments import nominal_spread
+from tests.filters.modal_problems import BAD, CHAIN_A, GOOD, LAW_A, RELAY, chain_a
 from tests.oracles import links_with_memory as oracle
 
 Series, Stack, Mixture, Modes = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Mixture", "Modes"))
@@ -28,17 +29,9 @@ SECOND = oracle.plant_moments(
     [p.matrix for p in PLANTS], [SHIFT + INPUT @ u for u in U], [p.noise.covariance for p in PLANTS], X0, P0
 )
 
-CHAIN_A = [np.array([[0.8, 0.2], [0.4, 0.6]]), np.array([[0.5, 0.5], [0.1, 0.9]]), np.array([[0.9, 0.1], [0.3, 0.7]])]
 CHAIN_B = np.array([[0.7, 0.2, 0.1], [0.1, 0.6, 0.3], [0.25, 0.25, 0.5]])
-LAW_A, LAW_B = np.array([0.9, 0.1]), np.array([0.2, 0.5, 0.3])  # not stationary
-GOOD = hg.hop(hg.Discrete([0.7, 1.1], [0.4, 0.6]), hg.Gaussian([[0.2]], [0.1]))
-BAD = hg.hop(hg.Rayleigh(0.2), 0.5)
+LAW_B = np.array([0.2, 0.5, 0.3])  # not stationary
 THREE = [hg.hop(g, 0.1) for g in (0.3, -0.6, 1.2)]
-RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
-
-
-def chain_a(k, name=None):
-    return hg.random_affine.MarkovChain(CHAIN_A[min(k, 2)], LAW_A, name)
 
 
 def errors(item, horizon=STEPS):

@@ -6,21 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-
-RELAY = hg.hop(hg.Nakagami(2.0), 0.15, amplification=1.4)
-PLANT = hg.LinearPlant([[0.98]], [[0.04]], [0.0], [[0.04 / (1 - 0.98**2)]])
-SENSOR = hg.LinearSensor([[1.0]], 0.05)
-BURSTS = np.array([[0.95, 0.05], [0.03, 0.97]])
-
-
-def bursts(transition=BURSTS):
-    return hg.markov_fading([0.2, 1.0], transition, 0.05)
-
-
-def variances(plant, sensor, channel, steps):
-    item = hg.linear_filter(plant, sensor, channel)
-    assert item.claim == "exact"
-    return np.diagonal(item.planned(np.zeros((steps, 0))).covariances[2::2], axis1=1, axis2=2)
+from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, variances
 
 
 def test_fading_in_bursts():

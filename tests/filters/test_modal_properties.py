@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import variances
+from tests.filters.modal_problems import variances
 
 Modes = hg.random_affine.Modes
 SEEDS = range(6)

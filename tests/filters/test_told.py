@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import BURSTS, PLANT, SENSOR, bursts
+from tests.filters.modal_problems import BURSTS, PLANT, SENSOR, bursts
 
 told_filter, late_filter = hg.filters.told_filter, hg.filters.mode_late_filter
 known_filter = hg.filters.mode_known_filter

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import BAD as LINK
-from tests.filters.test_modal import BURSTS, GOOD, PLANT, RELAY, SENSOR, bursts, chain_a
+from tests.filters.modal_problems import BAD as LINK
+from tests.filters.modal_problems import BURSTS, GOOD, PLANT, RELAY, SENSOR, bursts, chain_a
 
 true_error, without_memory, memory_matters = hg.filters.true_error, hg.model.without_memory, hg.model.memory_matters
 Modes = hg.random_affine.Modes

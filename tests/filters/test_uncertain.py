@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import BAD, BURSTS, GOOD, PLANT, SENSOR, bursts, variances
+from tests.filters.modal_problems import BAD, BURSTS, GOOD, PLANT, SENSOR, bursts, variances
 
 Modes, true_error = hg.random_affine.Modes, hg.filters.true_error
 THREE = np.array([[0.8, 0.15, 0.05], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]])

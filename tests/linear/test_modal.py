@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.second_moments import nominal_spread
-from tests.filters.test_modal import PLANT, SENSOR, bursts, variances
+from tests.filters.modal_problems import PLANT, SENSOR, bursts, variances
 
 Series, Stack, Modes, known = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Modes", "known"))
 GainAndNoise, Constant = hg.random_affine.GainAndNoise, hg.random_affine.Constant

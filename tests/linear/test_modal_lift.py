@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import BURSTS, PLANT, SENSOR, bursts, variances
+from tests.filters.modal_problems import BURSTS, PLANT, SENSOR, bursts, variances
 
 TWO_HOPS = hg.amplify_and_forward(
     [hg.autoregressive_fading(1.0, 0.4, 0.95, 0.05), hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.3, 0.1), 0.1, 0.2)]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from tests.filters.test_modal import PLANT, SENSOR, bursts
+from tests.filters.modal_problems import PLANT, SENSOR, bursts
 
 STEPS = 20_000
 
