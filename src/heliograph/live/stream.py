@@ -24,7 +24,8 @@ from heliograph.numerics.types import ArrayLike, PyTree
 class Stream:
     """Feed a filter one sample at a time; it holds the filter's state and the step counter.
 
-    The numbers are those of `run` over the same data, bit for bit.
+    The numbers are those of `run` over the same data, up to rounding: the compiler orders and joins the operations of a
+    step as the program around it allows.
 
     Raises:
         ValueError: no filter.
@@ -134,4 +135,4 @@ def _program(mould: Mould) -> Any:
         after, estimate = item.step(state, z, u, k)
         return after, jax.tree.leaves(estimate)
 
-    return jax.jit(step, compiler_options=understood())  # as `run` is compiled, which decides about the last bit
+    return jax.jit(step, compiler_options=understood())
