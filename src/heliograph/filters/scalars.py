@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.small_matrix import inner, rounding, solve, times, trace, transpose
+from heliograph.numerics.small_matrix import inner, rounding, solver, times, trace, transpose
 from heliograph.numerics.types import Array
 
 START = 0.1
@@ -41,11 +41,13 @@ def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
 
     def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         t, previous, sweeps = carry
-        return jnp.where(moving(t, previous), newton_step(t, *sweep(t, *fixed)), t), t, sweeps + 1
+        refined, slopes = sweep(t, *fixed)
+        better = jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes))
+        return jnp.where(moving(t, previous), better, t), t, sweeps + 1
 
     first = jnp.log(jnp.where(free, START, given))
     first = jnp.broadcast_to(first, (len(given), *fixed[-1].shape))
-    carry = jnp.where(free, sweep(first, *fixed)[0], first), first, jnp.asarray(1)
+    carry = first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)
     t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), again, carry)[0]
     refined, slopes = sweep(t, *parts)
     return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
@@ -96,9 +98,9 @@ def zero_mean_sweep(
 
 def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
     """W = Omega^-1 C C' Omega^-1 of K = C' Omega^-1, and Omega^-1 X of others: in matrices of the data's size."""
-    solved = solve(omega, jnp.concatenate([power, *others], axis=1))
-    first, *rest = jnp.split(solved, 1 + len(others), axis=1)
-    return solve(omega, transpose(first)), rest
+    solve = solver(omega)
+    first, *rest = jnp.split(solve(jnp.concatenate([power, *others], axis=1)), 1 + len(others), axis=1)
+    return solve(transpose(first)), rest
 
 
 def _root_ratio(

@@ -14,6 +14,7 @@ from heliograph.numerics.small_matrix import (
     inner,
     rounding,
     solve,
+    solver,
     symmetric,
     times,
     times_vector,
@@ -46,6 +47,9 @@ def intersect(
     return means[0] + times_vector(covariance, off), covariance
 
 
+_Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, slack, whether to go on, iteration
+
+
 @runs_last
 def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> Float[jax.Array, "count *#runs"]:
     """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
@@ -56,30 +60,27 @@ def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> 
     count = information.shape[0]
     scaled = information / (add([trace(j) for j in information]) / count)
 
-    def unfinished(point: _Point) -> jax.Array:
-        return jnp.max(-point.gradient, axis=0) > (1 + rounding(GAP, point.trace, LOOP)) * point.trace
+    def step(carry: _Progress) -> _Progress:
+        w, slack, _, iteration = carry
+        value, gradient, hessian = _trace_derivatives(scaled, w)
+        slack = jnp.where(iteration == 0, gradient - jnp.min(gradient, axis=0) + 0.1 * value, slack)
+        moved = _newton_step(_Point(w, slack, gradient, hessian))
+        going = jnp.max(-gradient, axis=0) > (1 + rounding(GAP, value, LOOP)) * value
+        w, slack = (jnp.where(going, new, old) for new, old in zip(moved, (w, slack), strict=True))
+        return w, slack, going, iteration + 1  # a run that has arrived stays where it is
 
-    def step(carry: tuple[_Point, jax.Array]) -> tuple[_Point, jax.Array]:
-        point, iteration = carry
-        w, slack = _newton_step(point)
-        moved = _Point(w, slack, *_trace_derivatives(scaled, w))
-        going = unfinished(point)  # a run that has arrived stays where it is
-        return jax.tree.map(lambda new, old: jnp.where(going, new, old), moved, point), iteration + 1
-
-    w = jnp.full((count, *information.shape[3:]), 1 / count)
-    derivatives = _trace_derivatives(scaled, w)
-    slack = derivatives[1] - jnp.min(derivatives[1], axis=0) + 0.1 * derivatives[0]
-    start = _Point(w, slack, *derivatives), jnp.asarray(0)
-    point, _ = jax.lax.while_loop(lambda c: jnp.any(unfinished(c[0])) & (c[1] < ITERATIONS), step, start)
-    return jnp.asarray(point.weights)
+    runs = information.shape[3:]
+    w = jnp.full((count, *runs), 1 / count)
+    start = w, jnp.zeros_like(w), jnp.ones(runs, bool), jnp.asarray(0)
+    w, *_ = jax.lax.while_loop(lambda c: jnp.any(c[2]) & (c[3] < ITERATIONS), step, start)
+    return jnp.asarray(w)
 
 
 class _Point(NamedTuple):
-    """Weights and their multipliers; tr P, its gradient and Hessian."""
+    """Weights and their multipliers; the gradient of tr P and its Hessian."""
 
     weights: Float[jax.Array, "count *#runs"]
     slack: Float[jax.Array, "count *#runs"]
-    trace: Float[jax.Array, "*#runs"]
     gradient: Float[jax.Array, "count *#runs"]
     hessian: Float[jax.Array, "count count *#runs"]
 
@@ -126,10 +127,11 @@ def _newton_step(point: _Point) -> tuple[jax.Array, jax.Array]:
     w, slack, gradient = point.weights, point.slack, point.gradient
     root = jnp.sqrt(w)  # scaled by it, the matrix stays well conditioned as weights vanish
     matrix = root[:, None] * point.hessian * root[None] + diagonal(slack)
-    ones = root * solve(matrix, root[:, None])[:, 0]
+    solve = solver(matrix)
+    ones = root * solve(root[:, None])[:, 0]
 
     def direction(target: jax.Array) -> tuple[jax.Array, jax.Array]:
-        solved = root * solve(matrix, (target / root - root * gradient)[:, None])[:, 0]
+        solved = root * solve((target / root - root * gradient)[:, None])[:, 0]
         move = solved - jnp.sum(solved, axis=0) / jnp.sum(ones, axis=0) * ones
         return move, (target - slack * move) / w - slack
 

@@ -6,7 +6,7 @@ feed a kernel like that. Larger matrices go to the library.
 """
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import reduce
+from functools import partial, reduce
 from operator import sub
 from typing import TypeVar
 
@@ -155,17 +155,26 @@ def solve(a: jax.Array, b: jax.Array) -> jax.Array:
 
     A component that those before it determine gets zeros: B' X is B' A^+ B whatever is chosen there.
     """
+    return solver(a)(b)
+
+
+def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
+    """`solve` of one A for several B, one after another: it is factored once."""
     n = a.shape[0]
     if n > UNROLL_LIMIT:
-        return _each(_long_solve, a, b)
+        return partial(_each, _long_solve, a)
     columns, scales = factor(a)
-    forward: list[jax.Array] = []
-    for i in range(n):  # L Y = B
-        forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
-    backward = forward[:]
-    for i in reversed(range(n)):  # L' X = Y
-        backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
-    return jnp.stack(backward)
+
+    def solved(b: jax.Array) -> jax.Array:
+        forward: list[jax.Array] = []
+        for i in range(n):  # L Y = B
+            forward.append(minus(b[i], (columns[j][i] * forward[j] for j in range(i))) * scales[i])
+        backward = forward[:]
+        for i in reversed(range(n)):  # L' X = Y
+            backward[i] = minus(forward[i], (columns[i][j] * backward[j] for j in range(i + 1, n))) * scales[i]
+        return jnp.stack(backward)
+
+    return solved
 
 
 def long_factor(a: jax.Array) -> jax.Array:
