@@ -1,17 +1,34 @@
-"""One matrix's arithmetic over many runs: vmap's axis goes last, and costly cases are computed where needed."""
+"""One matrix's arithmetic over many runs: vmap's axes go last, and costly cases are computed where needed.
 
-from collections.abc import Callable
-from functools import wraps
-from typing import ParamSpec, Protocol, TypeVar
+A kernel is an operation of its own in what JAX traces: a level of vmap adds an axis to it and looks into nothing, so
+that its arithmetic is traced for one matrix, whose shapes are those of its results, and once more for all, as compiled.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial, wraps
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jax.custom_batching import custom_vmap
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 
-from heliograph.numerics.types import Array, PyTree
+from heliograph.numerics.types import PyTree
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+_kernel: Any = Primitive("runs_last")
+_kernel.multiple_results = True
+
+
+class _Kernel:
+    """What one kernel is: its arithmetic, that of its derivatives; compared by identity."""
+
+    def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree]):
+        # Traced once per shapes, however many filters use it.
+        self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
+        self.source: Callable[..., PyTree] = lambda args, kwargs: source(*args, **kwargs)
 
 
 def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None) -> Callable[P, R]:
@@ -20,19 +37,75 @@ def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None =
     Or of other arithmetic for the same: that of a kernel which branches on all runs at once, `where_any`, cannot be
     mapped over runs.
     """
-    source = kernel if differentiable_as is None else differentiable_as
-    traced = jax.jit(kernel)  # once per shapes, however many filters use it
-    batched = custom_vmap(lambda *args: jax.lax.platform_dependent(*args, cpu=_alone(traced), default=traced))
+    this = _Kernel(kernel, kernel if differentiable_as is None else differentiable_as)
 
-    @batched.def_vmap
-    def rule(size: int, is_batched: PyTree, *args: PyTree) -> tuple[PyTree, PyTree]:
-        moved = jax.tree.map(_to_last, args, tuple(is_batched))
-        results = jax.tree.map(lambda x: _to_first(x, size), batched(*moved))
-        return results, jax.tree.map(lambda _: True, results)
+    @wraps(kernel)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        leaves, tree = jax.tree.flatten((args, kwargs))
+        leaves = [jnp.asarray(leaf) for leaf in leaves]
+        one = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
+        told, form = jax.tree.flatten(one)
+        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=tuple((x.shape, x.dtype) for x in told), runs=())
+        result: R = jax.tree.unflatten(form, results)
+        return result
 
-    differentiable = jax.custom_jvp(batched)
-    differentiable.defjvp(lambda primals, tangents: jax.jvp(source, primals, tangents))
-    return wraps(kernel)(differentiable)
+    return call
+
+
+def _shapes(*_: Any, told: tuple[Any, ...], runs: tuple[int, ...], **rest: Any) -> list[jax.core.ShapedArray]:
+    return [jax.core.ShapedArray((*shape, *runs), dtype) for shape, dtype in told]
+
+
+def _computed(
+    *leaves: jax.Array, kernel: _Kernel, tree: Any, told: tuple[Any, ...], runs: tuple[int, ...], alone: bool = False
+) -> list[jax.Array]:
+    """The results of all runs; those that no run's own argument has a part in come with an axis of 1."""
+    function = _alone(kernel.function) if alone else kernel.function
+    results = jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+    return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, told, strict=True)]
+
+
+def _over_one_more(
+    leaves: Sequence[jax.Array], axes: Sequence[int | None], *, runs: tuple[int, ...], **rest: Any
+) -> tuple[list[jax.Array], list[int]]:
+    size = next(x.shape[axis] for x, axis in zip(leaves, axes, strict=True) if axis is not None)
+    moved = [
+        jnp.expand_dims(x, x.ndim) if axis is None else jnp.moveaxis(x, axis, -1)
+        for x, axis in zip(leaves, axes, strict=True)
+    ]
+    results = _kernel.bind(*moved, runs=(*runs, size), **rest)
+    return results, [x.ndim - 1 for x in results]
+
+
+def _with_tangents(
+    primals: Sequence[jax.Array],
+    tangents: Sequence[Any],
+    *,
+    kernel: _Kernel,
+    tree: Any,
+    told: tuple[Any, ...],
+    runs: tuple[int, ...],
+) -> tuple[list[jax.Array], list[jax.Array]]:
+    """Derivatives in what has tangents; of the rest nothing is computed."""
+    moves = [not isinstance(t, ad.Zero) for t in tangents]
+
+    def function(*moving: jax.Array) -> list[jax.Array]:
+        rest = iter(moving)
+        leaves = [next(rest) if m else x for m, x in zip(moves, primals, strict=True)]
+        results = jax.tree.leaves(kernel.source(*jax.tree.unflatten(tree, leaves)))
+        return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, told, strict=True)]
+
+    at, along = (tuple(x for m, x in zip(moves, part, strict=True) if m) for part in (primals, tangents))
+    results, slopes = jax.jvp(function, at, along)
+    return results, slopes
+
+
+_kernel.def_impl(_computed)
+_kernel.def_abstract_eval(_shapes)
+batching.primitive_batchers[_kernel] = _over_one_more
+ad.primitive_jvps[_kernel] = _with_tangents
+mlir.register_lowering(_kernel, mlir.lower_fun(_computed, multiple_results=True))
+mlir.register_lowering(_kernel, mlir.lower_fun(partial(_computed, alone=True), multiple_results=True), platform="cpu")
 
 
 def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
@@ -70,13 +143,3 @@ def where_each(needed: jax.Array, costly: Callable[[], R], cheap: Callable[[], R
     """The same by computing both."""
     result: R = jax.tree.map(lambda a, b: jnp.where(needed, a, b), costly(), cheap())
     return result
-
-
-def _to_last(x: Array, is_batched: bool) -> jax.Array:
-    x = jnp.asarray(x)
-    return jax.lax.transpose(x, (*range(1, x.ndim), 0)) if is_batched else jax.lax.expand_dims(x, (x.ndim,))
-
-
-def _to_first(x: jax.Array, size: int) -> jax.Array:
-    x = jnp.broadcast_to(x, (*x.shape[:-1], size))
-    return jax.lax.transpose(x, (x.ndim - 1, *range(x.ndim - 1)))
