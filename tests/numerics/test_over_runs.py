@@ -1,0 +1,73 @@
+"""A kernel over runs: where vmap puts its axes, what is traced, and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.over_runs import runs_last, where_any, where_each
+from heliograph.numerics.small_matrix import times
+
+RNG = np.random.default_rng(0)
+A, B = RNG.normal(size=(3, 4, 2, 2)), RNG.normal(size=(2, 2))
+seen: list[tuple[int, ...]] = []
+
+
+@runs_last
+def product(a, b):
+    """A B and tr A."""
+    seen.append(a.shape)
+    return times(a, b), a[0, 0] + a[1, 1]
+
+
+def over_two(a, b):
+    return jax.vmap(jax.vmap(product, in_axes=(0, None)), in_axes=(0, None))(a, b)
+
+
+def test_axes_of_vmap_are_last_in_the_kernel_and_first_outside():
+    """And it is traced for one matrix and for all, not for what lies between."""
+    with jax.enable_x64(True):
+        seen.clear()
+        found, traces = jax.jit(over_two)(A, B)
+    np.testing.assert_allclose(found, A @ B, rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(traces, np.trace(A, axis1=2, axis2=3), rtol=1e-15)
+    assert sorted(set(seen)) == [(2, 2), (2, 2, 4, 3)] and len(seen) == 2, seen
+
+
+def test_results_that_no_run_has_a_part_in_come_for_each():
+    with jax.enable_x64(True):
+        found, traces = jax.vmap(lambda b: product(B, b))(A[0])
+    np.testing.assert_allclose(found, B @ A[0], rtol=1e-15, atol=1e-15)
+    np.testing.assert_array_equal(traces, [np.trace(B)] * 4)
+
+
+def test_derivatives_are_those_of_the_arithmetic_forward_and_back_one_or_many():
+    """Of the sum of squares of A B: 2 A' A B in B, 2 A B B' in A."""
+    with jax.enable_x64(True):
+        b = jnp.asarray(B)
+        expected = 2 * np.einsum("rsij,rsik,kl->jl", A, A, B)
+        for slopes in (jax.grad, jax.jacfwd):
+            found = slopes(lambda b: jnp.sum(over_two(A, b)[0] ** 2))(b)
+            np.testing.assert_allclose(found, expected, rtol=1e-14)
+        each = jax.vmap(jax.grad(lambda a: jnp.sum(product(a, b)[0] ** 2)))(jnp.asarray(A[0]))
+        np.testing.assert_allclose(each, 2 * A[0] @ B @ B.T, rtol=1e-14, atol=1e-14)
+
+
+def test_costly_cases_are_told_run_by_run_and_have_derivatives():
+    def of(pick):
+        return lambda x: pick(x > 1, lambda: x**3, lambda: x)
+
+    cube = runs_last(of(where_any), of(where_each))
+    x = jnp.asarray([0.5, 2.0, 3.0])
+    np.testing.assert_allclose(jax.vmap(cube)(x), [0.5, 8.0, 27.0])
+    np.testing.assert_allclose(jax.vmap(jax.grad(cube))(x), [1.0, 12.0, 27.0])
+
+
+def test_names_of_arguments_may_be_given():
+    np.testing.assert_allclose(product(A[0, 0], b=B)[0], A[0, 0] @ B, rtol=1e-6)
+
+
+def test_other_devices_get_the_arithmetic_without_the_conditional():
+    """The conditional keeps a processor's compiler from fusing across; another device's code has none."""
+    traced = jax.jit(over_two).trace(A, B)
+    lowered = {device: traced.lower(lowering_platforms=(device,)).as_text() for device in ("cpu", "cuda")}
+    assert "stablehlo.case" in lowered["cpu"] and "stablehlo.case" not in lowered["cuda"]
