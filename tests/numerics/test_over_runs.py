@@ -71,3 +71,16 @@ def test_other_devices_get_the_arithmetic_without_the_conditional():
     traced = jax.jit(over_two).trace(A, B)
     lowered = {device: traced.lower(lowering_platforms=(device,)).as_text() for device in ("cpu", "cuda")}
     assert "stablehlo.case" in lowered["cpu"] and "stablehlo.case" not in lowered["cuda"]
+
+
+def test_the_precision_is_that_of_the_call_though_it_is_compiled_later():
+    shifted = runs_last(lambda a: a + jnp.eye(2)[..., None] if a.ndim > 2 else a + jnp.eye(2))
+
+    def single(x):
+        with jax.enable_x64(False):
+            return jax.vmap(shifted)(x)
+
+    with jax.enable_x64(True):
+        found = jax.jit(single)(np.ones((3, 2, 2), np.float32))
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(found, [np.ones((2, 2)) + np.eye(2)] * 3)

@@ -10,6 +10,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -28,7 +29,7 @@ class _Kernel:
     def __init__(self, function: Callable[..., PyTree], source: Callable[..., PyTree]):
         # Traced once per shapes, however many filters use it.
         self.function = jax.jit(lambda args, kwargs: function(*args, **kwargs))
-        self.source: Callable[..., PyTree] = lambda args, kwargs: source(*args, **kwargs)
+        self.source = source
 
 
 def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None) -> Callable[P, R]:
@@ -45,7 +46,9 @@ def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None =
         leaves = [jnp.asarray(leaf) for leaf in leaves]
         one = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
         told, form = jax.tree.flatten(one)
-        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=tuple((x.shape, x.dtype) for x in told), runs=())
+        shapes = tuple((x.shape, x.dtype) for x in told)
+        x64 = bool(jnp.result_type(float) == np.float64)
+        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=shapes, x64=x64, runs=())
         result: R = jax.tree.unflatten(form, results)
         return result
 
@@ -57,11 +60,23 @@ def _shapes(*_: Any, told: tuple[Any, ...], runs: tuple[int, ...], **rest: Any) 
 
 
 def _computed(
-    *leaves: jax.Array, kernel: _Kernel, tree: Any, told: tuple[Any, ...], runs: tuple[int, ...], alone: bool = False
+    *leaves: jax.Array,
+    kernel: _Kernel,
+    tree: Any,
+    told: tuple[Any, ...],
+    x64: bool,
+    runs: tuple[int, ...],
+    alone: bool = False,
 ) -> list[jax.Array]:
-    """The results of all runs; those that no run's own argument has a part in come with an axis of 1."""
+    """The results of all runs, in the precision of the call: what is compiled is traced after its context has ended."""
     function = _alone(kernel.function) if alone else kernel.function
-    results = jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+    with jax.enable_x64(x64):
+        results = jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+        return _for_each(results, told, runs)
+
+
+def _for_each(results: Sequence[jax.Array], told: tuple[Any, ...], runs: tuple[int, ...]) -> list[jax.Array]:
+    """Results that no run's own argument has a part in come with an axis of 1."""
     return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, told, strict=True)]
 
 
@@ -85,18 +100,19 @@ def _with_tangents(
     tree: Any,
     told: tuple[Any, ...],
     runs: tuple[int, ...],
+    **rest: Any,
 ) -> tuple[list[jax.Array], list[jax.Array]]:
     """Derivatives in what has tangents; of the rest nothing is computed."""
     moves = [not isinstance(t, ad.Zero) for t in tangents]
 
-    def function(*moving: jax.Array) -> list[jax.Array]:
-        rest = iter(moving)
-        leaves = [next(rest) if m else x for m, x in zip(moves, primals, strict=True)]
-        results = jax.tree.leaves(kernel.source(*jax.tree.unflatten(tree, leaves)))
-        return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, told, strict=True)]
+    @wraps(kernel.source)
+    def source(*moving: jax.Array) -> list[jax.Array]:
+        each = iter(moving)
+        args, kwargs = jax.tree.unflatten(tree, [next(each) if m else x for m, x in zip(moves, primals, strict=True)])
+        return _for_each(jax.tree.leaves(kernel.source(*args, **kwargs)), told, runs)
 
     at, along = (tuple(x for m, x in zip(moves, part, strict=True) if m) for part in (primals, tangents))
-    results, slopes = jax.jvp(function, at, along)
+    results, slopes = jax.jvp(source, at, along)
     return results, slopes
 
 
