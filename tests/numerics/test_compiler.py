@@ -4,7 +4,7 @@ import jax
 import pytest
 
 from heliograph.numerics import compiler
-from heliograph.numerics.compiler import LEVEL, understood
+from heliograph.numerics.compiler import LEVEL, fully_optimised, quickly_compiled, understood
 
 
 @pytest.mark.parametrize("least", [False, True])
@@ -23,3 +23,18 @@ def test_an_option_of_another_release_costs_no_other(monkeypatch):
     """JAX 0.12 no longer has one that 0.10 has."""
     monkeypatch.setattr(compiler, "OPTIONS", {"xla_of_another_release": True, "xla_cpu_enable_fast_math": False})
     assert compiler.understood.__wrapped__() == {"xla_cpu_enable_fast_math": False}
+
+
+@pytest.mark.parametrize(("wrap", "at_a_lower_level"), [(quickly_compiled, True), (fully_optimised, False)])
+def test_only_what_runs_millions_of_steps_asks_for_the_last_level(monkeypatch, wrap, at_a_lower_level):
+    asked = {}
+
+    def jitted(function, *, donate, compiler_options):
+        asked.update(compiler_options)
+        return function
+
+    monkeypatch.setattr(compiler, "understood", lambda: dict(compiler.OPTIONS))
+    monkeypatch.setattr(compiler.eqx, "filter_jit", jitted)
+    assert wrap(lambda x: x + 1)(1) == 2
+    assert (LEVEL in asked) is at_a_lower_level
+    assert "xla_cpu_use_fusion_emitters" in asked

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from heliograph.numerics.check import check_count, fail, shown
-from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.compiler import fully_optimised
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.types import PyTree
 
@@ -72,6 +72,6 @@ def _filled(part: np.ndarray, count: int) -> np.ndarray:
     return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
 
 
-@quickly_compiled
+@fully_optimised
 def _blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
     return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)
