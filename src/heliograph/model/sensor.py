@@ -115,6 +115,10 @@ AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
     instance("sensor", sensor, AbstractSensor, "a sensor")
+    if isinstance(sensor, LinearSensor):  # known without a trace, of which each node would need its own
+        if sensor.matrix.shape[-1] != states:
+            raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {sensor.matrix.shape}")
+        return
     try:
         with jax.enable_x64(True):
             got = jax.eval_shape(sensor.measure, np.zeros(states)).shape

@@ -18,7 +18,12 @@ import scipy.special
 
 def is_traced(*values: object) -> bool:
     """Whether some number in these arrays or lists of numbers is traced."""
-    return any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return any(
+        isinstance(leaf, jax.core.Tracer)
+        for value in values
+        if not isinstance(value, np.ndarray | float | int)  # asked of each number of a model: known at a look
+        for leaf in jax.tree.leaves(value)
+    )
 
 
 def library(*values: object) -> Any:
