@@ -73,7 +73,7 @@ SHAPES = [
     (lambda: h.LinearSensor(EYE, [[1.0]]), "sensor noise", "shape (1, 1)"),
     (lambda: h.Sensor(lambda x: x, np.eye(3), outputs=["a", "b"]), "sensor noise", "shape (3, 3)"),
     (lambda: seen_by(h.Sensor(lambda x: x, 1.0)), "sensor", "shape (2,)"),
-    (lambda: seen_by(h.LinearSensor(np.eye(3), 1.0)), "sensor", "(3,) and (2,)"),
+    (lambda: seen_by(h.LinearSensor(np.eye(3), 1.0)), "sensor", "a matrix of shape (3, 3)"),
     (lambda: h.Network(plant(), {"a": h.Node(sensor(), h.perfect(2), {})}), "channel", "2 inputs"),
     (lambda: h.cubature_filter(plant(), sensor(), h.perfect(2)), "channel", "2 inputs"),
     (lambda: h.cubature_filter(plant(), sensor(), h.perfect(), initial_mean=[0]), "filter's initial mean", "(1,)"),
