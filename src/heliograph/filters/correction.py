@@ -21,6 +21,7 @@ from heliograph.numerics.small_matrix import (
     congruence,
     diagonal,
     own,
+    root,
     rounding,
     solve,
     sum_of_squares,
@@ -230,7 +231,7 @@ def _covariance(
 ) -> jax.Array:
     return pick(
         _is_precise(omega, noise),
-        lambda: sum_of_squares(prior, transpose(solved), output, noise),
+        lambda: sum_of_squares(prior, root(prior), transpose(solved), output, noise),
         lambda: _difference(prior, cross, solved),
     )
 

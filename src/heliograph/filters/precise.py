@@ -11,32 +11,31 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.small_matrix import (
-    UNROLL_LIMIT,
     identity,
-    inner,
     own,
-    pivot_scale,
     root,
     sum_of_squares,
     summed,
     times,
+    times_vector,
     transpose,
+    uncorrelated,
 )
 
 LEFT = 100  # times its rounding: a variance below has lost its digits
 
 
-class Heard(NamedTuple):
-    """After the first components of T z, whose rows make their noises uncorrelated: m + G (T z - T H m), P = R R'.
+class Component(NamedTuple):
+    """One component of T z, whose rows make their noises uncorrelated.
 
-    Shapes: root R (n, n), gain G (n, m), turn T (m, m), output T H (m, n), noise T N T' (m, m); runs last.
+    Shapes: number e_j (m,) and row T H of it (n,), the noise's variance (), least variance that is not rounding (); or
+    of all components, one more axis first. Runs last.
     """
 
-    root: jax.Array
-    gain: jax.Array
-    turn: jax.Array
-    output: jax.Array
-    noise: jax.Array
+    number: jax.Array
+    row: jax.Array
+    variance: jax.Array
+    least: jax.Array
 
 
 def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -54,24 +53,24 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     """
     n, m = len(prior), len(output)
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
-
-    def over_runs(a: jax.Array) -> jax.Array:
-        return jnp.broadcast_to(a.reshape(*a.shape, *[1] * (2 + len(runs) - a.ndim)), (*a.shape[:2], *runs))
-
     start = root(prior)
-    parts = start, np.zeros((n, m)), np.eye(m), output, noise
-    state = Heard(*(over_runs(jnp.asarray(a, prior.dtype)) for a in parts))
-    whole = own(noise)
-    sizes = times(jnp.abs(state.output), jnp.abs(state.root))
-    if m > UNROLL_LIMIT:
-        state = jax.lax.fori_loop(0, m, lambda j, state: _heard(state, whole, sizes, j), state)
-    else:
-        for j in range(m):
-            state = _heard(state, whole, sizes, j)
-    gain = times(state.gain, state.turn)
-    after = sum_of_squares(prior, gain, output, noise)
+    turn, components = _components(start, output, noise)
+    begin = jnp.broadcast_to(start, (n, n, *runs)), jnp.zeros((n, m, *runs), start.dtype)
+    gain = times(jax.lax.scan(_heard, begin, components)[0][1], turn)
+    after = sum_of_squares(prior, start, gain, output, noise)
     kept = jnp.asarray(identity(n, gain)) - times(gain, output)
     return gain, jnp.where(_has_digits(prior, start, kept, after), after, jnp.nan)
+
+
+def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
+    """T (m, m) and the components of T z; what was taken off a row left its rounding there."""
+    m, n = output.shape[:2]
+    ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
+    turned, variance = uncorrelated(noise, jnp.concatenate([ones, output], axis=1))
+    turn, rows = turned[:, :m], turned[:, m:]
+    reach = times(jnp.abs(turn), times(jnp.abs(output), jnp.abs(start)))
+    least = ((n + 2) * float(np.finfo(start.dtype).eps)) ** 2 * summed(reach * reach, 1)
+    return turn, Component(jnp.asarray(identity(m, output)), rows, variance, least)
 
 
 def _has_digits(prior: jax.Array, start: jax.Array, kept: jax.Array, after: jax.Array) -> jax.Array:
@@ -83,30 +82,17 @@ def _has_digits(prior: jax.Array, start: jax.Array, kept: jax.Array, after: jax.
     return jnp.all((LEFT * eps * lost <= left) | (left <= (4 * (n + 2) * eps) ** 2 * of_mean), axis=0)
 
 
-def _heard(state: Heard, whole: jax.Array, sizes: jax.Array, j: int | jax.Array) -> Heard:
-    """With component j too, whose noise is first taken off those after it; sizes |H| |R| (m, n) before all of them."""
-    before, gain, turn, output, noise = state
-    n, m, runs = len(before), len(output), [1] * (before.ndim - 2)
-    scale = pivot_scale(noise[j, j], whole[j])
-    variance = jnp.where(scale == 0, 0.0, noise[j, j])
-    later, here = ((np.arange(m) > j).reshape(m, 1, *runs), (np.arange(m) == j).reshape(1, m, *runs))
-    if m > 1:
-        share = jnp.where(later, (noise[:, j] * scale**2)[:, None], 0.0)
-        turn, output, noise = (part - share * part[j][None] for part in (turn, output, noise))
-
-    row = output[j][None]
-    f, reach = times(row, before), times(jnp.abs(turn[j])[None], sizes)  # what earlier ones took off left its rounding
-    least = ((n + 2) * float(np.finfo(f.dtype).eps)) ** 2 * inner(reach, reach)
-    total = inner(f, f) + variance
-    used = total > least
+def _heard(state: tuple[jax.Array, jax.Array], one: Component) -> tuple[tuple[jax.Array, jax.Array], None]:
+    """Root R (n, n) and gain G (n, m), m + G (T z - T H m), with one component more."""
+    before, gain = state
+    f = times_vector(transpose(before), one.row)
+    total = summed(f * f, 0) + one.variance
+    used = total > one.least
     safe = jnp.where(used, total, 1.0)
-    column = jnp.where(used, times(before, transpose(f)) / safe, 0.0)
-    both = jnp.where(variance > 0, jnp.sqrt(jnp.where(variance > 0, safe * variance, 1.0)), 0.0)
+    shared = times_vector(before, f)
+    column = jnp.where(used, shared / safe, 0.0)
+    noisy = one.variance > 0
+    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * one.variance, 1.0)), 0.0)
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
-    return Heard(
-        before - times(times(before, transpose(f)), turned),
-        gain - times(column, times(row, gain)) + column * here,
-        turn,
-        output,
-        noise,
-    )
+    news = one.number - times_vector(transpose(gain), one.row)
+    return (before - shared[:, None] * turned[None], gain + column[:, None] * news[None]), None

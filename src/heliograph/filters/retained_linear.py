@@ -12,6 +12,7 @@ from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
 from heliograph.numerics.small_matrix import (
     congruence,
     own,
+    root,
     solve,
     sum_of_squares,
     summed,
@@ -141,7 +142,7 @@ def _left_by(
     def squares() -> jax.Array:
         moved = times(transition, p)
         back = transpose(solve(times(moved, transpose(transition)) + process, moved))
-        return sum_of_squares(p, back, transition, process + later)
+        return sum_of_squares(p, root(p), back, transition, process + later)
 
     return pick(sharp, squares, lambda: symmetric(with_rounding(p, len(p)) - times(half, p)))
 

@@ -113,7 +113,9 @@ def with_rounding(p: A, terms: int) -> A:
     return p * (1 + units * np.eye(len(p), dtype=p.dtype)).reshape(p.shape[:2] + (1,) * (p.ndim - 2))
 
 
-def sum_of_squares(prior: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array) -> jax.Array:
+def sum_of_squares(
+    prior: jax.Array, prior_root: jax.Array, gain: jax.Array, output: jax.Array, noise: jax.Array
+) -> jax.Array:
     """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added.
 
     By a root of P, so that what I - K H takes off leaves the square of its rounding alone.
@@ -121,7 +123,7 @@ def sum_of_squares(prior: jax.Array, gain: jax.Array, output: jax.Array, noise: 
     n = len(prior)
     kept = identity(n, prior) - times(gain, output)
     rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own(prior))
-    left = times(kept, root(prior))
+    left = times(kept, prior_root)
     return symmetric(times(left, transpose(left)) + congruence(gain, noise)) + rounded
 
 
@@ -224,13 +226,32 @@ def whiten(a: jax.Array, x: jax.Array) -> jax.Array:
     return jnp.stack([jnp.where(scale == 0, jnp.nan, rest * scale) for rest, scale in _substituted(a, x)])
 
 
+def uncorrelated(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """T B and the diagonal D of T A T', for a positive semidefinite A; T has ones on its diagonal and zeros above."""
+    n, shape = len(a), jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
+    b = jnp.broadcast_to(b, (*b.shape[:2], *shape))
+    if n > UNROLL_LIMIT:
+        lower = root(a)
+        scales = _reciprocals(own(lower))
+        unit = lower * scales + diagonal(jnp.where(scales == 0, 1.0, 0.0))
+        rows = _each(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
+    else:
+        rests, each = zip(*_substituted(a, b), strict=True)
+        rows, scales = jnp.stack(rests), jnp.stack(each)
+    return rows, _reciprocals(scales * scales)
+
+
+def _reciprocals(a: jax.Array) -> jax.Array:
+    """1 / a, and 0 for 0."""
+    return jnp.where(a == 0, 0.0, 1 / jnp.where(a == 0, 1.0, a))
+
+
 def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]]:
     """Of each component what those before it do not say, x_i - sum_j L_ij y_j, and 1 / L_ii: y_i is their product."""
     n = a.shape[0]
     if n > UNROLL_LIMIT:
         lower = root(a)
-        columns, scales = list(jnp.moveaxis(lower, 1, 0)), [lower[i, i] for i in range(n)]
-        scales = [jnp.where(s == 0, 0.0, 1 / jnp.where(s == 0, 1.0, s)) for s in scales]
+        columns, scales = list(jnp.moveaxis(lower, 1, 0)), list(_reciprocals(own(lower)))
     else:
         columns, scales = factor(a)
     forward: list[jax.Array] = []
