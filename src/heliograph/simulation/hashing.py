@@ -1,74 +1,12 @@
-"""Keys whose hash is written out: the same bits as JAX's own keys, in less than half of the time on a processor.
+"""Traced programs with keys of another hash than those they were traced with."""
 
-JAX's Threefry takes its 20 rounds there in a loop that keeps all numbers in memory between its turns; written out, a
-number stays in a register for all of them.
-"""
-
-import math
 from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
-from jax.extend.random import define_prng_impl, threefry_prng_impl
 
-ROTATIONS = (13, 15, 26, 6), (17, 29, 16, 24)
-PARITY = 0x1BD11BDA
-
-Words = tuple[jax.Array, jax.Array]
-
-
-@jax.jit
-def threefry(key: Words, counter: Words) -> Words:
-    """Threefry 2x32 with 20 rounds.
-
-    Source: Salmon, Moraes, Dror, Shaw, Parallel random numbers: as easy as 1, 2, 3 (2011), section 5.2.
-    """
-    keys = *key, key[0] ^ key[1] ^ jnp.uint32(PARITY)
-    left, right = counter[0] + keys[0], counter[1] + keys[1]
-    for four in range(5):
-        for bits in ROTATIONS[four % 2]:
-            left = left + right
-            right = left ^ ((right << bits) | (right >> (32 - bits)))
-        left, right = left + keys[(four + 1) % 3], right + keys[(four + 2) % 3] + jnp.uint32(four + 1)
-    return left, right
-
-
-def _counters(shape: Sequence[int]) -> Words:
-    numbers = jax.lax.iota(jnp.uint32, math.prod(shape)).reshape(shape)
-    return jnp.zeros_like(numbers), numbers
-
-
-def _hashed(key: jax.Array, counter: Words) -> Words:
-    result: Words = threefry((key[0], key[1]), counter)
-    return result
-
-
-def _split(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
-    return jnp.stack(_hashed(key, _counters(shape)), axis=-1)
-
-
-def _fold_in(key: jax.Array, data: object) -> jax.Array:
-    number = jnp.asarray(data, dtype=jnp.uint32)
-    return jnp.stack(_hashed(key, (jnp.zeros_like(number), number)))
-
-
-def _bits(key: jax.Array, width: int, shape: tuple[int, ...]) -> jax.Array:
-    high, low = _hashed(key, _counters(shape))
-    if width == 64:
-        return (high.astype(jnp.uint64) << 32) | low.astype(jnp.uint64)
-    return (high ^ low).astype(f"uint{width}")
-
-
-WRITTEN_OUT = define_prng_impl(
-    key_shape=(2,),
-    seed=threefry_prng_impl.seed,
-    split=_split,
-    random_bits=_bits,
-    fold_in=_fold_in,
-    name="threefry2x32 written out",
-    tag="out",
-)
+from heliograph.simulation.threefry import WRITTEN_OUT
 
 
 def written_out(keys: jax.Array, programs: Sequence[ClosedJaxpr]) -> jax.Array:
