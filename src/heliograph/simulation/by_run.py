@@ -13,6 +13,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import PyTree
 
 from heliograph.simulation.hashing import evaluated, written_out
+from heliograph.simulation.together import together
 
 AHEAD = 2**18  # bytes drawn ahead: more than fills the processor between two steps, less than its cache
 
@@ -36,6 +37,7 @@ def trajectories(
     spread = _settled(lambda marks: _dependent(body, [*marks, True, *known])[: len(one)], varies)
     tells = _dependent(body, [*spread, True, *known])[len(one) :]
     ahead, rest, drawn = _split(body, len(one))
+    rest = together(rest, _marked(rest, [*spread, True, *known, *[True] * len(drawn)]))
     keys = written_out(keys, (ahead, rest))
     draw = jax.vmap(evaluated(ahead), in_axes=[0, *row_axes], out_axes=-1)
     draw = jax.vmap(draw, in_axes=[None, *[0] * len(row_axes)])

@@ -4,8 +4,9 @@ from collections.abc import Callable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
 
+from heliograph.simulation.part import part_of
 from heliograph.simulation.threefry import WRITTEN_OUT
 
 
@@ -39,15 +40,8 @@ def _evaluate(jaxpr: Jaxpr, consts: Sequence[jax.Array], args: Sequence[jax.Arra
             inner = first.params["jaxpr"]
             made, results = first.outvars, _evaluate(inner.jaxpr, inner.consts, read(first.invars))
         else:
-            made = [item for operation in operations for item in operation.outvars]
-            inside = set(made)
-            items = [item for operation in operations for item in operation.invars]
-            used = list(dict.fromkeys(i for i in items if not isinstance(i, Literal) and i not in inside))
-            part: Jaxpr = jaxpr.replace(  # type: ignore[no-untyped-call]
-                eqns=operations, constvars=[], invars=used, outvars=made,
-                debug_info=jaxpr.debug_info.with_unknown_names(),
-            )  # fmt: skip
-            results = jaxpr_as_fun(ClosedJaxpr(part, ()))(*read(used))
+            used, made, function = part_of(jaxpr, operations)
+            results = function(*read(used))
         values |= zip(made, results, strict=True)
     return read(jaxpr.outvars)
 
