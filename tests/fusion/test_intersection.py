@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.fusion.intersection import relative_gap, trace_optimal_weights
 from tests.bounds import covariances, estimates
-from tests.oracles import cubature_fusion as oracle
+from tests.oracles import covariance_intersection as oracle
 
 CERTIFIED = 1e-9  # the method stops at 1e-10
 
@@ -38,7 +38,10 @@ def test_weights_agree_with_slsqp():
     reference = oracle.trace_weights(bounds)
     for b, w in zip(bounds, reference, strict=True):
         fused = hg.fusion.fuse(hg.CovarianceIntersection(), estimates(b))
-        theirs = np.linalg.inv(np.einsum("k,kij->ij", w, np.linalg.inv(b)))
+        at_theirs, means = hg.fusion.fuse(hg.fusion.FixedIntersection(w), estimates(b)), [e.mean for e in estimates(b)]
+        mean, theirs = oracle.intersect(np.stack(means), b, w)
+        np.testing.assert_allclose(at_theirs.mean, mean, rtol=0, atol=1e-9)  # roundings by the information's condition
+        np.testing.assert_allclose(at_theirs.covariance, theirs, rtol=0, atol=1e-9 * np.trace(theirs))
         # Two minima of one convex function: ours is certified to 1e-10, SLSQP's is no better than its own tolerance.
         assert np.trace(fused.covariance) <= np.trace(theirs) * (1 + 1e-10)
         assert np.trace(fused.covariance) >= np.trace(theirs) * (1 - 1e-6)

@@ -7,7 +7,7 @@ import heliograph as hg
 from heliograph.model.estimate import STRENGTH, weakest
 from heliograph.testing import check_fusion
 from tests.bounds import covariances, estimates
-from tests.oracles import cubature_fusion as oracle
+from tests.oracles import covariance_intersection as oracle
 
 RULES = {
     "optimal": hg.CovarianceIntersection(),

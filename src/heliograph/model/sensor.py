@@ -39,6 +39,16 @@ class AbstractSensor(Module):
         """h(x): shapes (n,) -> (len(outputs),)."""
         raise NotImplementedError
 
+    def check_states(self, states: int) -> None:
+        """Raise ValueError unless the sensor measures a state of this length and returns its outputs."""
+        try:
+            with jax.enable_x64(True):
+                got = jax.eval_shape(self.measure, np.zeros(states)).shape
+        except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
+            raise fail("sensor", f"to measure a state of length {states}", shown_error(error)) from error
+        if got != (len(self.outputs),):
+            raise fail("sensor", f"{len(self.outputs)} outputs {list(self.outputs)}", f"shape {got}")
+
 
 class Sensor(AbstractSensor):
     """A nonlinear sensor: `measure(x)` written with jax.numpy; `noise` a covariance, a variance or a noise law.
@@ -103,6 +113,11 @@ class LinearSensor(AbstractSensor):
         """C x."""
         return jnp.asarray(self.matrix) @ x
 
+    def check_states(self, states: int) -> None:
+        """The same of the matrix, without a trace, of which each of many nodes would need its own."""
+        if self.matrix.shape[-1] != states:
+            raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {self.matrix.shape}")
+
 
 def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, ...]:
     return tuple(outputs[i] for i in angles_named("circular outputs", circular, outputs))
@@ -115,17 +130,7 @@ AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
     instance("sensor", sensor, AbstractSensor, "a sensor")
-    if isinstance(sensor, LinearSensor):  # known without a trace, of which each node would need its own
-        if sensor.matrix.shape[-1] != states:
-            raise fail("sensor", f"to measure a state of length {states}", f"a matrix of shape {sensor.matrix.shape}")
-        return
-    try:
-        with jax.enable_x64(True):
-            got = jax.eval_shape(sensor.measure, np.zeros(states)).shape
-    except (TypeError, ValueError, IndexError, ArithmeticError, AttributeError) as error:
-        raise fail("sensor", f"to measure a state of length {states}", shown_error(error)) from error
-    if got != (len(sensor.outputs),):
-        raise fail("sensor", f"{len(sensor.outputs)} outputs {list(sensor.outputs)}", f"shape {got}")
+    sensor.check_states(states)
 
 
 def is_linear(plant: AnyPlant, sensor: AnySensor) -> bool:
