@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.over_runs import runs_last, where_any, where_each
+from heliograph.numerics.over_runs import runs_last, runs_last_of, where_any, where_each
 from heliograph.numerics.small_matrix import times
 
 RNG = np.random.default_rng(0)
@@ -31,6 +31,20 @@ def test_axes_of_vmap_are_last_in_the_kernel_and_first_outside():
     np.testing.assert_allclose(found, A @ B, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(traces, np.trace(A, axis1=2, axis2=3), rtol=1e-15)
     assert sorted(set(seen)) == [(2, 2), (2, 2, 4, 3)] and len(seen) == 2, seen
+
+
+def test_a_kernel_that_says_its_shapes_is_traced_for_all_runs_alone():
+    @runs_last_of(lambda a, b: (b.shape, ()))
+    def told(a, b):
+        seen.append(a.shape)
+        return times(a, b), a[0, 0] + a[1, 1]
+
+    with jax.enable_x64(True):
+        seen.clear()
+        found, traces = jax.jit(jax.vmap(told, in_axes=(0, None)))(A[0], B)
+    assert seen == [(2, 2, 4)] and traces.dtype == np.float64, seen
+    np.testing.assert_allclose(found, A[0] @ B, rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(traces, np.trace(A[0], axis1=1, axis2=2), rtol=1e-15)
 
 
 def test_results_that_no_run_has_a_part_in_come_for_each():

@@ -14,6 +14,7 @@ import numpy as np
 
 from heliograph.files.network_file import load_function
 from heliograph.numerics.readable import readable
+from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 
 DIMENSIONS = ("setting", "run", "time", "node", "filter", "state", "received")
@@ -85,7 +86,7 @@ class Campaign:
 
     def key(self, setting: int) -> jax.Array:
         """The key with which `monte_carlo` gives the runs of one setting."""
-        key = jax.random.key(self.seed)
+        key = seed_key(self.seed)
         for word in self.words(setting):
             key = jax.random.fold_in(key, np.uint32(word))
         return key

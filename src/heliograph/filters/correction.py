@@ -14,7 +14,7 @@ from heliograph.filters.precise import precise_update
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
 from heliograph.numerics.check import array, fail
 from heliograph.numerics.module import Module
-from heliograph.numerics.over_runs import Pick, runs_last, where_any, where_each
+from heliograph.numerics.over_runs import Pick, runs_last, runs_last_of, where_any, where_each
 from heliograph.numerics.readable import readable
 from heliograph.numerics.small_matrix import (
     PRECISE,
@@ -31,7 +31,7 @@ from heliograph.numerics.small_matrix import (
     transpose,
     with_rounding,
 )
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.second_moments import SecondOrder
 
 
@@ -80,7 +80,11 @@ def as_scalars(values: np.ndarray) -> Scalars | None:
     return None if np.isnan(values).any() else Scalars(*values)
 
 
-@runs_last
+def _gain_and_prior(prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, *_: Array) -> PyTree:
+    return (len(prior), len(present)), prior.shape
+
+
+@runs_last_of(_gain_and_prior)
 def young_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -131,7 +135,7 @@ def _of_known_gain(channel: SecondOrder, w: jax.Array, present: jax.Array) -> ja
     return spread + absent(present)
 
 
-@runs_last
+@runs_last_of(_gain_and_prior)
 def zero_mean_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -6,7 +6,7 @@ import numpy as np
 
 from heliograph.filters.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.small_matrix import (
     NEGATIVE_TOLERANCE,
     OFF_SUPPORT,
@@ -61,7 +61,7 @@ def mixed_innovation(
     return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
 
 
-@runs_last
+@runs_last_of(lambda *_: ())
 def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
     """log N(value; 0, covariance) of the components that are not NaN, 0 if none is.
 

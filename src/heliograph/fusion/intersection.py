@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.small_matrix import (
     add,
     diagonal,
@@ -50,7 +50,7 @@ def intersect(
 _Progress = tuple[jax.Array, jax.Array, jax.Array, jax.Array]  # weights, slack, whether to go on, iteration
 
 
-@runs_last
+@runs_last_of(lambda information: (len(information), *information.shape[3:]))
 def trace_optimal_weights(information: Float[jax.Array, "count n n *#runs"]) -> Float[jax.Array, "count *#runs"]:
     """Weights on the simplex that minimise tr (sum w_k J_k)^-1, by a primal-dual interior point method.
 
@@ -184,7 +184,7 @@ def intersect_inversely(
     return mean, without_known(symmetric(covariance), both)
 
 
-@runs_last
+@runs_last_of(jnp.shape)
 def inverse(a: Float[jax.Array, "n n *#runs"]) -> Float[jax.Array, "n n *#runs"]:
     """A^-1 of a positive definite A."""
     n = a.shape[0]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Float
 
-from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.small_matrix import UNROLL_LIMIT, factor, long_factor, solve
 
 
@@ -26,7 +26,7 @@ def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     return long_factor(jnp.asarray(a)) if a.shape[-1] > UNROLL_LIMIT else _short_cholesky(jnp.asarray(a))
 
 
-@runs_last
+@runs_last_of(jnp.shape)
 def _short_cholesky(a: jax.Array) -> jax.Array:
     return jnp.stack(factor(a)[0], axis=1)
 

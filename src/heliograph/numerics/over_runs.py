@@ -33,11 +33,16 @@ class _Kernel:
         self.source = source
 
 
-def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None) -> Callable[P, R]:
+Shapes = Callable[..., PyTree]  # a kernel's arguments -> the shape of its result, or of each in a tuple
+
+
+def runs_last(
+    kernel: Callable[P, R], differentiable_as: Callable[P, R] | None = None, shapes: Shapes | None = None
+) -> Callable[P, R]:
     """Have vmap put its axis last in every argument and result of a kernel; derivatives are those of its arithmetic.
 
     Or of other arithmetic for the same: that of a kernel which branches on all runs at once, `where_any`, cannot be
-    mapped over runs.
+    mapped over runs. Where `shapes` says the results' shapes, the kernel need not be traced to find them.
     """
     this = _Kernel(kernel, kernel if differentiable_as is None else differentiable_as)
 
@@ -45,15 +50,30 @@ def runs_last(kernel: Callable[P, R], differentiable_as: Callable[P, R] | None =
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         leaves, tree = jax.tree.flatten((args, kwargs))
         leaves = [jnp.asarray(leaf) for leaf in leaves]
-        one = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
+        if shapes is None:
+            one = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
+        else:
+            one = _said(shapes(*args, **kwargs), leaves)
         told, form = jax.tree.flatten(one)
-        shapes = tuple((x.shape, x.dtype) for x in told)
+        sizes = tuple((x.shape, x.dtype) for x in told)
         x64 = bool(jnp.result_type(float) == np.float64)
-        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=shapes, x64=x64, runs=())
+        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=sizes, x64=x64, runs=())
         result: R = jax.tree.unflatten(form, results)
         return result
 
     return call
+
+
+def runs_last_of(shapes: Shapes) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """`runs_last` of a kernel that takes long to trace, whose results have these shapes."""
+    return lambda kernel: runs_last(kernel, shapes=shapes)
+
+
+def _said(shapes: PyTree, leaves: Sequence[jax.Array]) -> PyTree:
+    """Results of these shapes, numbers of the type that arithmetic with all arguments has."""
+    numbers = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    struct = partial(jax.ShapeDtypeStruct, dtype=jnp.result_type(*numbers))
+    return jax.tree.map(struct, shapes, is_leaf=lambda s: isinstance(s, tuple) and all(isinstance(i, int) for i in s))
 
 
 def _shapes(*_: Any, told: tuple[Any, ...], runs: tuple[int, ...], **rest: Any) -> list[jax.core.ShapedArray]:

@@ -20,6 +20,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.planning.channel_power import sent_powers, steady_powers
 from heliograph.planning.state_power import growth, of_sensor, seconds_over, steady_second
 from heliograph.relays.design import expected_maps, given_design
+from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import OWN, Network
 from heliograph.simulation.node import Node
 
@@ -176,7 +177,7 @@ def _drawn(
 ) -> dict[str, Float[np.ndarray, "batch steps m1 m1"]]:
     """E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
     count = runs // BATCHES
-    keys = jax.random.split(jax.random.key(seed), (BATCHES, count))
+    keys = jax.random.split(seed_key(seed), (BATCHES, count))
     sensors = {name: sensor for name, (sensor, _) in worlds.items()}
     return {name: np.asarray(found) for name, found in _moments(plant, sensors, jnp.asarray(inputs), keys).items()}
 

@@ -3,6 +3,7 @@
 from zlib import crc32
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 # What a key is for: folded in last, so that each use has its own stream.
@@ -10,6 +11,12 @@ INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START, MEMORY, MEMORY_START = range(7
 WORLD = 0  # the plant's place among the checksums of names
 
 Number = int | jax.Array | np.ndarray
+
+
+def seed_key(seed: int) -> jax.Array:
+    """Key of a seed below 2^32: that of `jax.random.key`, which compiles a program for it in each process."""
+    key: jax.Array = jax.random.wrap_key_data(jnp.asarray(np.array([0, seed], dtype=np.uint32)), impl="threefry2x32")
+    return key
 
 
 def draw_key(run_key: jax.Array, k: Number, place: Number, purpose: int) -> jax.Array:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, check_seed, fail
+from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 
 
@@ -15,7 +16,7 @@ def key_of(key: object) -> jax.Array:
         return key
     if isinstance(key, jax.Array | np.ndarray):
         raise fail("key", "a seed, or one key of jax.random.key", f"an array of {key.dtype} of shape {key.shape}")
-    return jax.random.key(check_seed("key", key))
+    return seed_key(check_seed("key", key))
 
 
 def inputs_of(network: Network, inputs: ArrayLike | None, horizon: int) -> np.ndarray:
