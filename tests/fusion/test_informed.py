@@ -131,15 +131,25 @@ def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
         leaves.fused({"a": ["node 1"], "b": ["node 1", "node 2"]})
 
 
+def along_and_linear(plant, parts):
+    """Two nodes, fused along cubature filters and by the linear ones, and the first alone by the plant's mean."""
+    linear, fused = network(plant, parts, {}), {"alone": hg.Fusion("alone", hg.fusion.MatrixWeights(with_mean=True))}
+    nodes = {}
+    for name, node in linear.nodes.items():
+        filters = {"own": node.filters["own"], "cubature": hg.cubature_filter(plant, node.sensor, node.channel)}
+        nodes[name] = hg.Node(node.sensor, node.channel, filters)
+    first = nodes["node 0"]
+    nodes["node 0"] = hg.Node(first.sensor, first.channel, first.filters | {"alone": first.filters["own"]})
+    for name in ("matrix", "all_reports"):
+        fused |= {f"{item} {name}": hg.Fusion(item, rules()[name].rule) for item in ("own", "cubature")}
+    return hg.Network(plant, nodes, fused)
+
+
 def test_losses_that_are_told_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
-    plant, parts = random_case(7, nodes=2)
-    silent = network(plant, parts, {"matrix": rules()["matrix"]})
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
-    found = hg.run(silent, z).estimates["fused"]["matrix"].covariance
-    alone = network(plant, parts[:1], {"mean": rules()["matrix_with_mean"]})
-    expected = hg.run(alone, {"node 0": z["node 0"]}).estimates["fused"]["mean"].covariance
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    fused = hg.run(along_and_linear(*random_case(7, nodes=2)), z).estimates["fused"]
+    np.testing.assert_allclose(fused["own matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_losses_at_random_keep_the_claim():
@@ -203,26 +213,19 @@ def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
     The spread of a gain times the square of the signal is all that differs: 1e-10 of variance.
     """
     plant, parts = random_case(2, nodes=2)
-    known = [(c, r, mean, 1e-10, noise) for c, r, mean, _, noise in parts]
-    fused = {name: rules()[name] for name in ("matrix", "all_reports")}
-    linear = network(plant, known, fused)
-    nodes = {
-        name: hg.Node(node.sensor, node.channel, {"own": hg.cubature_filter(plant, node.sensor, node.channel)})
-        for name, node in linear.nodes.items()
-    }
-    along = hg.Network(plant, nodes, fused)
-    assert set(along.claims()["fused"].values()) == {"nominal"}
+    net = along_and_linear(plant, [(c, r, mean, 1e-10, noise) for c, r, mean, _, noise in parts])
     draw = np.random.default_rng(0)
-    data = {name: draw.normal(size=(6, node.received)) for name, node in linear.nodes.items()}
-    found, expected = hg.run(along, data), hg.run(linear, data)
-    for name in fused:
-        ours, theirs = found.estimates["fused"][name], expected.estimates["fused"][name]
+    data = {name: draw.normal(size=(6, node.received)) for name, node in net.nodes.items()}
+    fused = hg.run(net, data).estimates["fused"]
+    for name in ("matrix", "all_reports"):
+        ours, theirs = fused[f"cubature {name}"], fused[f"own {name}"]
+        assert net.claims()["fused"][f"cubature {name}"] == "nominal"
         np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(ours.mean, theirs.mean, rtol=1e-6, atol=1e-6)
     with pytest.raises(ValueError, match="filters whose gains depend on no data"):
-        hg.simulation.cross_covariances(along, "own", 3)
+        hg.simulation.cross_covariances(net, "cubature", 3)
     with pytest.raises(ValueError, match="for the plant's own moments"):
-        hg.Network(plant, nodes, {"one": rules()["matrix_with_mean"]})
+        hg.Network(plant, net.nodes, {"one": hg.Fusion("cubature", hg.fusion.MatrixWeights(with_mean=True))})
 
 
 def test_a_large_tree_is_the_small_one():
