@@ -100,9 +100,7 @@ def test_a_receiver_behind_relays_smooths_the_relays_states_too():
     scale = np.sqrt(np.abs(whole.xx).max())
     np.testing.assert_allclose(found.mean, mean @ want.T, rtol=0, atol=CLOSE * scale)
     np.testing.assert_allclose(found.covariance, want @ covariance @ want.T, rtol=0, atol=CLOSE * scale**2)
-    schedule = hg.filters.ScheduledFilter(
-        hg.relays.receiver_behind_relays(network, hg.relays.own_error_design(network, time).gains)
-    )
+    schedule = hg.filters.ScheduledFilter(hg.relays.receiver_behind_relays(network, gains))
     with pytest.raises(
         ValueError, match=r"smoothing: expected a filter that keeps its covariance .*, got ScheduledFilter"
     ):
