@@ -29,7 +29,8 @@ def found(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduction")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(run, "results", told)
-        patch.setattr(compute, "SWEEPS", 20)  # of a design that is drawn, and in no number tested here
+        patch.setattr(compute, "SWEEPS", 1)  # of a design that is drawn, and in no number tested here
+        patch.setattr(compute, "STEADY", 600)  # 0.98^1200 = 3e-11 of a covariance is left
         run.reproduce(out, runs=RUNS, seed=2)
     return kept[0], out / "successive-relays"
 
