@@ -197,7 +197,7 @@ def test_the_guarantee_from_a_false_constant_is_broken(nodes):
 def result(nodes, outcome):
     """Everything, with made-up numbers where the real ones take minutes."""
     finding = hg.h_infinity.check_growth(setting.dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
-    size = hg.h_infinity.check_size(setting.dynamics(15), 0.7, [-2.0, -2.0], [2.0, 2.0])
+    size = finding._replace(ratio=0.69, differences=False)
     filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told"]
     errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
     over = {
