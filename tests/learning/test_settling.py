@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +15,7 @@ from heliograph.learning.description import describe
 from heliograph.learning.objective import Data, _settling, at_points, objectives
 from heliograph.learning.settling import in_chunks
 
-STEPS, RECORDINGS = 157, 2
+STEPS, RECORDINGS, LANES = 157, 2, 2
 TOLERANCE = 1e-10  # of the largest entry: what rounding is given that 157 steps add it up, and information squares it
 
 
@@ -57,7 +56,7 @@ def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):
     x = quick.description.parameters.start
     x = x + shift[: len(x)]
     assert settles(quick, x, data)
-    one, other = (at_points(each, x[None], data, 1) for each in (quick, plain))
+    one, other = (at_points(each, x[None], data, LANES) for each in (quick, plain))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
 
@@ -69,7 +68,7 @@ def test_where_gains_do_not_settle_the_scan_is_taken(both):
     x = np.stack([quick.description.parameters.start] * 3)
     x[1, 0] = -30.0
     assert [settles(quick, each, data) for each in x] == [True, False, True]
-    one, other = (at_points(each, x, data, 2) for each in (quick, plain))
+    one, other = (at_points(each, x, data, LANES) for each in (quick, plain))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
     np.testing.assert_array_equal(one.density[1], other.density[1])
@@ -80,7 +79,7 @@ def test_with_something_lost_the_scan_is_taken(both):
     z = data.measurements.copy()
     z[0, 3] = np.nan
     x, lossy = quick.description.parameters.start[None], data._replace(measurements=z)
-    for a, b in zip(at_points(quick, x, lossy, 1), at_points(plain, x, lossy, 1), strict=True):
+    for a, b in zip(*(at_points(each, x, lossy, LANES) for each in (quick, plain)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -99,5 +98,5 @@ def test_chunks_are_the_loop(steps):
             expected[r, k] = z[r, k] - plan.output @ prior - plan.offset
             mean = prior + gain[k] @ expected[r, k]
     with jax.enable_x64(True):
-        found = in_chunks(jax.tree.map(jnp.asarray, plan), jnp.asarray(gain), jnp.asarray(start), z)
+        found = jax.jit(in_chunks)(plan, gain, start, z)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13 * np.max(np.abs(expected)))
