@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.h_infinity import slope_bound
 from heliograph.papers.h_infinity_fusion import (
     discriminating,
     example,
@@ -34,7 +35,8 @@ def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(m
     assert one_step.enumeration_gap(1) > 1e-6  # one noise's variance 1 % too large
 
 
-def test_the_growth_constant_is_false_for_differences_and_true_for_sizes():
+def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeypatch):
+    monkeypatch.setattr(slope_bound, "LIMIT", 256)  # boxes: of a slope above 15 no number proves 0.7
     f, side = setting.dynamics(15), np.full(2, 2.0)
     found = hg.h_infinity.check_growth(f, 0.7, -side, side)
     assert found.refuted and 15 < found.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
