@@ -168,11 +168,13 @@ def test_noises_and_moments_of_every_map_can_be_traced():
             [hg.dropout(relayed, p[5]), hg.erasure(hg.random_affine.known([[1.0, p[0]]], [p[2]]), 1.0).base]
         )
 
+    def found(p):
+        item = make(p)
+        return item.moments(1).matrix, item.moments(4).matrix, push(item, 4, np.ones(15))
+
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
     with jax.enable_x64(True):
-        one, two, pushed = jax.jit(
-            lambda p: (make(p).moments(1).matrix, make(p).moments(4).matrix, push(make(p), 4, np.ones(15)))
-        )(p)
+        one, two, pushed = jax.jit(found)(p)
     np.testing.assert_allclose(one, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(two, make(p).moments(4).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
