@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.types import PyTree
@@ -29,7 +28,7 @@ class Mould(NamedTuple):
 def cast(item: object) -> tuple[list[jax.Array], Mould]:
     """An object's arrays, where a program finds them, and the rest of it. Call it in the float64 scope."""
     leaves, tree = jax.tree.flatten(jax.tree.map(_as_array, item))
-    numbers = [jnp.asarray(leaf) for leaf in leaves if eqx.is_array(leaf)]
+    numbers = [jax.device_put(leaf) for leaf in leaves if eqx.is_array(leaf)]  # no program for each shape
     return numbers, Mould(tree, tuple(None if eqx.is_array(leaf) else leaf for leaf in leaves))
 
 

@@ -5,7 +5,6 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.live.clock import time_input, uneven
@@ -17,7 +16,7 @@ from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.network import Network
-from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.stepping import AllFilters, begun
 
 
 class Player:
@@ -41,8 +40,8 @@ class Player:
                     raise fail(f"timeline: fusion {name!r}", wanted, "links that chance has a part in")
             ears = Ears(network, filters)
             self.numbers, mould = cast(ears)
-            self._start: PyTree = jax.tree.map(jnp.asarray, ears.filters.init())
-            data = self.numbers, self._start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
+            self.start = begun(ears.filters)
+            data = self.numbers, self.start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
             told = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).step(*row)[1], *data)
         self._like, self.structure = jax.tree.leaves(told), jax.tree.structure(told)
         self.replay = replay(mould, self.dt)
@@ -70,7 +69,7 @@ class Player:
         """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
         rows = np.full((1, self.received + self.given + 1), np.nan)
         rows[0, -1] = time
-        state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self._start)
+        state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.start)
         told = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._like]
         begun = rows, state, np.zeros((1, self.given)), np.full(1, -1), told
         return self.filled(slots, begun)
@@ -80,7 +79,11 @@ class Player:
 
         def repeated(part: np.ndarray) -> jax.Array:
             rest = np.repeat(part[:1], slots - len(part), axis=0)
-            return jnp.array(np.concatenate([part, rest]))  # never the array itself: a tape is given away
+            both = np.concatenate([part, rest])
+            copied: jax.Array = jax.device_put(
+                both, may_alias=False
+            )  # a tape is given away; without a program for each shape
+            return copied
 
         with jax.enable_x64(True):
             return Tape(*jax.tree.map(repeated, tuple(some)))

@@ -154,4 +154,9 @@ def read(told: list[jax.Array], slots: jax.Array) -> list[jax.Array]:
 
 def copied(tape: Tape) -> list[np.ndarray]:
     """The leaves of a tape, which goes on to be used."""
-    return [np.asarray(jnp.copy(leaf)) for leaf in jax.tree.leaves(tape)]
+    return [np.asarray(leaf) for leaf in _copy(jax.tree.leaves(tape))]
+
+
+@jax.jit
+def _copy(leaves: list[jax.Array]) -> list[jax.Array]:
+    return [jnp.copy(leaf) for leaf in leaves]

@@ -57,9 +57,8 @@ class Lanes:
         with jax.enable_x64(True):
             ears = Ears(network, AllFilters(network))
             self._numbers, mould = cast(ears)
-            start = jax.tree.map(jnp.asarray, ears.filters.init())
-            self.state, self.start = flat_like(start), np.asarray(row_of(start))
-            row = start, np.zeros(self.received), np.zeros(self.inputs), np.asarray(0)
+            self.state, self.start = flat_like(shared.start), np.asarray(row_of(shared.start))
+            row = shared.start, np.zeros(self.received), np.zeros(self.inputs), np.asarray(0)
             like = jax.eval_shape(lambda numbers, *row: _step(mould.filled(numbers), *row)[1], self._numbers, *row)
         self.told = flat_like(like)
         self.places = self._places()

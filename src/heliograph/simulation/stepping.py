@@ -171,6 +171,12 @@ class AllFilters(Module):
         return centre.step(state, parts, means, u, k)
 
 
+@quickly_compiled
+def begun(filters: AllFilters) -> PyTree:
+    """States before the first step, by one program: one by one, their operations are a program each."""
+    return jax.tree.map(jnp.asarray, filters.init())
+
+
 def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     """The filters with what does not depend on data computed before, where all data arrive."""
     ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
