@@ -1,7 +1,7 @@
 """What the example computes: both plants through the network, by every method."""
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -74,14 +74,17 @@ def through_moving(packets: Packets, seed: int, advance: Callable[[str], None], 
     return Through({name: score(part) for name, part in parts.items()}, counts, moving.moments(), found, truth)
 
 
-def through_plaza(recording: PlazaRecording, packets: Packets) -> tuple[Through, int]:
+def through_plaza(
+    recording: PlazaRecording, packets: Packets, methods: Collection[str] = METHODS
+) -> tuple[Through, int]:
     """The mower, and how many of its ranges were lost."""
     events, unheard = plaza.ranges(recording, packets)
     clock = recording.time - recording.start
     moments = np.unique(clock)
     with warnings.catch_warnings():  # the drift over an interval is that over its parts but for the heading's share
         warnings.simplefilter("ignore", UserWarning)
-        found, counts = every_method(plaza.network_from(recording), events, plaza.odometry(recording), moments)
+        _shared = Timeline(plaza.network(), 0.0)
+        found, counts = every_method(plaza.network(), events, plaza.odometry(recording), moments, methods)
     path = np.concatenate([recording.start_pose[None, :2], recording.truth[:, :2]])
     known = np.concatenate([[0.0], clock])
 

@@ -1,6 +1,7 @@
 """The mower of the demonstration, in continuous time; its ranges travel as the packets of a network did."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +31,13 @@ def drift(u: jax.Array) -> jax.Array:
     return u[2] * jnp.diag(jnp.stack([walk, walk, jnp.asarray(robot.HEADING_WALK)]))
 
 
-def network_from(recording: PlazaRecording) -> hg.Network:
+@cache
+def network() -> hg.Network:
     """The robot's own filter, which hears ranges that come through the network, started where the truth does."""
     start = np.diag(robot.START_DEVIATION**2)
     plant = hg.Plant(move, drift, DRIVE.start, start, ("x", "y", "heading"), ("speed", "turn_rate", "dt"))
     sensor = hg.Sensor(robot.ranges(DRIVE.beacons), robot.RANGE_VARIANCE, [f"range_{i}" for i in range(1, 5)])
-    channel = hg.perfect(len(recording.beacons))
+    channel = hg.perfect(len(DRIVE.beacons))
     filters = {"filter": hg.cubature_filter(plant, sensor, channel)}
     return hg.Network(plant, {"robot": hg.Node(sensor, channel, filters)})
 

@@ -1,6 +1,6 @@
 """Events played to timelines as time goes on, and what these say at each moment, of now and of a while ago."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,9 +30,13 @@ def arrival_of(event: Event) -> float:
 
 
 def every_method(
-    network: Network, events: Sequence[Event], known: Sequence[Event], moments: np.ndarray
+    network: Network,
+    events: Sequence[Event],
+    known: Sequence[Event],
+    moments: np.ndarray,
+    methods: Collection[str] = METHODS,
 ) -> tuple[dict[str, Heard], dict[str, int]]:
-    """What each method says at these moments, and the verdicts on the events where they are rewound.
+    """What each of `methods` says at these moments, and the verdicts on the events where they are rewound.
 
     `events` come from the first node of the network, whose first filter is asked; in the order of their arrival.
     `known`, inputs, come at once.
@@ -40,12 +44,14 @@ def every_method(
     first = {(event.sequence, event.time): event for event in reversed(events)}.values()  # copies have the same number
     now = [event._replace(time=arrival_of(event)) for event in first]
     at_once = [event._replace(arrival=event.time) for event in events]
-    current, _ = _played(network, [*known, *now], WINDOW, moments)
-    dropped, _ = _played(network, [*known, *events], 0.0, moments)
-    rewound, counts = _played(network, [*known, *events], WINDOW, moments, LAGS)
-    ideal, _ = _played(network, [*known, *at_once], WINDOW, moments)
-    found = {"used_as_current": current["now"], "late_dropped": dropped["now"], "rewound": rewound["now"]}
-    return found | {name: rewound[name] for name in LAGS} | {"no_delay": ideal["now"]}, counts
+    others = {"used_as_current": (now, WINDOW), "late_dropped": (events, 0.0), "no_delay": (at_once, WINDOW)}
+    lags = {name: lag for name, lag in LAGS.items() if name in methods}
+    found, counts = _played(network, [*known, *events], WINDOW, moments, lags)
+    found["rewound"] = found.pop("now")
+    for name, (heard, window) in others.items():
+        if name in methods:
+            found[name] = _played(network, [*known, *heard], window, moments)[0]["now"]
+    return {name: found[name] for name in METHODS if name in methods}, counts
 
 
 def _played(

@@ -35,7 +35,7 @@ class Drive:
 
 def network() -> hg.Network:
     """The robot's own filter; `heliograph serve heliograph.examples.live.mower:network` keeps it running."""
-    return plaza.network_from(read_recording())
+    return plaza.network()
 
 
 def read_drive(seed: int) -> Drive:
