@@ -7,7 +7,7 @@ import pytest
 
 from heliograph.examples.demo.scores import Score
 from heliograph.examples.demo.twin import Design
-from heliograph.examples.network_design import compute, published, run
+from heliograph.examples.network_design import compute, page, published, run
 from heliograph.examples.network_design.published import Circuit, packets
 
 
@@ -24,6 +24,7 @@ def told(tmp_path_factory, fits):
         patch.setattr(compute, "TWO_HOPS", (6.0,))
         patch.setattr(compute, "FRONT", (3.0, 6.0))
         patch.setattr(compute, "PERIODS", range(1, 4))
+        patch.setattr(page, "EVEN", 6)
         patch.setattr(compute, "demonstration", lambda seed: designs)
         patch.setattr(compute, "circuit", lambda: Circuit(2.0, 1.5, 0.75))
         run.example(out)
@@ -67,7 +68,7 @@ def test_schedules_and_sites_are_the_known_ones(told):
 
 
 def test_the_page_tells_what_is_saved(told):
-    summary, page = told
+    summary, html = told
     assert summary["circuit"] == {"error_saved_percent": 25.0, "power_saved_percent": 25.0}
     assert set(summary["demonstration"]) == {"as_it_is", "centred", "centred_thousandth"}
     for words in (
@@ -77,8 +78,8 @@ def test_the_page_tells_what_is_saved(told):
         "1/4167",
         "heliograph example network-design",
     ):
-        assert words in page
-    assert page.count("<img") == 4
+        assert words in html
+    assert html.count("<img") == 4
 
 
 @pytest.mark.parametrize(("times", "silent"), [(1.1, 52), (3.0, 61)])
