@@ -1,5 +1,7 @@
 """H-infinity designs: levels, closed forms and limits of the published example."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -49,10 +51,15 @@ def test_the_initial_weight_alone_sets_the_smallest_level_of_the_paper():
 HORIZON = (0.025931, 0.028873, 0.029031, 0.028674)
 
 
+@cache
+def over_the_horizon(i):
+    return hg.h_infinity.horizon_design(node(i))
+
+
 @pytest.mark.parametrize("i", range(4))
 def test_smallest_levels_over_the_horizon(i):
     """Two solvers and an independent derivation agree to the digits given; separate multipliers have a closed form."""
-    design, separate = hg.h_infinity.horizon_design(node(i)), hg.h_infinity.horizon_design(node(i), separate=True)
+    design, separate = over_the_horizon(i), hg.h_infinity.horizon_design(node(i), separate=True)
     np.testing.assert_allclose(design.level, HORIZON[i], rtol=3e-5)
     closed = np.sqrt(0.05**2 * 2 * (1 - 0.7**32) / ((1 - 0.7**2) * 15))
     np.testing.assert_allclose(separate.level, closed, rtol=1e-5)
@@ -89,9 +96,12 @@ def test_a_largest_eigenvalue_leaves_no_tie_open(i):
 
     With the tie left to the solver the levels were 0.031 to 0.041, up to 42 % above those of the smallest trace.
     """
-    level = hg.h_infinity.smallest_recursive_level(node(i), "largest_eigenvalue").level
-    np.testing.assert_allclose(level, (0.02649, 0.03070, 0.02903, 0.03150)[i], rtol=5e-4)  # bisection to 1e-4
-    assert level > HORIZON[i]
+    known = (0.02649, 0.03070, 0.02903, 0.03150)[i]
+
+    def works(level):
+        return hg.h_infinity.recursive_design(node(i), level, objective="largest_eigenvalue", search=False).feasible
+
+    assert works((1 + 5e-4) * known) and not works(max((1 - 5e-4) * known, HORIZON[i]))
 
 
 def test_a_second_solver_finds_the_same_level():
@@ -174,9 +184,7 @@ def test_what_varies_over_time_and_what_does_not():
         paper.b[0],
         initial_weight=paper.W,
     )
-    np.testing.assert_allclose(
-        hg.h_infinity.horizon_design(varying).level, hg.h_infinity.horizon_design(node(0)).level, rtol=1e-9
-    )
+    np.testing.assert_allclose(hg.h_infinity.horizon_design(varying).level, over_the_horizon(0).level, rtol=1e-9)
     slower = hg.h_infinity.growth_system(
         16,
         paper.B,
