@@ -22,7 +22,7 @@ def told(tmp_path_factory, fits):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compute, "ONE_HOP", (2.0,))
         patch.setattr(compute, "TWO_HOPS", (6.0,))
-        patch.setattr(compute, "FRONT", (3.0, 6.0))
+        patch.setattr(compute, "FRONT", (0.3, 1.0))
         patch.setattr(compute, "PERIODS", range(1, 4))
         patch.setattr(page, "EVEN", 6)
         patch.setattr(compute, "demonstration", lambda seed: designs)

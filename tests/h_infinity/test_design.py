@@ -106,9 +106,9 @@ def test_a_largest_eigenvalue_leaves_no_tie_open(i):
 
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
-    short = node(0, steps=2)
+    third, short = node(2, steps=2), node(0, steps=2)
     np.testing.assert_allclose(
-        hg.h_infinity.horizon_design(short, solver="scs").level, hg.h_infinity.horizon_design(short).level, rtol=1e-5
+        hg.h_infinity.horizon_design(third, solver="scs").level, hg.h_infinity.horizon_design(third).level, rtol=1e-5
     )
     design = hg.h_infinity.recursive_design(short, 1.8, START, solver="scs")
     assert hg.h_infinity.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
