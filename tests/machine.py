@@ -1,16 +1,22 @@
 """The induction machine of the cubature-fusion publication, from the oracle's constants, as a heliograph network."""
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
 from tests.oracles.cubature_fusion import PRINTED, STRONG, Setting
 
+NUMBERS = ["b1", "b2", "b3", "b4", "b5", "b6", "h", "k1", "k2", "k3"]
 
-def transition(s: Setting):
-    b1, b2, b3, b4, b5, b6, h, k1, k2, k3 = (s[n] for n in ["b1", "b2", "b3", "b4", "b5", "b6", "h", "k1", "k2", "k3"])
 
-    def f(x, u):
+class Transition(eqx.Module):
+    """The machine's step; its numbers are arrays, so that settings share what is compiled."""
+
+    numbers: dict[str, np.ndarray]
+
+    def __call__(self, x, u):
+        b1, b2, b3, b4, b5, b6, h, k1, k2, k3 = (self.numbers[name] for name in NUMBERS)
         rates = [
             b1 * x[0] + k1 * x[1] + b2 * x[2] + k2,
             -k1 * x[0] + b1 * x[1] + b2 * x[3],
@@ -20,7 +26,9 @@ def transition(s: Setting):
         ]
         return x + h * jnp.stack(rates)
 
-    return f
+
+def transition(s: Setting):
+    return Transition({name: np.asarray(s[name]) for name in NUMBERS})
 
 
 def plant(s: Setting):
