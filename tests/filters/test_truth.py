@@ -9,6 +9,7 @@ from tests.filters.modal_problems import BURSTS, GOOD, PLANT, RELAY, SENSOR, bur
 
 true_error, without_memory, memory_matters = hg.filters.true_error, hg.model.without_memory, hg.model.memory_matters
 Modes = hg.random_affine.Modes
+SETTLED = 200  # steps, after which nothing of what is looked at changes
 HOPS = [hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9))]
 
 
@@ -17,7 +18,7 @@ def memoryless(plant, sensor, channel):
 
 
 def test_the_filter_without_memory_claims_less_than_half_of_its_error():
-    found = true_error(memoryless(PLANT, SENSOR, bursts()), PLANT, SENSOR, bursts(), 400)
+    found = true_error(memoryless(PLANT, SENSOR, bursts()), PLANT, SENSOR, bursts(), SETTLED)
     assert found.claimed[-1, 0, 0] == pytest.approx(0.113530, abs=6e-7)
     assert found.true[-1, 0, 0] == pytest.approx(0.276761, abs=6e-7)
 
@@ -35,7 +36,7 @@ def test_a_filter_for_two_shadows_in_one():
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     chain = hg.random_affine.MarkovChain(BURSTS)
     apart, together = (hg.parallel([bursts(c) for c in (a, b)]) for a, b in ((BURSTS, BURSTS), (chain, chain)))
-    found = true_error(hg.linear_filter(PLANT, two, apart), PLANT, two, together, 400)
+    found = true_error(hg.linear_filter(PLANT, two, apart), PLANT, two, together, SETTLED)
     assert found.claimed[-1, 0, 0] == pytest.approx(0.148447, abs=6e-7)
     assert found.true[-1, 0, 0] == pytest.approx(0.238690, abs=6e-7)
 
@@ -46,8 +47,8 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
     p = np.array([0.375, 0.625])
     channel = bursts(lag * np.eye(2) + (1 - lag) * p)
     item = memoryless(PLANT, SENSOR, channel)
-    found = true_error(item, PLANT, SENSOR, channel, 1500)
-    gain = float(item.planned(np.zeros((300, 0))).steps.values.gain[-1, 0, 0])
+    found = true_error(item, PLANT, SENSOR, channel, SETTLED)
+    gain = float(item.planned(np.zeros((SETTLED, 0))).steps.values.gain[-1, 0, 0])
     c, power = (1 - gain * 0.7) * 0.98, 0.04 / (1 - 0.98**2)
     share = gain**2 * (0.8**2 * p[0] * p[1]) * power / (1 - c**2)
     claim, moved = found.claimed[-1, 0, 0], c * lag * 0.98

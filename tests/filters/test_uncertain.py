@@ -7,6 +7,7 @@ import heliograph as hg
 from tests.filters.modal_problems import BAD, BURSTS, GOOD, PLANT, SENSOR, bursts, variances
 
 Modes, true_error = hg.random_affine.Modes, hg.filters.true_error
+STEPS = 300  # all that is told of the long run has settled by then
 THREE = np.array([[0.8, 0.15, 0.05], [0.1, 0.8, 0.1], [0.05, 0.25, 0.7]])
 
 
@@ -14,7 +15,7 @@ def rough(radius, rows=BURSTS):
     return bursts(hg.random_affine.MarkovChain(rows, radius=radius))
 
 
-def bound(channel, steps=400):
+def bound(channel, steps=STEPS):
     item = hg.linear_filter(PLANT, SENSOR, channel)
     assert item.claim == "upper"
     return item, item.planned(np.zeros((steps, 0))).covariances[2::2, 0, 0]
@@ -25,16 +26,16 @@ def bound(channel, steps=400):
 )
 def test_how_loose_it_is(radius, known, worst):
     """Not above the known bound, and not below the exact filter of the worst constant chain."""
-    found = bound(rough(radius), 1000)[1][-1]
+    found = bound(rough(radius))[1][-1]
     corners = [BURSTS + radius * np.array([[a, -a], [b, -b]]) for a in (-1, 1) for b in (-1, 1)]
-    exact = max(variances(PLANT, SENSOR, bursts(c), 1000)[-1, 0] for c in corners)
+    exact = max(variances(PLANT, SENSOR, bursts(c), STEPS)[-1, 0] for c in corners)
     assert exact == pytest.approx(worst, abs=0.0006)
     assert exact < found < known + 0.0005
 
 
 def test_a_radius_of_zero_is_the_exact_filter():
-    almost = bound(rough(1e-13), 50)[1]
-    np.testing.assert_allclose(almost, variances(PLANT, SENSOR, bursts(), 50)[:, 0], rtol=1e-5)
+    almost = bound(rough(1e-13))[1]
+    np.testing.assert_allclose(almost, variances(PLANT, SENSOR, bursts(), STEPS)[:, 0], rtol=1e-5)
     assert hg.linear_filter(PLANT, SENSOR, rough(0.0)).claim == "exact"
 
 
@@ -58,14 +59,14 @@ def test_it_dominates_the_truth_of_chains_that_wander_within_the_radius(seed):
 
 @pytest.mark.parametrize("corner", [(1, 1), (1, -1), (-1, 1), (-1, -1)])
 def test_it_dominates_the_truth_at_the_corners_and_the_exact_filter_there(corner):
-    item, claimed = bound(rough(0.02), 300)
+    item, claimed = bound(rough(0.02))
     chain = bursts(
         hg.random_affine.MarkovChain(
             BURSTS + 0.02 * np.array([[-corner[0], corner[0]], [-corner[1], corner[1]]]), [0.375, 0.625]
         )
     )
-    true = true_error(item, PLANT, SENSOR, chain, 300).true[:, 0, 0]
-    assert np.all(true <= claimed) and np.all(variances(PLANT, SENSOR, chain, 300)[:, 0] <= true * (1 + 1e-12))
+    true = true_error(item, PLANT, SENSOR, chain, STEPS).true[:, 0, 0]
+    assert np.all(true <= claimed) and np.all(variances(PLANT, SENSOR, chain, STEPS)[:, 0] <= true * (1 + 1e-12))
 
 
 def test_two_rough_chains_together():
