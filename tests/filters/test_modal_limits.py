@@ -8,10 +8,12 @@ import pytest
 import heliograph as hg
 from tests.filters.modal_problems import BURSTS, PLANT, RELAY, SENSOR, bursts, variances
 
+STEPS = 200  # after which no variance changes any more
+
 
 def test_fading_in_bursts():
     """P_1, P_2, P_10, P_inf to the digits given."""
-    found = variances(PLANT, SENSOR, bursts(), 400)[[0, 1, 9, -1], 0]
+    found = variances(PLANT, SENSOR, bursts(), STEPS)[[0, 1, 9, -1], 0]
     np.testing.assert_allclose(found, [0.323796, 0.283304, 0.248939, 0.238689], atol=6e-7)
 
 
@@ -20,7 +22,7 @@ def test_two_sensors_in_one_shadow_or_in_two(shared, limit):
     two = hg.LinearSensor([[1.0], [1.0]], 0.05 * np.eye(2))
     chain = hg.random_affine.MarkovChain(BURSTS)
     links = hg.parallel([bursts(chain if shared else BURSTS) for _ in range(2)])
-    assert variances(PLANT, two, links, 400)[-1, 0] == pytest.approx(limit, abs=6e-7)
+    assert variances(PLANT, two, links, STEPS)[-1, 0] == pytest.approx(limit, abs=6e-7)
 
 
 def test_two_drifting_hops():
@@ -52,7 +54,7 @@ LIMITS = {  # a channel that remembers, and the same without memory or in other 
 
 @pytest.mark.parametrize("name", LIMITS)
 def test_limits(name):
-    one, other = (variances(PLANT, SENSOR, channel, 60) for channel in LIMITS[name])
+    one, other = (variances(PLANT, SENSOR, channel, STEPS) for channel in LIMITS[name])
     np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
