@@ -162,14 +162,11 @@ def test_drifting_gains_need_no_grid(name):
     """Their covariance is that over all paths of c, though the filter knows but one or two functions of it."""
     correlations, build, at_c = DRIFTING[name]
     steps, total = 3 if len(correlations) == 1 else 2, None
+    sent = oracle.sent_moments(SECOND[:steps, :steps], MEASURES, [s.noise.covariance for s in SENSORS])
     for weight, c in drifts(correlations, steps, 3 if name == "two hops that drift together" else 2):
         maps = [at_c(lambda value: hg.hop(1.1 + 0.4 * value, 0.2), row) for row in c]
         parts = oracle.path_moments(
-            SECOND[:steps, :steps],
-            MEASURES,
-            [s.noise.covariance for s in SENSORS],
-            [np.asarray(m.moments(1).mean[:-1]) for m in maps],
-            [nominal_spread(m).center for m in maps],
+            sent, [np.asarray(m.moments(1).mean[:-1]) for m in maps], [nominal_spread(m).center for m in maps]
         )
         total = (
             [weight * p for p in parts]

@@ -28,25 +28,28 @@ def plant_moments(matrices, shifts, noises, mean, covariance):
     return second
 
 
-def path_moments(second, sensors, sensor_noises, means, spreads):
+def sent_moments(second, sensors, sensor_noises):
+    """E[y~_k y~_l'], E[x_k y~_l'], E[y~_k] of what the sensors send, y~ = (y, 1), whatever the path.
+
+    Shapes: sensors (T, p + 1, n + 1), each [[C, v], [0, 1]].
+    """
+    steps, n, c = len(second), second.shape[-1] - 1, np.array(sensors)[: len(second)]
+    yy = np.einsum("kpa,klab,lqb->klpq", c, second, c)
+    for k in range(steps):
+        yy[k, k] += np.pad(sensor_noises[k], ((0, 1), (0, 1)))
+    return yy, np.einsum("klab,lqb->klaq", second[:, :, :n], c), np.einsum("kpa,kka->kp", c, second[..., -1])
+
+
+def path_moments(sent, means, spreads):
     """E[z z'], E[x z'], E[z] over the steps for one path.
 
-    Shapes: sensors (T, p + 1, n + 1), each [[C, v], [0, 1]]; means (T, m, p + 1), spreads (T, m, m, p + 1, p + 1).
+    Shapes: means (T, m, p + 1), spreads (T, m, m, p + 1, p + 1).
     """
-    steps, n = len(second), second.shape[-1] - 1
-    m = means[0].shape[0]
-    zz, xz, z1 = np.zeros((steps, m, steps, m)), np.zeros((steps, n, steps, m)), np.zeros((steps, m))
-    for k in range(steps):
-        ck = sensors[k]
-        for j in range(steps):
-            y = ck @ second[k, j] @ sensors[j].T
-            if k == j:
-                y = y + np.pad(sensor_noises[k], ((0, 1), (0, 1)))
-                zz[k, :, k] = np.einsum("abij,ij->ab", spreads[k], y)
-            zz[k, :, j] += means[k] @ y @ means[j].T
-            xz[j, :, k] = second[j, k][:n] @ ck.T @ means[k].T
-        z1[k] = means[k] @ ck @ second[k, k][:, -1]
-    return zz, xz, z1
+    (yy, xy, y1), means = sent, np.array(means)
+    zz = np.einsum("kap,klpq,lbq->kalb", means, yy, means)
+    for k, spread in enumerate(spreads):
+        zz[k, :, k] += np.einsum("abij,ij->ab", spread, yy[k, k])
+    return zz, np.einsum("klnq,laq->knla", xy, means), np.einsum("kap,kp->ka", means, y1)
 
 
 def best_linear(second, zz, xz, z1):
@@ -64,18 +67,12 @@ def best_linear(second, zz, xz, z1):
 
 def by_all_paths(second, sensors, sensor_noises, initial, transitions, means, spreads):
     """Error covariances (T, n, n); transitions[k] leads from step k to k + 1, means[k][i] is mode i's at step k."""
-    steps, total = len(second), 0.0
+    steps, total, sent = len(second), 0.0, sent_moments(second, sensors, sensor_noises)
     for path in product(range(len(initial)), repeat=steps):
         weight = initial[path[0]] * np.prod([transitions[k][path[k], path[k + 1]] for k in range(steps - 1)])
         if weight == 0:
             continue
-        one = path_moments(
-            second,
-            sensors,
-            sensor_noises,
-            [means[k][i] for k, i in enumerate(path)],
-            [spreads[k][i] for k, i in enumerate(path)],
-        )
+        one = path_moments(sent, [means[k][i] for k, i in enumerate(path)], [spreads[k][i] for k, i in enumerate(path)])
         total = (
             [weight * part for part in one]
             if isinstance(total, float)
