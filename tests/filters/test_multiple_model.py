@@ -12,6 +12,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.05)
 CHAIN = [[0.95, 0.05], [0.03, 0.97]]
 LINK = hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
 DATA = [0.3, -1.2, 0.8, 1.5, -0.4, 0.9]
+MANY = 20_000  # particles
 WIDE = hg.LinearPlant([[0.9, 0.2], [-0.1, 0.8]], [[0.3, 0.1], [0.1, 0.2]], [1.0, -0.5], np.eye(2))
 BOTH = hg.LinearSensor([[1.0, 0.0], [1.0, 1.0]], 0.2 * np.eye(2))
 FILTERS = [hg.filters.gpb1_filter, hg.filters.imm_filter, hg.filters.gpb2_filter]
@@ -98,11 +99,11 @@ def test_many_particles_are_close_to_bayes_rule():
     """20,000 particles over six steps, 64 paths: within 4 standard errors of the mean of as many draws."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(DATA))
     mean, spread, total = exact(PLANT, SENSOR, link, DATA)
-    found, likelihood = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20_000), DATA)
-    tolerance = 4 / np.sqrt(20_000) * np.sqrt(spread[0, 0])
+    found, likelihood = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY), DATA)
+    tolerance = 4 / np.sqrt(MANY) * np.sqrt(spread[0, 0])
     assert abs(found.mean[0] - mean[0]) < tolerance
     assert abs(found.covariance[0, 0] - spread[0, 0]) < tolerance
-    assert abs(likelihood - total) < 4 * len(DATA) / np.sqrt(20_000)
+    assert abs(likelihood - total) < 4 * len(DATA) / np.sqrt(MANY)
 
 
 CURVED = hg.Plant(lambda x, u: x + 0.1 * np.array([1.0, -1.0]) * x**2, 0.01 * np.eye(2), [0.5, 1.0], np.eye(2))
@@ -260,10 +261,10 @@ def test_a_count_of_particles_is_positive():
 
 
 def test_particles_depend_on_seed_and_data_alone():
-    item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=50)
+    item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY)
     once, again = stepped(item, DATA)[0], stepped(item, DATA)[0]
     np.testing.assert_array_equal(once.mean, again.mean)
-    other = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=50, seed=1), DATA)[0]
+    other = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY, seed=1), DATA)[0]
     assert other.mean[0] != once.mean[0]
 
 
