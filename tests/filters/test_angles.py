@@ -11,8 +11,7 @@ from heliograph.numerics.angle import nearest, wrapped
 
 STEPS = 30
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
-QUIET = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
-NOISY = hg.parallel([hg.hop(1.0, 4.0), hg.hop(1.0, 1e-2)])
+QUIET, NOISY = hg.hop(1.0, np.diag([0.1, 1e-4])), hg.hop(1.0, np.diag([4.0, 1e-2]))
 MODES = hg.random_affine.Modes(CHAIN, [QUIET, NOISY])
 U = np.tile([1.0, 0.02], (STEPS, 1))  # a metre a step, turning slowly
 TURNED = np.diag([-1.0, -1.0, 1.0])
