@@ -22,28 +22,30 @@ def look(x):
     return jnp.stack([jnp.hypot(x[0], x[1]), jnp.arctan2(x[1], x[0])])
 
 
-def network(heading, bearing):
-    """The robot and the station, with the states and outputs that are angles."""
+def described(heading, bearing):
+    """The robot and the station's sensor, with the states and outputs that are angles."""
     noise, start = np.diag([0.05, 0.05, 0.01]) ** 2, np.diag([0.5, 0.5, 0.05]) ** 2
     states = ["x", "y", "heading"]
     place = [-12.0, 3.0, -np.pi / 2]
     inputs = ["distance", "turn"]
     plant = hg.Plant(move, noise, place, start, states, inputs, circular=heading)
     outputs = ["range", "bearing"]
-    sensor = hg.Sensor(look, np.diag([0.5, 0.05]) ** 2, outputs=outputs, circular=bearing)
-    link = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
-    filters = {"cubature": hg.cubature_filter(plant, sensor, link)}
-    lossy = hg.erasure(link, arrival=0.8)  # one packet in five is lost, and the station knows
-    return hg.Network(plant, {"station": hg.Node(sensor, lossy, filters)})
+    return plant, hg.Sensor(look, np.diag([0.5, 0.05]) ** 2, outputs=outputs, circular=bearing)
 
 
-inputs = np.tile([0.15, 0.02], (40, 1))
-cases = {"numbers on a line": ([], []), "angles": (["heading"], ["bearing"])}
+link = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
+lossy = hg.erasure(link, arrival=0.8)  # one packet in five is lost, and the station knows
+robot, station = described(["heading"], ["bearing"])
+filters = {
+    "numbers on a line": hg.cubature_filter(*described([], []), link),
+    "angles": hg.cubature_filter(robot, station, link),
+}
+network = hg.Network(robot, {"station": hg.Node(station, lossy, filters)})
+record = hg.monte_carlo(network, 40, runs=32, key=1, inputs=np.tile([0.15, 0.02], (40, 1)))
 errors, paths = {}, {}
-for name, (heading, bearing) in cases.items():
-    record = hg.monte_carlo(network(heading, bearing), 40, runs=32, key=1, inputs=inputs)
-    errors[name] = np.hypot(*np.moveaxis(record.errors("station", "cubature")[..., :2], -1, 0))
-    paths[name] = record.estimates["station"]["cubature"].mean
+for name, estimate in record.estimates["station"].items():
+    errors[name] = np.hypot(*np.moveaxis(record.errors("station", name)[..., :2], -1, 0))
+    paths[name] = estimate.mean
     print(f"{name}: RMS error of the place {np.sqrt(np.mean(errors[name] ** 2)):.2f} m")
 
 # %%
