@@ -19,6 +19,7 @@ BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
 def test_examples_run(page, tmp_path, monkeypatch):
+    """A network that several pages draw with one horizon and as many runs is compiled once."""
     monkeypatch.chdir(tmp_path)  # some write files
     scope = {}
     for block in BLOCK.findall(page.read_text()):
