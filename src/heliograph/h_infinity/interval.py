@@ -121,13 +121,13 @@ def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
     """Numbers that only change places: those of the low ends, and those of the high ones; places are whole numbers."""
     if any(part.low.dtype.kind in "iu" and not np.array_equal(part.low, part.high) for part in x):
         raise UnknownError("a place that depends on x")
-
-    def bind(ends: list[Numbers]) -> list[Numbers]:
-        found = equation.primitive.bind(*map(jax.numpy.asarray, ends), **equation.params)
-        return list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
-
-    pairs = zip(bind([part.low for part in x]), bind([part.high for part in x]), strict=True)
+    pairs = zip(_bound(equation, [part.low for part in x]), _bound(equation, [part.high for part in x]), strict=True)
     return [Interval(*pair) for pair in pairs]
+
+
+def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
+    found = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
+    return list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
