@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.papers.intermittent_observations import compute, setting
+from heliograph.papers.intermittent_observations import compute, run, setting
 from heliograph.papers.intermittent_observations.mean_error import from_runs, mean_error, over_patterns
 from heliograph.papers.intermittent_observations.rounding import iterate
 from heliograph.papers.intermittent_observations.run import results
 from heliograph.papers.intermittent_observations.statements import statements
-from heliograph.report.results import _write
 from tests.papers.readme import said_of
 from tests.riccati import riccati
 
@@ -19,18 +18,31 @@ BOUND = {(0.1, 0.6): 4.5801, (0.3, 0.6): 6.5848, (0.1, 0.9): 3.6612, (0.4, 0.6):
 
 
 @pytest.fixture(scope="module")
-def found():
+def reproduced(tmp_path_factory):
+    """What is computed, and the folder that is written of it."""
+    kept = []
+
+    def told(result):
+        kept.append(result)
+        return results(result)
+
+    out = tmp_path_factory.mktemp("out")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(compute, "POINTS", 8)  # 0.3, 0.4, ... 1: both sides of the threshold that is looked at
         patch.setattr(compute, "DIGITS", 5e-7)  # within the 1e-6 of the numbers tested
-        return compute.compute(runs=400, seed=1)
+        patch.setattr(run, "results", told)
+        run.reproduce(out, runs=400, seed=1)
+    return kept[0], out / "intermittent-observations"
 
 
 @pytest.fixture(scope="module")
-def folder(found, tmp_path_factory):
-    out = tmp_path_factory.mktemp("out")
-    _write(results(found), out)
-    return out
+def found(reproduced):
+    return reproduced[0]
+
+
+@pytest.fixture(scope="module")
+def folder(reproduced):
+    return reproduced[1]
 
 
 @pytest.fixture(scope="module")
