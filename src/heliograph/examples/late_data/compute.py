@@ -83,7 +83,7 @@ def through_plaza(
     moments = np.unique(clock)
     with warnings.catch_warnings():  # the drift over an interval is that over its parts but for the heading's share
         warnings.simplefilter("ignore", UserWarning)
-        _shared = Timeline(plaza.network(), 0.0)
+        _shared = Timeline(plaza.network(), 0.0)  # while one of a network lives, others have its compiled programs
         found, counts = every_method(plaza.network(), events, plaza.odometry(recording), moments, methods)
     path = np.concatenate([recording.start_pose[None, :2], recording.truth[:, :2]])
     known = np.concatenate([[0.0], clock])
