@@ -104,6 +104,11 @@ def test_a_largest_eigenvalue_leaves_no_tie_open(i):
     assert works((1 + 5e-4) * known) and not works(max((1 - 5e-4) * known, HORIZON[i]))
 
 
+def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
+    level = hg.h_infinity.smallest_recursive_level(node(0), "largest_eigenvalue").level
+    np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
+
+
 def test_a_second_solver_finds_the_same_level():
     """SCS to 1e-9 against Clarabel to 1e-8: both stop well below 1e-5 relative."""
     third, short = node(2, steps=2), node(0, steps=2)
