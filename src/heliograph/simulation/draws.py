@@ -3,7 +3,6 @@
 from zlib import crc32
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 # What a key is for: folded in last, so that each use has its own stream.
@@ -15,7 +14,8 @@ Number = int | jax.Array | np.ndarray
 
 def seed_key(seed: int) -> jax.Array:
     """Key of a seed below 2^32: that of `jax.random.key`, which compiles a program for it in each process."""
-    key: jax.Array = jax.random.wrap_key_data(jnp.asarray(np.array([0, seed], dtype=np.uint32)), impl="threefry2x32")
+    words: jax.Array = jax.device_put(np.array([0, seed], dtype=np.uint32))
+    key: jax.Array = jax.random.wrap_key_data(words, impl="threefry2x32")
     return key
 
 

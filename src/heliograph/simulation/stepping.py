@@ -182,7 +182,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
     central = filters.central if all(filters.complete) else {}
     with jax.enable_x64(True):
-        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.retains, jnp.asarray(u)))
+        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.retains, np.asarray(u)))
     done = dict(zip(ahead, planned, strict=True))
     alike = tuple(done.get(i, item) for i, item in enumerate(filters.alike))
     result = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
@@ -191,7 +191,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
 
 @quickly_compiled
 def _plan(
-    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], retains: bool, u: jax.Array
+    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], retains: bool, u: jax.Array | np.ndarray
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
     """Of these filters alone: whatever a network's fusions are, it is one program."""
 
