@@ -8,9 +8,9 @@ import pytest
 from heliograph.papers.intermittent_observations import compute, run, setting
 from heliograph.papers.intermittent_observations.mean_error import from_runs, mean_error, over_patterns
 from heliograph.papers.intermittent_observations.rounding import iterate
-from heliograph.papers.intermittent_observations.run import results
 from heliograph.papers.intermittent_observations.statements import statements
 from tests.papers.readme import said_of
+from tests.papers.reproduction import kept
 from tests.riccati import riccati
 
 MEAN = {(0.1, 0.6): 4.3818, (0.3, 0.6): 6.1303, (0.1, 0.9): 3.6096, (0.4, 0.6): 6.8095}
@@ -20,19 +20,12 @@ BOUND = {(0.1, 0.6): 4.5801, (0.3, 0.6): 6.5848, (0.1, 0.9): 3.6612, (0.4, 0.6):
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
     """What is computed, and the folder that is written of it."""
-    kept = []
-
-    def told(result):
-        kept.append(result)
-        return results(result)
-
     out = tmp_path_factory.mktemp("out")
-    with pytest.MonkeyPatch.context() as patch:
+    with kept(run) as (computed, patch):
         patch.setattr(compute, "POINTS", 8)  # 0.3, 0.4, ... 1: both sides of the threshold that is looked at
         patch.setattr(compute, "DIGITS", 5e-7)  # within the 1e-6 of the numbers tested
-        patch.setattr(run, "results", told)
         run.reproduce(out, runs=400, seed=1)
-    return kept[0], out / "intermittent-observations"
+    return computed[0], out / "intermittent-observations"
 
 
 @pytest.fixture(scope="module")

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from heliograph.papers.quadratic_bias import compute, run, setting
-from heliograph.papers.quadratic_bias.run import reproduce, results
+from heliograph.papers.quadratic_bias.run import reproduce
 from heliograph.papers.quadratic_bias.statements import statements
 from heliograph.papers.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
 from tests.papers.readme import README, said_of
+from tests.papers.reproduction import kept
 from tests.papers.verdicts import both, check_verdicts
 
 # Means over t = 31 ... 100 by a separate implementation (enumerated monomials in NumPy), for what the oracle lacks.
@@ -20,17 +21,10 @@ EXPECTED = {"memory": (0.0419766, 0.0393043), "cubic": (0.0328326, 0.0333223), "
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    kept = []
-
-    def told(result):
-        kept.append(result)
-        return results(result)
-
     out = tmp_path_factory.mktemp("out")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "results", told)
+    with kept(run) as (computed, _):
         run.reproduce(out, runs=128, seed=1)
-    return kept[0], out / "quadratic-bias"
+    return computed[0], out / "quadratic-bias"
 
 
 @pytest.fixture(scope="module")

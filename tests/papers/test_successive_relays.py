@@ -8,11 +8,12 @@ import pytest
 from heliograph.papers.successive_relays import compute, run, setting
 from heliograph.papers.successive_relays.misprints import used_before_known
 from heliograph.papers.successive_relays.printed import by_filter, recursion
-from heliograph.papers.successive_relays.run import reproduce, results
+from heliograph.papers.successive_relays.run import reproduce
 from heliograph.papers.successive_relays.statements import statements, z_limit
 from heliograph.relays.design import given_design
 from tests.oracles import successive_relays as oracle
 from tests.papers.readme import said_of
+from tests.papers.reproduction import kept
 from tests.papers.verdicts import both, check_verdicts
 
 RUNS = 600
@@ -20,19 +21,12 @@ RUNS = 600
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
-    kept = []
-
-    def told(result):
-        kept.append(result)
-        return results(result)
-
     out = tmp_path_factory.mktemp("reproduction")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "results", told)
+    with kept(run) as (computed, patch):
         patch.setattr(compute, "SWEEPS", 1)  # of a design that is drawn, and in no number tested here
         patch.setattr(compute, "STEADY", 600)  # 0.98^1200 = 3e-11 of a covariance is left
         run.reproduce(out, runs=RUNS, seed=2)
-    return kept[0], out / "successive-relays"
+    return computed[0], out / "successive-relays"
 
 
 @pytest.fixture(scope="module")

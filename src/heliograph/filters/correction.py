@@ -80,11 +80,11 @@ def as_scalars(values: np.ndarray) -> Scalars | None:
     return None if np.isnan(values).any() else Scalars(*values)
 
 
-def _gain_and_prior(prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, *_: Array) -> PyTree:
+def _shapes_of_update(prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, *_: Array) -> PyTree:
     return (len(prior), len(present)), prior.shape
 
 
-@runs_last_of(_gain_and_prior)
+@runs_last_of(_shapes_of_update)
 def young_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalars: Array
 ) -> tuple[jax.Array, jax.Array]:
@@ -135,7 +135,7 @@ def _of_known_gain(channel: SecondOrder, w: jax.Array, present: jax.Array) -> ja
     return spread + absent(present)
 
 
-@runs_last_of(_gain_and_prior)
+@runs_last_of(_shapes_of_update)
 def zero_mean_correction(
     prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array, scalar: Array
 ) -> tuple[jax.Array, jax.Array]:

@@ -61,11 +61,11 @@ def mixed_innovation(
     return Innovation(mean, covariance, jnp.where(nothing, 0.0, density))
 
 
-def _each(value: jax.Array, covariance: jax.Array, size: jax.Array) -> tuple[int, ...]:
+def _shape_of_runs(value: jax.Array, covariance: jax.Array, size: jax.Array) -> tuple[int, ...]:
     return jnp.broadcast_shapes(value.shape[1:], covariance.shape[2:], size.shape[1:])
 
 
-@runs_last_of(_each)
+@runs_last_of(_shape_of_runs)
 def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax.Array:
     """log N(value; 0, covariance) of the components that are not NaN, 0 if none is.
 
