@@ -1,7 +1,5 @@
 """What a fit maximises: a filter's likelihood as a function of the free numbers, with scores and information."""
 
-import hashlib
-from collections.abc import Hashable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal, NamedTuple
@@ -24,6 +22,7 @@ from heliograph.model.sensor import is_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.same import same
 from heliograph.numerics.small_matrix import solve
 from heliograph.numerics.types import Array, Float, PyTree
 from heliograph.random_affine.second_moments import has_known_gain, has_random_gain, second_order
@@ -81,22 +80,25 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """The filter of one form, from numbers on the line. Equal ones share a compiled program: see `_identity`.
+    """The filter of one form, from numbers on the line. Equal ones share a compiled program.
 
-    settles: it is a `LinearFilter` of which nothing varies over time. random: so are gains.
+    settles: it is a `LinearFilter` of which nothing varies over time. random: so are gains. A function may read numbers
+    that live outside of it; that these are others now is seen by the network that it returns at the start.
     """
 
     description: Description
     form: Form
-    identity: Hashable
     settles: bool
     random: bool
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Objective) and self.identity == other.identity
+        return isinstance(other, Objective) and same(self._parts(), other._parts())
 
     def __hash__(self) -> int:
-        return hash(self.identity)
+        return hash((self.description.build, self.form))
+
+    def _parts(self) -> tuple[object, ...]:
+        return self.form, self.description, self.description.start
 
     def filter(self, x: Array) -> AbstractFilter:
         """The filter at a point of the line."""
@@ -129,9 +131,8 @@ def objectives(network: Description) -> list[Objective]:
         ValueError: a network whose likelihood no filter here knows.
     """
     built = network.start
-    identity, forms = _identity(network, built), forms_of(built)
-    settles, random = _settles(built), len(forms) > 1
-    return [Objective(network, form, (form, identity), settles and form == "linear", random) for form in forms]
+    forms, settles = forms_of(built), _settles(built)
+    return [Objective(network, form, settles and form == "linear", len(forms) > 1) for form in forms]
 
 
 def forms_of(network: Network) -> list[Form]:
@@ -239,17 +240,3 @@ def _scored(
     late = jnp.stack([jnp.arange(steps) < steps // 2, jnp.arange(steps) >= steps // 2]).astype(e.dtype)
     halves = jnp.einsum("hk,iak,ibk->hab", late, de, v) + jnp.einsum("hk,iajk,jbik->hab", late, q, q) / 2
     return density, score, halves
-
-
-def _identity(network: Description, built: Network) -> Hashable:
-    """What decides how a program is compiled: the function, what is free, and every number of the network at the start.
-
-    A function of the user's own that reads a number which lives outside of it is not looked into, as with `jax.jit`.
-    """
-    leaves = jax.tree.leaves(built)
-    digest = hashlib.sha256(repr(jax.tree.structure(built)).encode())
-    for leaf in leaves:
-        digest.update(np.asarray(leaf).tobytes() if isinstance(leaf, np.ndarray | jax.Array) else b"-")
-    for one in network.parameters.every:
-        digest.update(repr((one.name, one.domain, one.start.tolist())).encode())
-    return network.build, digest.hexdigest()

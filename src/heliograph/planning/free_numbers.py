@@ -1,12 +1,13 @@
 """The free numbers of a network that is a function of them: starts, ends, and one vector of them all."""
 
 from collections.abc import Callable
+from functools import partial
 from inspect import signature
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from heliograph.learning.description import describe
+from heliograph.learning.description import Description, describe
 from heliograph.numerics.check import array, fail, items, table
 from heliograph.numerics.types import Array, Float
 from heliograph.simulation.network import Network
@@ -118,8 +119,8 @@ def marked(build: Build) -> tuple[Build, Numbers]:
             raise fail(f"free number {one.name!r}", "one between two limits", f"a {one.domain.kind}")
         ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
         found[one.name] = Number(np.asarray(one.start), *ends)
+    return partial(_with_marks, description), Numbers(found)
 
-    def built(**values: object) -> Network:
-        return description.at(values)
 
-    return built, Numbers(found)
+def _with_marks(description: Description, **values: object) -> Network:
+    return description.at(values)

@@ -1,36 +1,22 @@
-"""Error and powers of a network by the numbers that it is a function of, and their derivatives.
-
-The gradient of the error is the adjoint's at fixed gains (`modes_told`), pulled back by JAX through the moments of
-channels and through the powers.
-"""
+"""Error and powers of a network by the numbers that it is a function of, and their derivatives."""
 
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.over_time import first
-from heliograph.numerics.check import fail, instance
-from heliograph.numerics.float64 import compiled
-from heliograph.numerics.types import Array, Float
+from heliograph.numerics.check import instance
+from heliograph.numerics.types import Float
 from heliograph.planning.criterion import Error
+from heliograph.planning.followed import Followed, Slopes, programs
 from heliograph.planning.free_numbers import YOUNG, Build, Numbers, Vector, scalars_of_young
 from heliograph.planning.hearing import means_are_known
-from heliograph.planning.measuring import check_time, measured, transmitters_of, worlds_of
-from heliograph.planning.modes_told import Measured, Settled, settled, touched
+from heliograph.planning.measuring import check_time, transmitters_of, worlds_of
+from heliograph.planning.modes_told import Measured, Settled, settled
 from heliograph.planning.state_power import check_stable
 from heliograph.planning.weighing import Weighing, weighing
 from heliograph.simulation.network import Network
-
-UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
-
-
-class Slopes(NamedTuple):
-    """Derivatives of the error, and of what each transmitter sends at each step."""
-
-    error: Float[np.ndarray, "x"]
-    powers: Float[np.ndarray, "time hops x"]
 
 
 class Point(NamedTuple):
@@ -67,8 +53,7 @@ class Problem:
         if not all(means_are_known(name, first(one.channel)) for name, one in worlds_of(network).items()):
             self.young, self.numbers = True, Numbers(numbers.each | {YOUNG: scalars_of_young(error.steps)})
         self.names, self.weighing = transmitters_of(network), weighing(error, error.matrix(network.states))
-        self._measured = compiled(self._measure)
-        self._slopes = compiled(self._differentiate)
+        self._measured, self._slopes = programs(Followed(build, self.numbers, error, self.young, network))
         self._last: dict[tuple[bytes, int | None], Point] = {}
 
     def network(self, x: Vector) -> Network:
@@ -77,25 +62,6 @@ class Problem:
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
-
-    def _measure(self, x: Array) -> Measured:
-        values = self.numbers.named(jnp.asarray(x))
-        young = values.pop(YOUNG) if self.young else None
-        try:
-            network = self.build(**values)
-        except UNTRACEABLE as error:
-            expected = "operations of jax.numpy on its numbers, and no choice by their values"
-            raise fail("network of free numbers", expected, type(error).__name__) from None
-        return measured(network, self.asked, young)
-
-    def _differentiate(self, x: Array, fixed: Settled) -> Slopes:
-        m, pull = jax.vjp(self._measure, jnp.asarray(x))
-        of_error, size = jax.grad(touched)(m, fixed), m.powers.size
-        each = jnp.eye(size).reshape(size, *m.powers.shape)
-        of_powers = jax.tree.map(lambda part: jnp.zeros((size, *part.shape)), m)._replace(powers=each)
-        asked = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), of_error, of_powers)
-        found = jax.vmap(pull)(asked)[0]
-        return Slopes(found[0], found[1:].reshape(*m.powers.shape, -1))
 
     def at(self, x: Vector, weighing: Weighing | None = None) -> Point:
         """Everything at a point, of an eigenvalue as sharp as the weighing has it.
