@@ -11,7 +11,11 @@ import tempfile
 import pytest
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
-IN_A_HURRY = "--xla_cpu_use_fusion_emitters=false", "--xla_cpu_parallel_codegen_split_count=1"
+IN_A_HURRY = (
+    "--xla_cpu_use_fusion_emitters=false",
+    "--xla_cpu_parallel_codegen_split_count=1",
+    "--xla_disable_hlo_passes=hlo-verifier",
+)
 
 
 def pytest_configure(config):
@@ -21,6 +25,8 @@ def pytest_configure(config):
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
         # Most programs run once, so that compiling them is what takes time: a fifth of it with these.
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
+        # Each operation knows from which line it came; the compiler copies that with it, a tenth of its time.
+        os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
         # BLAS threads wait busily for matrices of a few rows: thirty times the processor time of a small L-BFGS-B.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         for flag in IN_A_HURRY:

@@ -15,8 +15,10 @@ Donated = Literal["none", "all-except-first"]  # arguments whose memory the resu
 
 # The newer way of generating code for a processor takes twice as long and makes code that is a tenth faster. The last
 # level of optimisation takes a quarter longer; a network's runs gain 3 to 7 % by it, the cubature kernel 25 %.
+# The compiler checks a program again after each of its own passes, a tenth of the time, for those who write passes.
 LEVEL = "xla_backend_optimization_level"
-OPTIONS: dict[str, bool | int] = {"xla_cpu_use_fusion_emitters": False, LEVEL: 2}
+Options = dict[str, bool | int | str]
+OPTIONS: Options = {"xla_cpu_use_fusion_emitters": False, "xla_disable_hlo_passes": "hlo-verifier", LEVEL: 2}
 
 
 def quickly_compiled(function: Callable[P, R], donate: Donated = "none") -> Callable[P, R]:
@@ -29,9 +31,7 @@ def fully_optimised(function: Callable[P, R]) -> Callable[P, R]:
     return _compiled(function, lambda: {name: value for name, value in understood().items() if name != LEVEL})
 
 
-def _compiled(
-    function: Callable[P, R], options: Callable[[], dict[str, bool | int]], donate: Donated = "none"
-) -> Callable[P, R]:
+def _compiled(function: Callable[P, R], options: Callable[[], Options], donate: Donated = "none") -> Callable[P, R]:
     """The compiler is asked for its options at the first call, not where a function is defined."""
 
     @cache
@@ -47,7 +47,7 @@ def _compiled(
 
 
 @cache
-def understood() -> dict[str, bool | int]:
+def understood() -> Options:
     """Those of the options that this release of the compiler has: they are not part of its promises.
 
     Without the level where JAX's flag jax_disable_most_optimizations is set, which an option would overrule.
