@@ -31,8 +31,7 @@ CACHE = 2**20  # bytes of errors that are worked through at once
 class Sums(Module):
     """Sums over runs: of pairs e_i e_j (time, part, pair, batch), of e' B^-1 e, of claimed covariances, of symbols.
 
-    Run r goes to batch r mod BATCHES; the last axis is longer, so that a block of consecutive runs lies in one piece,
-    and what is beyond folds back in the end. A covariance that all runs share is summed once, without batches.
+    Run r goes to batch r mod BATCHES. A covariance that all runs share is summed once, without batches.
     failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
     `order`: whose estimates the parts are, kinds first and then fused ones; the first `own` have their own covariances.
@@ -55,16 +54,15 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
     def initial(self, shapes: PyTree) -> Sums:
         """Zero sums."""
-        runs, steps, n = shapes["truth"].shape
-        wide = BATCHES + runs - 1
+        _, steps, n = shapes["truth"].shape
         parts, order, own = _parts(shapes)
         sizes = [int(np.prod(parts[i].mean.shape[2:-1])) for i in order]
         total, mine, pairs = sum(sizes), sum(sizes[:own]), n * (n + 1) // 2
         return Sums(
-            count=jnp.zeros(wide),
-            pairs=jnp.zeros((steps, total, pairs, wide)),
-            nees=jnp.zeros((steps, total, wide)),
-            claimed=jnp.zeros((steps, mine, pairs, wide)),
+            count=jnp.zeros(BATCHES),
+            pairs=jnp.zeros((steps, total, pairs, BATCHES)),
+            nees=jnp.zeros((steps, total, BATCHES)),
+            claimed=jnp.zeros((steps, mine, pairs, BATCHES)),
             shared=jnp.zeros((steps, total - mine, pairs)),
             failed=jnp.zeros((steps, 2, total)),
             failed_runs=jnp.zeros((2, 1, total)),
@@ -95,7 +93,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
         sent = jax.tree.map(lambda x: jnp.broadcast_to(x, (len(valid), *x.shape[1:])), batch["uplinks"])
         return replace(
             sums,
-            count=_dealt(carry.count, counted, 0, runs[0] % BATCHES),
+            count=carry.count + _by_batch(counted, runs[0] % BATCHES),
             failed_runs=carry.failed_runs + jnp.sum(ever, axis=-1)[:, None],
             uplinks=jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent),
         ), ()
@@ -160,16 +158,17 @@ def _added(
     bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)], axis=1) & valid  # (time, 2, part, run)
     claimed, shared = sums.claimed, sums.shared
     if sums.own:
-        claimed = _dealt(claimed, jnp.where(valid, _pairs(bounds[0]), 0.0), first, start)
+        claimed = _plus(claimed, _by_batch(jnp.where(valid, _pairs(bounds[0]), 0.0), start), first)
     if sums.own < len(parts):
-        shared = _dealt(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first, 0)
+        shared = _plus(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first)
+    dealt = _by_batch(errors, start)
     return replace(
         sums,
-        pairs=_dealt(sums.pairs, _pairs(errors[:, None] * errors[None]), first, start),
-        nees=_dealt(sums.nees, nees, first, start),
+        pairs=_plus(sums.pairs, _pairs(dealt[:, None] * dealt[None]), first),
+        nees=_plus(sums.nees, _by_batch(nees, start), first),
         claimed=claimed,
         shared=shared,
-        failed=_dealt(sums.failed, jnp.sum(bad, axis=-1).astype(float), first, 0),
+        failed=_plus(sums.failed, jnp.sum(bad, axis=-1).astype(float), first),
     ), bad
 
 
@@ -199,23 +198,20 @@ def _pairs(values: jax.Array) -> jax.Array:
     return jnp.stack([values[i, j] for i, j in zip(*np.triu_indices(len(values)), strict=True)], axis=2)
 
 
-def _dealt(sums: jax.Array, values: jax.Array, first: jax.Array | int, start: jax.Array | int) -> jax.Array:
-    """Add values (time, ..., run) of consecutive steps from `first` on, of consecutive runs from batch `start` on."""
-    place = (first, *[0] * (sums.ndim - 2), start) if sums.ndim > 1 else (start,)
+def _by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
+    """Values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
+    runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
+    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1))
+    row = jax.lax.dynamic_update_slice(row, values, (*zero, start))
+    begin, beyond = row[..., :BATCHES], row[..., BATCHES:]
+    return jax.lax.dynamic_update_slice(begin, begin[..., : runs - 1] + beyond, (*zero, 0))
+
+
+def _plus(sums: jax.Array, values: jax.Array, first: jax.Array | int) -> jax.Array:
+    """Add values (time, ...) of consecutive steps from `first` on."""
+    place = (first, *[0] * (sums.ndim - 1))
     there = jax.lax.dynamic_slice(sums, place, values.shape)
     return jax.lax.dynamic_update_slice(sums, there + values, place)
-
-
-@compiled
-def _by_batch(*sums: Array) -> list[jax.Array]:
-    """Sums (..., batch) of exactly BATCHES batches: what lies beyond belongs to the first ones."""
-
-    def folded(ahead: Array) -> jax.Array:
-        beyond = jnp.asarray(ahead)[..., BATCHES:]
-        missing = [(0, 0)] * (ahead.ndim - 1) + [(0, BATCHES - beyond.shape[-1])]
-        return jnp.asarray(ahead)[..., :BATCHES] + jnp.pad(beyond, missing)
-
-    return [folded(ahead) for ahead in sums]
 
 
 def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[tuple[np.ndarray, ...]]]:
@@ -223,7 +219,7 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
 
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
-    sums = _by_batch(carry.count, carry.pairs, carry.nees, carry.claimed)
+    sums = carry.count, carry.pairs, carry.nees, carry.claimed
     count, pairs, nees, own = (np.moveaxis(np.asarray(part), -1, 0) for part in sums)  # views: they are last in memory
     own = own / np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
