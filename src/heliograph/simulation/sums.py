@@ -158,17 +158,17 @@ def _added(
     bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)], axis=1) & valid  # (time, 2, part, run)
     claimed, shared = sums.claimed, sums.shared
     if sums.own:
-        claimed = _plus(claimed, _by_batch(jnp.where(valid, _pairs(bounds[0]), 0.0), start), first)
+        claimed = _added_from(claimed, _by_batch(jnp.where(valid, _pairs(bounds[0]), 0.0), start), first)
     if sums.own < len(parts):
-        shared = _plus(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first)
+        shared = _added_from(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first)
     dealt = _by_batch(errors, start)
     return replace(
         sums,
-        pairs=_plus(sums.pairs, _pairs(dealt[:, None] * dealt[None]), first),
-        nees=_plus(sums.nees, _by_batch(nees, start), first),
+        pairs=_added_from(sums.pairs, _pairs(dealt[:, None] * dealt[None]), first),
+        nees=_added_from(sums.nees, _by_batch(nees, start), first),
         claimed=claimed,
         shared=shared,
-        failed=_plus(sums.failed, jnp.sum(bad, axis=-1).astype(float), first),
+        failed=_added_from(sums.failed, jnp.sum(bad, axis=-1).astype(float), first),
     ), bad
 
 
@@ -201,13 +201,13 @@ def _pairs(values: jax.Array) -> jax.Array:
 def _by_batch(values: jax.Array, start: jax.Array | int) -> jax.Array:
     """Values (..., run) of consecutive runs from batch `start` on as (..., batch), zero where there is none."""
     runs, zero = values.shape[-1], (0,) * (values.ndim - 1)
-    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1))
+    row = jnp.zeros((*values.shape[:-1], BATCHES + runs - 1), values.dtype)
     row = jax.lax.dynamic_update_slice(row, values, (*zero, start))
     begin, beyond = row[..., :BATCHES], row[..., BATCHES:]
     return jax.lax.dynamic_update_slice(begin, begin[..., : runs - 1] + beyond, (*zero, 0))
 
 
-def _plus(sums: jax.Array, values: jax.Array, first: jax.Array | int) -> jax.Array:
+def _added_from(sums: jax.Array, values: jax.Array, first: jax.Array | int) -> jax.Array:
     """Add values (time, ...) of consecutive steps from `first` on."""
     place = (first, *[0] * (sums.ndim - 1))
     there = jax.lax.dynamic_slice(sums, place, values.shape)
