@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from tests.oracles.cubature_fusion import PRINTED, STRONG, Setting
+from tests.oracles.relayed_machine import PRINTED, STRONG, Setting, simulate
 
 NUMBERS = ["b1", "b2", "b3", "b4", "b5", "b6", "h", "k1", "k2", "k3"]
 
@@ -58,8 +58,6 @@ def start(s: Setting, node: int):
 
 
 def data(s: Setting, steps: int = 6, seed: int = 0):
-    from tests.oracles.cubature_fusion import simulate
-
     laws = (s["xi"][1], s["gamma"][1])
     return simulate({**s, "T": steps}, 1, np.random.default_rng(seed), laws)["ybar"][0]
 

@@ -30,6 +30,7 @@ from heliograph.papers.cubature_fusion.variants import MixedCross, variants
 from heliograph.papers.statement import Sampled
 from tests import machine
 from tests.oracles import cubature_fusion as oracle
+from tests.oracles import relayed_machine
 from tests.papers.verdicts import both, check_verdicts
 
 FILTERS = {"open_loop", "mean_gain", "extended_polytope", "cubature_printed", "cubature_tight", "cubature_polytope",
@@ -39,11 +40,11 @@ FUSED = {"ci_optimal", "ci_equal", "central"}
 NUMBERS = {"rmse", "rmse_se", "mean_trace", "worst_direction"}
 
 
-@pytest.mark.parametrize(("ours", "theirs"), [(PRINTED, oracle.PRINTED), (STRONG, oracle.STRONG)])
+@pytest.mark.parametrize(("ours", "theirs"), [(PRINTED, relayed_machine.PRINTED), (STRONG, relayed_machine.STRONG)])
 def test_constants_are_those_of_the_oracle(ours, theirs):
     x, eye = np.random.default_rng(0).normal(size=5), np.eye(5)
     with jax.enable_x64(True):
-        np.testing.assert_allclose(plant(ours).transition(x, ()), oracle.f(x, theirs), rtol=1e-13)  # rounding
+        np.testing.assert_allclose(plant(ours).transition(x, ()), relayed_machine.f(x, theirs), rtol=1e-13)  # rounding
     np.testing.assert_array_equal([sensor(ours, i).matrix for i in range(4)], theirs["C"])
     np.testing.assert_array_equal(ours.guesses, theirs["xhat0"])
     np.testing.assert_array_equal(plant(ours).noise.covariance, theirs["R"])
@@ -57,7 +58,7 @@ def test_constants_are_those_of_the_oracle(ours, theirs):
             np.testing.assert_array_equal(getattr(mine.law, part), getattr(reference.law, part))
 
 
-@pytest.mark.parametrize(("s", "theirs"), [(PRINTED, oracle.PRINTED), (STRONG, oracle.STRONG)])
+@pytest.mark.parametrize(("s", "theirs"), [(PRINTED, relayed_machine.PRINTED), (STRONG, relayed_machine.STRONG)])
 @pytest.mark.parametrize(("sign", "terms"), [(1, oracle.printed_terms), (-1, oracle.tight_terms)])
 def test_terms_of_the_bounds_are_those_of_the_oracle(s, theirs, sign, terms):
     ours, reference = one_step.box_terms(one_step.channel_of(s), sign), terms(theirs)

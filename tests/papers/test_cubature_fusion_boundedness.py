@@ -6,7 +6,7 @@ import pytest
 import heliograph as hg
 from heliograph.papers.cubature_fusion.boundedness import growth_condition
 from tests.machine import PRINTED, plant
-from tests.oracles.cubature_fusion import jacobian
+from tests.oracles.relayed_machine import jacobian
 
 
 def linear(matrix):
