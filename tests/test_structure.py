@@ -20,6 +20,7 @@ ORDER = [
     ["model"],
     [
         "filters.base",
+        "filters.plausibility",
         "filters.retained",
         "filters.retained_linear",
         "filters.retained_moments",

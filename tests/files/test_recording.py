@@ -6,7 +6,6 @@ import heliograph as h
 from heliograph.files.recording import (
     estimate_columns,
     read_recording,
-    received_names,
     write_estimates,
 )
 from heliograph.files.table import write_table
@@ -76,9 +75,9 @@ def test_no_inputs():
 
 def test_names_of_what_is_received():
     sensor, plant = sensed("pos", "vel"), tracked()
-    assert received_names(h.Node(sensor, relayed(2), {})) == ("pos", "vel")
+    assert h.Node(sensor, relayed(2), {}).received_names == ("pos", "vel")
     both = h.with_direct_link(relayed(2), h.perfect(2))
-    assert received_names(h.Node(sensor, both, {})) == ("z0", "z1", "z2", "z3")
+    assert h.Node(sensor, both, {}).received_names == ("z0", "z1", "z2", "z3")
     net = h.Network(plant, {"a": h.Node(sensor, both, {})})
     measured = read_recording(columns(z0=TIME, z1=TIME, z2=TIME, z3=[1, 2, 3, 4]), net)
     np.testing.assert_array_equal(measured.measurements["a"][:, 3], [1, 2, 3, 4])

@@ -157,3 +157,21 @@ def test_with_gaussian_noise_it_is_gpb1():
 def test_a_drift_has_no_atoms():
     with pytest.raises(ValueError, match="gains of finitely many values, got one that drifts"):
         hg.mixture_filter(PLANT, SENSOR, hg.autoregressive_fading(1.0, 0.3, 0.9, 0.1))
+
+
+@pytest.mark.parametrize("channel", [hg.dropout(hg.perfect(), 0.0), hg.model.silent(noise=0), hg.hop(0.0, 0.0)])
+def test_a_value_that_no_combination_leaves_says_nothing(channel):
+    """It was NaN for ever; the likelihood is none, and the next value is used as if it had not been."""
+    plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    item = hg.mixture_filter(plant, sensor, channel)
+    prior = item.predict(item.init())
+    after, heard = item.correct(prior, [0.5])
+    np.testing.assert_array_equal(item.estimate(after).mean, item.estimate(prior).mean)
+    np.testing.assert_array_equal(item.estimate(after).covariance, item.estimate(prior).covariance)
+    assert heard.log_likelihood == -np.inf
+    stream = hg.Stream(item)
+    with pytest.raises(
+        ValueError, match=r"measurement of step 0: expected a plausible one, got \[0.5\]: a value that the"
+    ):
+        stream.push([0.5])
+    assert stream.push([0.0]).mean == 0.0 and stream.steps == 1

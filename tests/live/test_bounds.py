@@ -63,7 +63,7 @@ def test_what_is_older_than_the_window_is_used_if_nothing_newer_is_final(network
     assert timeline.push("a", 1, 2.0, 1.0, 50.0) == "used"  # 48 s on its way
     assert timeline.push("a", 2, 1.5, 1.0, 50.0) == "late"
     assert timeline.push("a", 3, 51.0, 1.0, 50.0) == "future"
-    assert timeline.counts["a"] == {"used": 2, "duplicate": 0, "conflict": 0, "late": 1, "future": 1}
+    assert timeline.counts["a"] == {"used": 2, "duplicate": 0, "conflict": 0, "late": 1, "future": 1, "implausible": 0}
     assert hg.Timeline(network, 1.0, ahead=2.0).push("a", 3, 51.0, 1.0, 50.0) == "used"
 
 

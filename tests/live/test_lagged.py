@@ -6,6 +6,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.live.later import Sweeper
+from heliograph.live.player import player
 
 GAPS = {"a": (3, 5, 11), "b": (3, 5, 7, 11)}  # two of them at both nodes, one at the end
 
@@ -78,5 +79,5 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
     both = {"f": gains, "linear": hg.linear_filter(plant, sensor, hg.perfect())}
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
     beside = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
-    smoothed = Sweeper(beside, None).item
+    smoothed = Sweeper(beside, None, player(beside).structure).item
     assert smoothed.fusions == () and [beside.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]

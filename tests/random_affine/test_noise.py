@@ -45,3 +45,15 @@ def test_a_singular_covariance_is_sampled_on_its_subspace():
 def test_what_is_no_covariance_is_refused(value, message):
     with pytest.raises(ValueError, match=message):
         as_noise("noise", value, 2)
+
+
+@pytest.mark.parametrize("covariance", [[[0.1, 0.3], [0.3, 0.9]], [[1.0, 1e-9], [1e-9, 1e-18]]])
+def test_samples_of_a_singular_covariance_stay_in_its_range(covariance):
+    """The root of an eigenvalue of rounding, 1e-8, would be a noise where there is none."""
+    noise = hg.Gaussian(covariance)
+    s = np.asarray(covariance)
+    null = np.array([s[0, 1], -s[0, 0]])
+    with jax.enable_x64(True):
+        samples = np.array([noise.sample(jax.random.key(i)) for i in range(20)])
+    assert np.abs(samples @ null).max() <= 1e-14 * np.abs(samples * null).max()
+    np.testing.assert_allclose(noise.factor @ noise.factor.T, s, rtol=1e-12)

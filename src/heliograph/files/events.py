@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from heliograph.disk.output_file import FORMATS
-from heliograph.files.recording import TIME_STEP, received_names, write_estimates
+from heliograph.files.recording import TIME_STEP, write_estimates
 from heliograph.live.event import INPUTS, Event
 from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
@@ -40,7 +40,7 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
     """
     path = Path(path)
     columns = _columns(path)
-    components = {name: received_names(node) for name, node in network.nodes.items()}
+    components = {name: node.received_names for name, node in network.nodes.items()}
     components[INPUTS] = tuple(name for name in network.inputs if name != TIME_STEP)
     known = [NODE, SEQUENCE, TIME, ARRIVAL, VALUES, *(name for names in components.values() for name in names)]
     for name in columns:

@@ -15,7 +15,6 @@ from heliograph.numerics.check import backwards, backwards_text, fail
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
-from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.record import Record, is_sound
 
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
@@ -96,12 +95,6 @@ def _recording_of(columns: Mapping[str, np.ndarray], network: Network, source: s
     return Recording(measurements, u, time)
 
 
-def received_names(node: Node | Listener) -> tuple[str, ...]:
-    """Names of what reaches a node's filters: the sensor's outputs where they are as many, else z0, z1, ..."""
-    outputs = node.outputs
-    return outputs if len(outputs) == node.received else tuple(f"z{i}" for i in range(node.received))
-
-
 def estimate_columns(record: Record) -> dict[str, np.ndarray]:
     """The estimates of a recording as columns.
 
@@ -164,7 +157,7 @@ def _at_the_end(values: np.ndarray, rows: int) -> np.ndarray:
 
 def _received_columns(network: Network) -> dict[str, list[tuple[str, ...]]]:
     """For each node and component the names its column may have, the preferred one first."""
-    names = {node: received_names(item) for node, item in network.nodes.items()}
+    names = {node: item.received_names for node, item in network.nodes.items()}
     uses = Counter([TIME, *network.inputs])
     for node, components in names.items():
         uses.update([*components, *(f"{node}.{name}" for name in components)])

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retaining import with_surprise
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -70,6 +71,17 @@ class AbstractFilter(Module):
         z, u = measured(self, z), given(self, u)
         return _step(self, state, z, u, step_number(self, k))
 
+    def step_judged(
+        self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
+    ) -> tuple[PyTree, Estimate, Judgement]:
+        """As `step`, with what is to be said of z and u; a state with which something is implausible is not to be kept.
+
+        Raises:
+            ValueError: what `step` refuses.
+        """
+        z, u = measured(self, z), given(self, u)
+        return _step_judged(self, state, z, u, step_number(self, k))
+
     def step_retained(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
     ) -> tuple[PyTree, AbstractRetained]:
@@ -104,6 +116,11 @@ class AbstractFilter(Module):
         return self
 
     @property
+    def of_atoms(self) -> bool:
+        """Whether its likelihood alone says which values its model excludes, being a mixture's."""
+        return False
+
+    @property
     def horizon(self) -> int | None:
         """Number of steps that it covers; None if it may go on for ever."""
         return steps_covered(self)
@@ -113,6 +130,17 @@ class AbstractFilter(Module):
 def _step(item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree) -> tuple[PyTree, Estimate]:
     after, _ = item.correct(item.predict(state, u, k), z, k)
     return after, item.after_step(after, k)
+
+
+@compiled
+def _step_judged(
+    item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
+) -> tuple[PyTree, Estimate, Judgement]:
+    prior = item.predict(state, u, k)
+    after, heard = item.correct(prior, z, k)
+    estimate = item.after_step(after, k)
+    told = item.estimate(state), item.estimate(prior), estimate
+    return after, estimate, judge(item.claim, (state, prior, after), told, heard, z, item.of_atoms)
 
 
 @compiled

@@ -21,6 +21,7 @@ from heliograph.numerics.small_matrix import (
     congruence,
     diagonal,
     own,
+    pivots,
     root,
     rounding,
     solve,
@@ -263,4 +264,8 @@ _gain_and_covariance = runs_last(partial(_by_precision, where_any), partial(_by_
 
 
 def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
-    return jnp.any(own(noise) < rounding(PRECISE, omega, 1000) * own(omega), axis=0)
+    """Whether some component's noise, given those before it, is far below what is unknown of it.
+
+    So a combination of components that is free of noise counts, though none of them is.
+    """
+    return jnp.any(pivots(noise) < rounding(PRECISE, omega, 1000) * own(omega), axis=0)

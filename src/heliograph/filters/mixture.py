@@ -69,7 +69,7 @@ class MixtureFilter(AbstractFilter):
     the mode's probability times that of the combination in it; the modes' probabilities are carried along, but not what
     the state owes to the mode. Nominal: after the first step the prior is not Gaussian, and process noise enters by its
     covariance only. The log-likelihood is that of the mixture, log sum_a p_a N(z; ...); the innovation's covariance is
-    the mixture's too.
+    the mixture's too. A value that no combination leaves says nothing: its log-likelihood is -inf, the state stays.
 
     Source: Ackerson and Fu, On state estimation in switching environments (1970), with random gains as modes.
     """
@@ -82,6 +82,11 @@ class MixtureFilter(AbstractFilter):
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
+
+    @property
+    def of_atoms(self) -> bool:
+        """It is a mixture over atoms."""
+        return True
 
     @in_float64
     def init(self) -> MixtureBelief:
@@ -118,7 +123,8 @@ class MixtureFilter(AbstractFilter):
 
         likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
         weighed = sharpest(likelihood, certain) + jnp.log(prior)
-        weight = jax.nn.softmax(weighed)
+        excluded = jnp.max(weighed) == -jnp.inf  # no combination leaves such a value: it says nothing
+        weight = jax.nn.softmax(jnp.where(excluded, jnp.log(prior), weighed))
         shift = weight @ moved
         apart = moved - shift
         after = (
@@ -129,7 +135,8 @@ class MixtureFilter(AbstractFilter):
         value = nearest(value, value[jnp.argmax(prior)], self.heard_angles)
         heard = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
-        return MixtureBelief(mean + shift, symmetrize(after), modes, state.moved), heard
+        found = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, found), heard
 
     @in_float64
     def estimate(self, state: MixtureBelief) -> Estimate:

@@ -7,30 +7,22 @@ from typing import Protocol
 import jax
 import jax.numpy as jnp
 
+from heliograph.filters.plausibility import innovation_distance
 from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.retained_linear import RetainedLinear
 from heliograph.filters.retained_moments import RetainedMoments
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.numerics.angle import Angles
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import diagonal, squared_distance, times, transpose
+from heliograph.numerics.small_matrix import diagonal, times, transpose
 from heliograph.numerics.small_matrix import solve as small_solve
 from heliograph.numerics.types import Array, Float
 
 
 def with_surprise(step: AbstractRetained, heard: Innovation) -> AbstractRetained:
     """The step with how much its innovation surprised the filter, in units of what it believes."""
-    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
-    present = ~jnp.isnan(value)
-    both = present[:, None] & present
-    total = jnp.where(both, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
-    surprise = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
-    return replace(step, surprise=surprise, heard=jnp.sum(present).astype(surprise.dtype))
-
-
-@runs_last
-def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
-    return squared_distance(a, x)
+    surprise, count = innovation_distance(heard)
+    return replace(step, surprise=surprise, heard=count)
 
 
 class HasMoments(Protocol):

@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.types import ArrayLike, Float
 
-Verdict = Literal["used", "duplicate", "conflict", "late", "future"]
+Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
 INPUTS = "inputs"  # the node whose events are the plant's inputs
 

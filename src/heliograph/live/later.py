@@ -20,6 +20,7 @@ from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.gathering import Fused
+from heliograph.simulation.judging import reasons
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
 
@@ -32,10 +33,15 @@ class Sweep(Module):
     ears: Ears
     fusions: tuple[Fused, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
+    structure: jax.tree_util.PyTreeDef = eqx.field(static=True)  # of what is told after a row
 
-    def step(self, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Retained]:
-        """One step of all, with what a sweep back over it needs."""
-        after, found = self.ears.filters.step(state, self.ears.groups(heard), u, k)
+    def step(
+        self, tape: Tape, row: jax.Array, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, Retained]:
+        """One step of all into a row, with what a sweep back over it needs; without what was implausible there."""
+        own, central = reasons(self.structure.unflatten([leaf[row] for leaf in tape.told]))
+        skip = own, {name: central[name] for name in self.ears.filters.central}
+        after, found = self.ears.filters.step(state, self.ears.groups(heard), u, k, skip=skip)
         return after, ({kind: found["retained"][kind] for kind in self.kinds}, found["retained_centrally"])
 
     def start(self, tape: Tape, slot: jax.Array) -> PyTree:
@@ -104,7 +110,7 @@ def _into_row(dt: int) -> Into:
     def into(item: Sweep, tape: Tape, order: jax.Array, place: Place) -> Retained:
         before, now = order[place[0] - 1], order[place[0]]
         u = interval(tape, before, now, dt)
-        return item.step(item.start(tape, before), tape.parts(now)[0], u, tape.step[now])[1]
+        return item.step(tape, now, item.start(tape, before), tape.parts(now)[0], u, tape.step[now])[1]
 
     return into
 
@@ -118,10 +124,10 @@ def _into_step(item: Sweep, tape: Tape, order: jax.Array, place: Place) -> Retai
     before, now, k = order[place[0] - 1], order[place[0]], place[1]
 
     def one(j: jax.Array, state: PyTree) -> PyTree:
-        return item.step(state, *at_step(tape, before, now, j), j)[0]
+        return item.step(tape, now, state, *at_step(tape, before, now, j), j)[0]
 
     state = jax.lax.fori_loop(tape.step[before] + 1, k, one, item.start(tape, before))
-    return item.step(state, *at_step(tape, before, now, k), k)[1]
+    return item.step(tape, now, state, *at_step(tape, before, now, k), k)[1]
 
 
 def _earlier_step(tape: Tape, order: jax.Array, place: Place) -> Place:
@@ -132,7 +138,7 @@ def _earlier_step(tape: Tape, order: jax.Array, place: Place) -> Place:
 class Sweeper:
     """The program of a network, with its numbers, and how its results are called."""
 
-    def __init__(self, network: Network, dt: int | None):
+    def __init__(self, network: Network, dt: int | None, structure: jax.tree_util.PyTreeDef):
         self.network = network
         kinds = tuple(k for k, kind in enumerate(network.kinds) if _retains(_of(network, k, kind.filters[0])))
         items = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
@@ -144,7 +150,7 @@ class Sweeper:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(item for item in AllFilters(network).fusions if self._fuses(item, kinds))
         with jax.enable_x64(True):
-            self.item = Sweep(Ears(network, AllFilters(alone, kinds)), fusions, kinds)
+            self.item = Sweep(Ears(network, AllFilters(alone, kinds)), fusions, kinds, structure)
             self._numbers, mould = cast(self.item)
         self._run = sweep_back(mould, dt)
 

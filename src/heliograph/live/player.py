@@ -7,7 +7,9 @@ from weakref import WeakValueDictionary
 import jax
 import numpy as np
 
+from heliograph.filters.plausibility import why_inputs, why_values
 from heliograph.live.clock import time_input, uneven
+from heliograph.live.event import INPUTS
 from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
 from heliograph.live.mould import cast
@@ -15,6 +17,7 @@ from heliograph.live.tape import Ears, Tape, replay
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.judging import Judges
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, begun
 
@@ -33,7 +36,7 @@ class Player:
         self.received = sum(node.received for node in network.nodes.values())
         self.given = inputs - (self.dt is not None)
         with jax.enable_x64(True):
-            filters = AllFilters(network)
+            filters = AllFilters(network, judges=True)
             for name, link in filters.reporting.items():
                 if link.uplinks.groups:
                     wanted = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
@@ -44,7 +47,14 @@ class Player:
             data = self.numbers, self.start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
             told = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).step(*row)[1], *data)
         self._like, self.structure = jax.tree.leaves(told), jax.tree.structure(told)
-        self.replay = replay(mould, self.dt)
+        self.replay, self._judges = replay(mould, self.dt), Judges(network)
+
+    def why(self, told: list[np.ndarray], node: str) -> str | None:
+        """Why what a node said at a row is implausible, from what was told after it; None if it is not."""
+        found = jax.tree.unflatten(self.structure, told)
+        return (
+            why_inputs(self._judges.of_all(found)) if node == INPUTS else why_values(self._judges.of_node(found, node))
+        )
 
     @cached_property
     def sweeper(self) -> Sweeper:
@@ -53,7 +63,7 @@ class Player:
         Raises:
             ValueError: no filter that can be smoothed.
         """
-        return Sweeper(self.network, self.dt)
+        return Sweeper(self.network, self.dt, self.structure)
 
     @cached_property
     def identity(self) -> Identity:

@@ -84,6 +84,14 @@ class Rows:
         self.keys.insert(place, row.key)
         self.held.insert(place, row)
 
+    def place(self, key: Key) -> int:
+        """Where the row of this key stands, or would."""
+        return bisect_left(self.keys, key)
+
+    def remove(self, place: int) -> None:
+        """Hold one row less."""
+        del self.keys[place], self.held[place]
+
     def fill(self, row: HeldRow, event: Known) -> None:
         """Take what an event has into its row; NaN is nothing."""
         there = row.numbers[self.places[event.place]]

@@ -13,10 +13,12 @@ from heliograph.live.mould import Mould
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
+from heliograph.simulation.judging import plausible_step, step_without
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters
 
 READ = 64  # rows that are read at once
+TOLD = "estimates", "fused", "judged", "judged_centrally"
 
 
 class Tape(NamedTuple):
@@ -56,9 +58,24 @@ class Ears(Module):
         self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
 
     def step(self, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
-        """One step of all; what they tell is "estimates" by kind and "fused" by name."""
+        """One step of all, without what is implausible; what they tell is "estimates" by kind and "fused" by name.
+
+        And "judged" and "judged_centrally" of what was heard, by kind and by name.
+        """
+        after, found = plausible_step(self.filters, state, self.groups(heard), u, k)
+        return after, {name: found[name] for name in TOLD}
+
+    def judged(self, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
+        """The same with all that was heard, implausible or not."""
         after, found = self.filters.step(state, self.groups(heard), u, k)
-        return after, {"estimates": found["estimates"], "fused": found["fused"]}
+        return after, {name: found[name] for name in TOLD}
+
+    def without(
+        self, first: tuple[PyTree, PyTree], state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, PyTree]:
+        """The step again, where each filter leaves out what it finds implausible."""
+        after, found = step_without(self.filters, first, state, self.groups(heard), u, k)
+        return after, {name: found[name] for name in TOLD}
 
     def groups(self, heard: jax.Array) -> list[jax.Array]:
         """What each group's nodes heard, (node, received)."""

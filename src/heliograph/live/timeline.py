@@ -38,6 +38,8 @@ class Timeline:
     - "late": it is before the base, in the order (time, node, sequence);
     - "duplicate": the same node, sequence and time are held with the same values; "conflict": with others, and the
       first stay;
+    - "implausible": no filter at the node could use it without losing its state or its digits (`heliograph.filters
+      .plausibility`), judged on what is held; or all its values are beyond the node's limits;
     - "used".
 
     An event that is refused changes nothing. A plant with an input "dt" has continuous time, which starts at `start`;
@@ -46,7 +48,8 @@ class Timeline:
     row is made of all events of a time, and what is heard there twice is a conflict; else every event is a row.
 
     At most `capacity` rows are held; beyond it the oldest become final, counted in `forced`. `counts` has the number
-    of each verdict by node, and under "inputs".
+    of each verdict by node, and under "inputs"; `dropped` how many single values were beyond a node's limits, which
+    counted as not arrived.
 
     Raises:
         ValueError: no network, a negative window, a node called "inputs", continuous time where parts go by steps.
@@ -68,6 +71,7 @@ class Timeline:
         self._sizes = {name: (i, network.nodes[name].received) for i, name in enumerate(network.names)}
         self._sizes[INPUTS] = -1, self._player.given
         self.counts = {name: dict.fromkeys(VERDICTS, 0) for name in self._sizes}
+        self.dropped = dict.fromkeys(network.names, 0)
         self.forced = 0
         slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
         begun = self.now if self._dt is not None else -1.0
@@ -101,15 +105,27 @@ class Timeline:
             ValueError: an unknown node, values that are not the node's, a time that is no number or no step; nothing
                 is counted, and everything stays as it was.
         """
-        event = self._known(node, sequence, time, values, arrival)
+        event, dropped = self._within(self._known(node, sequence, time, values, arrival), node)
         now = max(self.now, event.arrival)
         verdict = self._rows.verdict(event, now - self.window, self.ahead)
+        nothing = dropped and np.isnan(event.values).all()
+        if verdict == "used" and (nothing or not self._used(event)):
+            verdict = "implausible"
         if verdict == "used":
-            self._use(event)
             self.now = now
             self._settle()
+        if verdict in ("used", "implausible") and dropped:
+            self.dropped[node] += dropped
         self.counts[node][verdict] += 1
         return verdict
+
+    def _within(self, event: Known, node: str) -> tuple[Known, int]:
+        """The event without what is beyond its node's limits, and how many values these were."""
+        limits = None if node == INPUTS else self.network.nodes[node].limits
+        outside = None if limits is None else limits.outside(event.values)
+        if outside is None or not outside.any():
+            return event, 0
+        return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum())
 
     def advance(self, now: float) -> None:
         """Let time pass: what is older than the window becomes final.
@@ -184,6 +200,7 @@ class Timeline:
         held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._tape))}
         final = {f"final.{i}": leaf for i, leaf in enumerate(told)}
         head = {"now": self.now, "forced": self.forced, "counts": self.counts, "of": self._player.identity}
+        head |= {"dropped": self.dropped}
         head |= {"options": [self.window, self.ahead, self.capacity]}
         return packed(head, {**row_arrays(self._rows.held), **held, **final, "final.time": time})
 
@@ -208,6 +225,7 @@ class Timeline:
     def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: Tape) -> None:
         """Hold what was saved."""
         self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
+        self.dropped = head["dropped"]
         slots, count = len(self._order), len(arrays["row.time"])
         self._tape = self._player.filled(slots, saved)
         self._rows.hold(rows_from(arrays, np.asarray(saved.rows), dict(self._sizes.values())))
@@ -229,9 +247,10 @@ class Timeline:
         came = max(self.now, at) if arrival is None else moment(f"{name}, arrival", arrival)
         return Known(place, whole(f"{name}, sequence", sequence), at, numbers(name, values, size), came)
 
-    def _use(self, event: Known) -> None:
-        """Put the event into its row, and replay from there."""
+    def _used(self, event: Known) -> bool:
+        """Put the event into its row and replay from there; if it is implausible all is as it was before, and False."""
         place, row = self._rows.find(event)
+        before = None if row is None else (row.numbers.copy(), dict(row.events))
         if row is None:
             if not self._free:
                 self._collect()
@@ -240,7 +259,35 @@ class Timeline:
             self._order[place] = row.slot
             self._rows.insert(place, row)
         self._rows.fill(row, event)
-        self._latest = self._replayed(row, place, len(self._rows.held))
+        latest = self._replayed(row, place, len(self._rows.held))
+        if not self._refuses(event, row, place, latest):
+            self._latest = latest
+            return True
+        if before is None:
+            self._rows.remove(place)
+            self._order[place : len(self._rows.held)] = self._order[place + 1 : len(self._rows.held) + 1].copy()
+            self._free.append(row.slot)
+        else:
+            row.numbers[:], row.events = before
+        if place < len(self._rows.held):
+            self._replayed(self._rows.held[place], place, len(self._rows.held))
+        return False
+
+    def _refuses(self, event: Known, row: HeldRow, place: int, latest: list[np.ndarray]) -> bool:
+        """Whether an event that was just replayed is implausible; an input also over one unit of time from its own."""
+        if place < len(self._rows.held) - 1:
+            latest = self._told_at(row.slot)
+        name = INPUTS if event.place < 0 else self.network.names[event.place]
+        why = self._player.why(latest, name)
+        if why is None and name == INPUTS and self._dt is not None:
+            why = self._player.why(self._look(row.key[0] + 1.0, place + 1), name)
+        return why is not None
+
+    def _told_at(self, slot: int) -> list[np.ndarray]:
+        """What the filters told after the row in a slot."""
+        slots = np.full(READ, slot, dtype=np.int32)
+        with jax.enable_x64(True):
+            return [np.asarray(leaf)[0] for leaf in read(self._tape.told, slots)]
 
     def _replayed(self, row: HeldRow, start: int, stop: int) -> list[np.ndarray]:
         """Write a row and step over those of the order from `start` to `stop`; what is told after the last."""

@@ -118,13 +118,30 @@ def sum_of_squares(
 ) -> jax.Array:
     """(I - K H) P (I - K H)' + K N K', with the rounding of the mean itself, eps^2 P, added.
 
-    By a root of P, so that what I - K H takes off leaves the square of its rounding alone.
+    By roots of P and of N, so that what I - K H takes off, and what K takes of a singular N, leave the squares of their
+    rounding alone, which are not negative.
     """
     n = len(prior)
     kept = identity(n, prior) - times(gain, output)
     rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own(prior))
     left = times(kept, prior_root)
-    return symmetric(times(left, transpose(left)) + congruence(gain, noise)) + rounded
+    return symmetric(times(left, transpose(left)) + spread_of(gain, noise)) + rounded
+
+
+@jax.custom_jvp
+def spread_of(gain: jax.Array, noise: jax.Array) -> jax.Array:
+    """K N K' of a positive semidefinite N as a square, by a root of N; its derivatives are those of the product."""
+    part = times(gain, root(noise))
+    return times(part, transpose(part))
+
+
+@spread_of.defjvp
+def _spread_jvp(
+    primals: tuple[jax.Array, jax.Array], tangents: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    (gain, noise), (gain_dot, noise_dot) = primals, tangents
+    half = times(times(gain_dot, noise), transpose(gain))
+    return spread_of(gain, noise), half + transpose(half) + congruence(gain, noise_dot)
 
 
 def factor(a: jax.Array) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -207,18 +224,30 @@ def root(a: jax.Array) -> jax.Array:
     return jnp.stack(factor(a)[0], axis=1)
 
 
+def pivots(a: jax.Array) -> jax.Array:
+    """Variance of each component given those before it, (n, ...); 0 where these determine it."""
+    return own(a) if len(a) == 1 else own(root(a)) ** 2
+
+
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
     """x' A^-1 x = |L^-1 x|^2 for a positive semidefinite A = L L'; NaN for an indefinite one.
 
     A component that those before it determine counts 1, what is expected of it in the limit, where x says what they
     say, and is infinite where it does not; `size` (n,) is what x is a difference of, for its rounding.
     """
+    return add(list(squared_distances(a, x, size)[0]))
+
+
+def squared_distances(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
+    """The terms of `squared_distance`, each given those before it, and which of them these determine."""
     reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own(a), 0.0)) + OFF_VALUE * jnp.abs(size)
-    total: list[jax.Array] = []
+    squares: list[jax.Array] = []
+    determined: list[jax.Array] = []
     for i, (rest, scale) in enumerate(_substituted(a, x)):
         agrees = jnp.where(jnp.abs(rest) <= reach[i], 1.0, jnp.inf)
-        total.append(jnp.where(scale == 0, agrees, (rest * scale) ** 2))
-    return add(total)
+        determined.append(scale == 0)
+        squares.append(jnp.where(determined[-1], agrees, (rest * scale) ** 2))
+    return jnp.stack(squares), jnp.stack(determined)
 
 
 def whiten(a: jax.Array, x: jax.Array) -> jax.Array:

@@ -94,14 +94,16 @@ class Gaussian(AbstractNoise):
 def _root(covariance_: Square) -> np.ndarray:
     """A with A A' = S from eigenvectors of S; of its correlations, where those of S lose digits of a component's own.
 
-    An eigenvalue is known to rounding of the largest one, so that a component in small units would be lost.
+    An eigenvalue is known to rounding of the largest one, so that a component in small units would be lost; one that is
+    no more than that is zero, since its root, of 1e-8, would be heard where a combination has no noise.
     """
     matrix = np.asarray(covariance_)
     deviation = np.sqrt(np.diagonal(matrix))
     unit = np.where(deviation > 0, deviation, 1.0)
     for scale in (np.ones_like(unit), unit):
         values, vectors = np.linalg.eigh(matrix / np.outer(scale, scale))
-        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.maximum(values, 0.0)))
+        rounding = 10 * len(values) * np.finfo(float).eps * np.max(values, initial=0.0)
+        factor: np.ndarray = scale[:, None] * (vectors * np.sqrt(np.where(values > rounding, values, 0.0)))
         if np.all(np.abs(factor @ factor.T - matrix) <= OWN_DIGITS * np.outer(unit, unit)):
             break
     return factor

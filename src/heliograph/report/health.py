@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from heliograph.files.recording import received_names
 from heliograph.filters.base import AbstractFilter
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.record import Record
@@ -101,7 +100,7 @@ def examine(
     links = []
     for node in heard:
         z, place = heard[node], network.nodes[node]
-        for i, name in enumerate(received_names(place)):
+        for i, name in enumerate(place.received_names):
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))
     filters = []

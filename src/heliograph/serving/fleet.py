@@ -1,6 +1,6 @@
 """Plants of one network: each takes its events as a timeline does; what is due is stepped for all of them at once."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from itertools import pairwise
 from typing import NamedTuple
@@ -11,6 +11,7 @@ from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.numerics.types import Float
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
 from heliograph.serving.pool import Pool
@@ -60,6 +61,8 @@ class Fleet:
         self._end = np.inf if covered is None else covered - 1
         self._leap = min(options.leap, FAR) if self.lanes.dt is None else options.leap
         self._joint = self.lanes.dt is None or network.common is not None
+        self._blank = self.pool.take()
+        self.pool.start(self._blank, -1.0)
 
     def begin(self, name: str, time: float, origin: datetime | None) -> Plant:
         """A new plant, whose continuous time starts at `time`."""
@@ -107,27 +110,41 @@ class Fleet:
         verdict = rows.verdict(event, now - self.options.window, self.options.ahead)
         if verdict != "used":
             return verdict
-        place, row = rows.find(event)
-        if row is None:
-            row = HeldRow(rows.key(event), self.pool.take(), self._width)
-            rows.insert(place, row)
-        rows.fill(row, event)
-        plant.dirty = place if plant.dirty is None else min(plant.dirty, place)
+        plant.take(event, self.pool.take, self._width)
         plant.now = now
         return verdict
+
+    def undo(self, plant: Plant, now: float) -> None:
+        """Have a plant as it was before what it took since it was settled."""
+        self.pool.give(plant.undo())
+        plant.now = now
 
     def settle(self, touched: Iterable[Plant], all_: bool = False) -> list[Settled]:
         """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
+        self.step(plants)
+        back = -np.inf if all_ else self.options.window
+        ends = [(plant, *plant.settle(plant.now - back)) for plant in plants]
+        return [Settled(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
+
+    def step(self, plants: Iterable[Plant]) -> None:
+        """Step what is due, for all plants at once."""
         chains = [chain for plant in plants if (chain := plant.chain())]
         for chain in chains:
             slots = [row.slot for row in chain]
             self.pool.table[slots, self.pool.numbers] = np.array([row.numbers for row in chain])
         for before, after, at in _rounds(chains, self.lanes.dt is None):
             self.pool.step(np.array(before), np.array(after), np.array(at))
-        back = -np.inf if all_ else self.options.window
-        ends = [(plant, *plant.settle(plant.now - back)) for plant in plants]
-        return [Settled(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
+
+    def trial(
+        self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
+    ) -> Float[np.ndarray, "plant told"]:
+        """What the filters of each plant (None: one that has not begun) would tell with these inputs, NaN as they were.
+
+        After a step from the newest row, or over one unit of time, in which nothing is heard.
+        """
+        slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
+        return self.pool.trial(np.array(slots), given, self._end)
 
     def told(self, slots: list[int]) -> list[list[float]]:
         """What the filters told after the rows in these slots."""

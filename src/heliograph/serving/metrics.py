@@ -34,11 +34,14 @@ class Tallies(Collector):
 def _links(watch: Watch) -> Iterable[Metric]:
     messages = CounterMetricFamily("heliograph_messages", "Messages by node and verdict.", labels=["node", "verdict"])
     lost = GaugeMetricFamily("heliograph_lost", "Gaps in a node's sequence numbers, now.", labels=["node"])
+    what = "Values beyond a node's limits, or codes, which count as not arrived."
+    dropped = CounterMetricFamily("heliograph_dropped", what, labels=["node"])
     for node, tally in watch.links().items():
         for verdict in VERDICTS:
             messages.add_metric([node, verdict], tally[verdict])
         lost.add_metric([node], tally["lost"])
-    return messages, lost
+        dropped.add_metric([node], tally["dropped"])
+    return messages, lost, dropped
 
 
 def _surprises(watch: Watch) -> Iterable[Metric]:

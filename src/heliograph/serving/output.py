@@ -26,6 +26,7 @@ class Told(BaseModel):
     claim: Claim = Field(description="What the covariance is: exact, upper, nominal, or none.")
     nis: float | None = Field(None, description="Normalised innovation squared of what was heard; null if nothing was.")
     heard: int = Field(0, description="How many numbers were heard: what nis should be on average.")
+    implausible: str = Field("", description="Why this filter alone did not use what was heard, where it did not.")
 
 
 class Estimates(BaseModel):
@@ -47,7 +48,7 @@ class Refused(BaseModel):
     node: str | None
     sequence: int | None
     time: float | str | None
-    reason: Literal["duplicate", "conflict", "late", "future", "malformed"]
+    reason: Literal["duplicate", "conflict", "late", "future", "implausible", "malformed"]
     detail: str
 
 

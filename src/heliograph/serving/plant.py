@@ -1,10 +1,15 @@
 """One plant of a fleet: the rows it holds, the verdict on each message, and its links' tallies."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import datetime
+from typing import NamedTuple
 
-from heliograph.live.event import Verdict
+import numpy as np
+
+from heliograph.live.event import Known, Verdict
 from heliograph.live.rows import HeldRow, Rows
+from heliograph.numerics.types import Float
 
 
 @dataclass
@@ -12,7 +17,7 @@ class Link:
     """What came from a node: numbers of messages by verdict, and `lost`, the gaps in its counts that nothing filled.
 
     Counts run from `first` to `newest`, which was measured at `at`. A smaller number of a later time begins anew: the
-    node was started again. A larger one of an earlier time is from before that.
+    node was started again. A larger one of an earlier time is from before that. `dropped`: single values beyond limits.
     """
 
     first: int = -1
@@ -24,13 +29,15 @@ class Link:
     conflict: int = 0
     late: int = 0
     future: int = 0
+    implausible: int = 0
+    dropped: int = 0
 
     def count(self, verdict: Verdict, sequence: int, time: float) -> None:
-        """Count one message. What is late or from the future came, whatever became of it."""
+        """Count one message. What is late, implausible or from the future came, whatever became of it."""
         setattr(self, verdict, getattr(self, verdict) + 1)
         if verdict in ("duplicate", "conflict"):
             return
-        if verdict == "future":  # its clock is wrong: it says nothing of the order
+        if verdict in ("future", "implausible"):  # its time may be wrong: it says nothing of the order
             time = self.at
         if self.newest < 0 or (sequence < self.newest and time > self.at):
             self.first, self.newest, self.at = sequence, sequence, time
@@ -47,12 +54,20 @@ class Link:
             self.lost -= self.lost > 0  # it had only been overtaken
 
 
+class Change(NamedTuple):
+    """A row that took an event, and its numbers and events before; None: it was not there."""
+
+    row: HeldRow
+    before: tuple[Float[np.ndarray, " size"], dict[tuple[int, int, float], Float[np.ndarray, " values"]]] | None
+
+
 @dataclass
 class Plant:
     """Rows held, of which those from `dirty` on have to be stepped anew.
 
     `now` is the newest arrival; `forced`: rows that became final before their time, for want of room. `origin`: the
-    moment that its times are counted from, where they are dates. `version` counts its commits.
+    moment that its times are counted from, where they are dates. `version` counts its commits. `changes` since the last
+    events became settled can be undone.
     """
 
     name: str
@@ -63,6 +78,33 @@ class Plant:
     dirty: int | None = None
     forced: int = 0
     links: dict[str, Link] = field(default_factory=dict)
+    changes: list["Change"] = field(default_factory=list)
+
+    def take(self, event: Known, slot: Callable[[], int], width: int) -> None:
+        """Hold an event that is used, in a row of a slot if it begins one; what changes is remembered."""
+        place, row = self.rows.find(event)
+        if row is None:
+            row = HeldRow(self.rows.key(event), slot(), width)
+            self.rows.insert(place, row)
+            self.changes.append(Change(row, None))
+        else:
+            self.changes.append(Change(row, (row.numbers.copy(), dict(row.events))))
+        self.rows.fill(row, event)
+        self.dirty = place if self.dirty is None else min(self.dirty, place)
+
+    def undo(self) -> list[int]:
+        """Hold what was held before the last changes; slots that are free again. What was stepped is dirty."""
+        slots = []
+        for row, before in reversed(self.changes):
+            if before is None:
+                self.rows.remove(self.rows.place(row.key))
+                slots.append(row.slot)
+            else:
+                row.numbers[:], row.events = before
+        place = min((self.rows.place(row.key) for row, _ in self.changes), default=len(self.rows.held))
+        self.dirty = place if place < len(self.rows.held) else None
+        self.changes = []
+        return slots
 
     def link(self, node: str) -> Link:
         """The tally of a node."""
@@ -79,6 +121,7 @@ class Plant:
 
     def settle(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
         """The rows that are final once this is the watermark, and the slots that are not needed any more."""
+        self.changes = []
         base, forced = self.rows.settle(watermark)
         if not base:
             return [], []

@@ -46,6 +46,16 @@ class Pool:
         row[self.state], row[self.at], row[self.numbers] = self.lanes.start, -1.0, np.nan
         row[-1] = time
 
+    def trial(self, before: np.ndarray, given: np.ndarray, last: float) -> np.ndarray:
+        """What is told a step, or a unit of time, after the rows in these slots, with these inputs and no data."""
+        lanes, table = self.lanes, self.table
+        u = np.where(np.isnan(given), table[before, self.held], given)
+        u = u if lanes.dt is None else np.insert(u, lanes.dt, 1.0, axis=1)
+        k = np.minimum(table[before, self.at.start] + 1, last)
+        nothing = np.full((len(before), lanes.received), np.nan)
+        done = lanes.step(np.concatenate([table[before, self.state], nothing, u, k[:, None]], axis=1))
+        return done[:, lanes.state.size :]
+
     def step(self, before: np.ndarray, after: np.ndarray, at: np.ndarray) -> None:
         """Step from the rows in these slots into others. `at`: the number of the step where time counts steps.
 

@@ -104,7 +104,7 @@ async def _alone(wanted: Wanted, lanes: Lanes, look: Look) -> None:
     stop = asyncio.Event()
     fleet = Fleet(lanes, wanted.options)
     kept = _kept(wanted, fleet)
-    resumed, service = kept.count() > 0, Service(fleet, kept)
+    resumed, service = kept.count() > 0, Service(fleet, kept, _say)
     try:
         with signals(stop):
             transport = Pipe() if wanted.broker is None else connected(wanted.broker)
@@ -148,7 +148,7 @@ async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:
     async def serve(number: int, stop: asyncio.Event) -> None:
         kept = Store(place, mine, f"part {number} of {parts}")  # whoever has the part tells what it had to tell
         try:
-            service = look(Service(Fleet(lanes, wanted.options), kept))
+            service = look(Service(Fleet(lanes, wanted.options), kept, _say))
             await serve_until(stop, service, connected(broker, Part(number, parts)))
         finally:
             kept.close()

@@ -2,21 +2,22 @@
 
 import gc
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from datetime import UTC, datetime, time, timedelta
+from datetime import UTC, datetime, timedelta
 from time import perf_counter
 from typing import NamedTuple
 
-from heliograph.live.event import INPUTS, Verdict
+from heliograph.live.event import Verdict
 from heliograph.numerics.check import InputError, shown
 from heliograph.serving.fleet import Fleet, Settled
 from heliograph.serving.keeping import ConflictError, Entry, Keeps, Kept
 from heliograph.serving.kept import plant_bytes, plant_from
-from heliograph.serving.message import Message, read_message, seconds
+from heliograph.serving.message import Message, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
 from heliograph.serving.telling import Teller, line
+from heliograph.serving.using import Using
 
 ROWS = 200_000  # that are held in memory before plants which were not heard for long leave it for the store
 WHY: dict[Verdict, str] = {
@@ -24,6 +25,7 @@ WHY: dict[Verdict, str] = {
     "conflict": "held already with other values, which stay",
     "late": "before what is final",
     "future": "later than it can be: a clock is wrong",
+    "implausible": "no filter could use it",
 }
 
 
@@ -44,14 +46,15 @@ class Service:
     """A network's filters, for any number of plants, fed with messages in whatever order they come.
 
     It knows no transport: `take` uses a batch and gives what is to be told of it, after the commit. One call at a time.
-    `malformed` and `known` count messages that could not be read, and duplicates and late ones.
+    `malformed` and `known` count messages that could not be read, and duplicates and late ones. `say` is called once,
+    with a line, when the first message is refused as implausible.
     """
 
-    def __init__(self, fleet: Fleet, store: Keeps):
-        self.fleet, self.store = fleet, store
+    def __init__(self, fleet: Fleet, store: Keeps, say: Callable[[str], None] | None = None):
+        self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
-        self._teller = Teller(fleet.lanes)
+        self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
         self._told: int | None = None  # up to where, since the last commit
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
@@ -97,14 +100,11 @@ class Service:
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
         """Use messages and commit; what is to be told, and how long the commit took."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
-        for message, payload in zip(messages, payloads, strict=True):
-            try:
-                if isinstance(message, str):
-                    raise InputError(message)
-                plant, verdict = self._use(message)
-            except InputError as error:
+        for message, payload, outcome in zip(messages, payloads, self._using.use(messages), strict=True):
+            plant, verdict, why, notes = outcome
+            if isinstance(message, str) or verdict is None:
                 malformed += 1
-                entries.append(_refused(None, {}, "malformed", f"{error}: {shown(payload)}"))
+                entries.append(_refused(None, {}, "malformed", f"{why}: {shown(payload)}"))
                 continue
             if plant is not None:
                 touched[plant.name] = plant
@@ -112,7 +112,10 @@ class Service:
                 used.add(message.plant)
             else:
                 known += verdict in ("duplicate", "late")
-                entries.append(_refusal(message, verdict))
+                entries.append(_refusal(message, verdict, why))
+            entries += [_refusal(message, "implausible", note) for note in notes]
+            if verdict == "implausible" or notes:
+                self._warn(message, why or notes[0])
         settled = self.fleet.settle(touched.values())
         entries += self._finals(settled)
         provisional = self._provisional([each for each in settled if each.plant.name in used])
@@ -123,6 +126,14 @@ class Service:
         self.malformed += malformed
         self.known += known
         return outputs + provisional, committed
+
+    def _warn(self, message: Message, why: str) -> None:
+        """Say once that something is implausible."""
+        if self._say is not None:
+            plant = f"of plant {message.plant!r} " if message.plant else ""
+            what = f"message {message.sequence} of {message.node!r} {plant}is implausible"
+            self._say(f"warning: {what}: {why}; such messages are told as refused and counted, and not said again")
+            self._say = None
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Keep what changed. If that fails, what is in memory of it is forgotten: the store is right."""
@@ -148,32 +159,6 @@ class Service:
         for name, kept in self.store.load([name for name in names if name not in self.plants]).items():
             plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
             plant.version = kept.version
-
-    def _use(self, message: Message) -> tuple[Plant | None, Verdict]:
-        """Give a message to its plant, which is None if it would have begun with one that is refused."""
-        plant = self.plants.get(message.plant)
-        origin = self._origin(message) if plant is None else plant.origin
-        at = seconds(message.time, origin)
-        now = at if plant is None else plant.now
-        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin)
-        event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
-        given = message.inputs
-        inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
-        if plant is None:
-            if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
-                return None, "future"
-            plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
-        if inputs is not None:
-            self.fleet.take(plant, inputs)
-        verdict = self.fleet.take(plant, event)
-        plant.link(message.node).count(verdict, message.sequence, at)
-        return plant, verdict
-
-    def _origin(self, message: Message) -> datetime | None:
-        """The midnight before a plant's first message, in UTC, where its times are dates."""
-        if not isinstance(message.time, datetime) or self.fleet.lanes.dt is None:
-            return None
-        return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)
 
     def _finals(self, settled: Iterable[Settled]) -> list[Entry]:
         """What is told once: the rows that are final now and in which something was heard."""
@@ -217,10 +202,10 @@ def _read(payload: bytes) -> Message | str:
         return str(error)
 
 
-def _refusal(message: Message, why: Verdict) -> Entry:
+def _refusal(message: Message, verdict: Verdict, why: str) -> Entry:
     moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
     parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-    return _refused(message.plant, parts, why, WHY[why])
+    return _refused(message.plant, parts, verdict, why or WHY[verdict])
 
 
 def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:

@@ -2,6 +2,7 @@
 
 from pydantic_core import to_json
 
+from heliograph.filters.plausibility import in_words
 from heliograph.serving.lanes import Lanes, Place
 
 
@@ -22,12 +23,15 @@ class Teller:
         return line({"kind": kind, "plant": plant, "time": time, "estimates": found})
 
     def _filter(self, place: Place, told: list[float]) -> dict[str, object]:
-        n, mean, begin, surprise = self._n, place.mean, place.covariance, place.surprise
+        n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
         covariance = None if place.claim == "none" else [told[i : i + n] for i in range(begin, begin + n * n, n)]
         found: dict[str, object] = {"mean": told[mean : mean + n], "covariance": covariance, "claim": place.claim}
-        if surprise is not None:
-            found["nis"], found["heard"] = told[surprise], int(told[surprise + 1])
-        return found
+        if judged is None:
+            return found
+        if told[judged.reason] > 0:
+            why = in_words(told[judged.reason], told[judged.distance])
+            return found | {"nis": None, "heard": 0, "implausible": why}
+        return found | {"nis": told[judged.distance], "heard": int(told[judged.arrived])}
 
 
 def line(parts: dict[str, object]) -> bytes:

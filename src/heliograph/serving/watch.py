@@ -23,14 +23,16 @@ LAGS = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0, 300.0, 1000.0, 3600.0
 
 
 class Link(Protocol):
-    """Numbers of messages of a node: by verdict, and `lost`, the gaps in its counts."""
+    """Numbers of messages of a node: by verdict; `lost`: gaps in its counts; `dropped`: values beyond limits."""
 
     lost: int
+    dropped: int
     used: int
     duplicate: int
     conflict: int
     late: int
     future: int
+    implausible: int
 
 
 class Plant(Protocol):
@@ -141,7 +143,7 @@ class Watch:
             yield from service.plants.items()
 
     def links(self) -> dict[str, dict[str, int]]:
-        """By node, over all plants: numbers of messages by verdict, and lost ones."""
+        """By node, over all plants: numbers of messages by verdict, lost ones, and values beyond limits."""
         return _added(plant for _, plant in self.plants())
 
     def view(self, plant: str | None, since: int = 0) -> dict[str, Any]:
@@ -176,6 +178,10 @@ class Watch:
                 yield f"{node}: {link['late']} came too late to be used; a longer --window would hold what they change"
             if link["future"]:
                 yield f"{node}: {link['future']} are later than they can be; its clock is wrong"
+            if link["implausible"]:
+                yield f"{node}: {link['implausible']} are implausible and were refused; their lines say why"
+            if link["dropped"]:
+                yield f"{node}: {link['dropped']} values are beyond its limits, or codes, and count as not arrived"
             if link["conflict"]:
                 yield f"{node}: {link['conflict']} came again with other values; the first stayed"
 
@@ -233,7 +239,7 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
     found: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():
-            tally = found.setdefault(node, dict.fromkeys((*VERDICTS, "lost"), 0))
+            tally = found.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped"), 0))
             for name in tally:
                 tally[name] += getattr(link, name)
     return found

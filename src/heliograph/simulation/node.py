@@ -7,11 +7,13 @@ import equinox as eqx
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
+from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, shown, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 
 
@@ -21,19 +23,33 @@ class Node(Module):
 
     With a `fed_back_filter` among them the sensor sends what that filter does not expect.
 
+    `limits`: what an honest received number is within, (low, high) for all of them or a pair for each, None where there
+    is no limit. `invalid`: a code, or several, by which the sensor says that it has no value (-999). Recorded and live
+    data beyond that count as not arrived, are counted and named. Claims stand as far as no honest number is among them.
+
     Raises:
-        ValueError: a sensor and a channel that do not fit, a filter that hears beside one that is fed back.
+        ValueError: a sensor and a channel that do not fit, a filter that hears beside one that is fed back, limits that
+            are none.
     """
 
     sensor: AnySensor
     channel: Channel
     filters: dict[str, AbstractFilter]
+    limits: Limits | None
 
-    def __init__(self, sensor: AnySensor, channel: Channel, filters: Mapping[str, AbstractFilter]):
+    def __init__(
+        self,
+        sensor: AnySensor,
+        channel: Channel,
+        filters: Mapping[str, AbstractFilter],
+        limits: LimitsLike = None,
+        invalid: ArrayLike = (),
+    ):
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_filters(self.filters, self.received)
+        self.limits = limits_of(self.received, limits, invalid)
         hearing = [name for name, item in self.filters.items() if item.received]
         if self.told_by is not None and hearing != [self.told_by]:
             raise fail("node whose sensor hears back", f"no filter that hears beside {self.told_by!r}", hearing)
@@ -54,6 +70,11 @@ class Node(Module):
         return tuple(first(self.sensor).outputs)
 
     @property
+    def received_names(self) -> tuple[str, ...]:
+        """Names of what reaches the filters."""
+        return received_names(self.outputs, self.received)
+
+    @property
     def complete(self) -> bool:
         """Whether everything arrives, always."""
         return not first(self.channel).erases
@@ -71,6 +92,15 @@ class Listener(Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
     complete: bool = eqx.field(static=True)
 
+    @property
+    def received_names(self) -> tuple[str, ...]:
+        """Names of what reaches the filters."""
+        return received_names(self.outputs, self.received)
+
+    @property
+    def limits(self) -> None:
+        """None: a network of relays has no limits of its own."""
+
 
 @readable
 class Common(Module):
@@ -78,6 +108,11 @@ class Common(Module):
 
     sensor: AnySensor
     channel: Channel
+
+
+def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
+    """Names of what is received: the sensor's outputs where these are as many, else z0, z1, ..."""
+    return outputs if len(outputs) == received else tuple(f"z{i}" for i in range(received))
 
 
 def check_received(name: str, item: AbstractFilter, received: int) -> None:

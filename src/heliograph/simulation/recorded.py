@@ -1,5 +1,6 @@
 """Every filter of a network over recorded measurements."""
 
+import warnings
 from collections.abc import Mapping
 
 import jax
@@ -12,13 +13,18 @@ from heliograph.numerics.check import check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
+from heliograph.numerics.types import Float
 from heliograph.simulation.given import inputs_of, measurement_of
+from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.uplinks import Drawn, SentReports
 from heliograph.smoothing.modes import AbstractSmoothing
+
+Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
 
 
 def run(
@@ -39,6 +45,9 @@ def run(
     (steps, received), NaN where it never arrived; `SentReports` where delays differ. They may be left out where
     nothing happens to them by chance.
 
+    Values beyond a node's limits, and what is implausible for all filters of a node (`heliograph.filters
+    .plausibility`), count as not arrived; each is warned of, with its rows from 1.
+
     Raises:
         ValueError: a node without measurements or the reverse, shapes that do not fit, times that go backwards, a
             filter or fusion that cannot be smoothed.
@@ -53,27 +62,73 @@ def run(
     network.check_horizon(steps)
     u = inputs_of(network, inputs, steps)
     clock = np.arange(steps, dtype=np.float64) if time is None else check_times("time", time, steps)
-    grouped = tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
+    for name in network.names:
+        z[name] = _within(name, network.nodes[name], z[name])
     part = None if smooth is None else smoothed_part(network, smooth, steps)
-    filters = AllFilters(network, part and part.kinds)
+    filters = AllFilters(network, part and part.kinds, judges=True)
     with jax.enable_x64(True):
         given = {} if reports is None else table("reports", reports, "reports by fusion")
         arrivals = {
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
         }
-        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u, arrivals))
+        found = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
     return found_record(network, part, found, clock)
+
+
+def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
+    """Measurements without what is beyond their node's limits, which is warned of."""
+    if node.limits is None or not (outside := node.limits.outside(z)).any():
+        return z
+    row, count = int(np.argmax(outside.any(axis=1))), int(outside.sum())
+    said = node.limits.why(z[row], node.received_names)
+    warnings.warn(
+        f"node {name!r}: {count} of {z.size} values count as not arrived; row {row + 1}: {said}", stacklevel=3
+    )
+    return np.where(outside, np.nan, z)
+
+
+def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree:
+    """What the filters find without what is implausible, which is warned of.
+
+    Where some is, the recording is filtered step by step without it to find all rows; then, without those that all
+    filters of a node refuse, once again as a recording that never had them.
+    """
+
+    def grouped() -> tuple[np.ndarray, ...]:
+        return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
+
+    found = to_numpy(_run_filters(*rest, grouped(), False))
+    if not any_implausible(found):
+        said = doubts(network, found, {})
+    else:
+        found = to_numpy(_run_filters(*rest, grouped(), True))
+        refused = refused_rows(network, found)
+        said = doubts(network, found, refused)
+        for name, rows in refused.items():
+            z[name] = z[name].copy()
+            z[name][list(rows)] = np.nan
+        again = to_numpy(_run_filters(*rest, grouped(), False))
+        found = to_numpy(_run_filters(*rest, grouped(), True)) if any_implausible(again) else again
+    for line in said:
+        warnings.warn(line, stacklevel=3)
+    return {name: part for name, part in found.items() if not name.startswith("judged")}
 
 
 @quickly_compiled
 def _run_filters(
-    filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
-) -> PyTree:
+    filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
+    without: bool,
+) -> PyTree:  # fmt: skip
+    """A scan over all rows; `without` what is implausible."""
+
     def body(states: PyTree, row: tuple[PyTree, ...]) -> tuple[PyTree, PyTree]:
         k, u_k, z_k, drawn = row
+        if without:
+            return plausible_step(filters, states, z_k, u_k, k, drawn)
         return filters.step(states, z_k, u_k, k, drawn)
 
     rows = jnp.arange(len(u)), u, z, arrivals
     found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
-    return found if later is None else one_run(later.both, found)
+    judged = {name: found.pop(name) for name in ("judged", "judged_centrally")}
+    return (found if later is None else one_run(later.both, found)) | judged

@@ -9,27 +9,48 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
+from heliograph.filters.plausibility import Judgement, Reason
 from heliograph.filters.retained import AbstractRetained
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.module import Module
 
 
 class Told(NamedTuple):
-    """What a filter tells of a step: its estimate, and what it retains of the step if that is asked for."""
+    """What a filter tells of a step: its estimate, and what it retains of the step or says of the data, if asked."""
 
     estimate: Estimate
-    retained: AbstractRetained | None
+    retained: AbstractRetained | None = None
+    judgement: Judgement | None = None
 
 
 def told_step(
-    item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, retains: bool
+    item: AbstractFilter,
+    state: PyTree,
+    z: jax.Array,
+    u: jax.Array,
+    k: jax.Array,
+    retains: bool,
+    judges: bool = False,
+    skip: jax.Array | None = None,
 ) -> tuple[PyTree, Told]:
-    """One step of a filter, and what is told of it."""
-    if not retains:
-        after, estimate = item.step(state, z, u, k)
-        return after, Told(estimate, None)
-    after, retained = item.step_retained(state, z, u, k)
-    return after, Told(item.after_step(after, k), retained)
+    """One step of a filter, and what is told of it.
+
+    `skip`: the reason not to use z, where there is one: then nothing of it arrived, and where the prediction itself is
+    no number the state before it stays.
+    """
+    z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
+    if retains:
+        judgement = item.step_judged(state, z, u, k)[2] if judges else None
+        after, retained = item.step_retained(state, z, u, k)
+        return after, Told(item.after_step(after, k), retained, judgement)
+    if judges:
+        after, estimate, judgement = item.step_judged(state, z, u, k)
+    else:
+        (after, estimate), judgement = item.step(state, z, u, k), None
+    if skip is not None:
+        stays, known = skip == Reason.PREDICTION, (state, item.estimate(state))
+        after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
+    return after, Told(estimate, judgement=judgement)
 
 
 class Alike(Module):
@@ -44,19 +65,26 @@ class Alike(Module):
     count: int = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
     retains: bool = eqx.field(static=True, default=False)
+    judges: bool = eqx.field(static=True, default=False)
 
     def init(self) -> PyTree:
         """States before the first step, (filter and node, ...)."""
         return over_all(started, self.count * self.nodes)(self.filters)
 
-    def step(self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, Told]:
-        """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...)."""
+    def step(
+        self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
+    ) -> tuple[PyTree, Told]:
+        """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...).
 
-        def one(item: AbstractFilter, state: PyTree, z: jax.Array) -> tuple[PyTree, Told]:
-            return told_step(item, state, z, u, k, self.retains)
+        `skip` (filter, node): reasons not to use them.
+        """
 
-        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
-        after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)))
+        def one(item: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None) -> tuple[PyTree, Told]:
+            return told_step(item, state, z, u, k, self.retains, self.judges, skip)
+
+        reasons = None if skip is None else skip.reshape(-1)
+        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0)))
+        after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
         return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
 
     def matrices(

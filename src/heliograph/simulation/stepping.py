@@ -52,10 +52,14 @@ class AllFilters(Module):
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
     n: int = eqx.field(static=True)
     retains: bool = eqx.field(static=True)
+    judges: bool = eqx.field(static=True)
 
-    def __init__(self, network: Network, retaining: Collection[int] | None = None):
-        """`retaining`: which kinds are to be smoothed, and the central filters with them; None if nothing is."""
-        self.retains = retaining is not None
+    def __init__(self, network: Network, retaining: Collection[int] | None = None, judges: bool = False):
+        """`retaining`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
+
+        `judges`: filters say what is implausible, and leave it out where they are told so; none of them retains.
+        """
+        self.retains, self.judges = retaining is not None, judges
         self.alike = tuple(
             Alike(
                 stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
@@ -63,6 +67,7 @@ class AllFilters(Module):
                 len(names),
                 len(network.groups[g]),
                 retaining is not None and kind in retaining,
+                judges,
             )
             for kind, (g, names) in enumerate(network.kinds)
         )
@@ -112,20 +117,27 @@ class AllFilters(Module):
         u: jax.Array,
         k: jax.Array,
         drawn: Mapping[str, Drawn] | None = None,
+        skip: tuple[Sequence[jax.Array], Mapping[str, jax.Array]] | None = None,
     ) -> tuple[PyTree, dict[str, PyTree]]:
         """One step of all filters from the measurements of each group, and from what happens to reports, by fusion.
 
         Gives "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of what has quantizers, and
         "reports" with their delays by fusion, as the nodes send them; and what is retained where that is asked for,
-        "retained" by kind and "retained_centrally" by name.
+        "retained" by kind and "retained_centrally" by name; "judged" and "judged_centrally" if filters judge, and
+        `skip` has the reasons of the same form not to use data.
         """
         own, central, sent, known, reporting = states
-        results = [item.step(state, z[item.group], u, k) for item, state in zip(self.alike, own, strict=True)]
+        reasons = [None] * len(own) if skip is None else skip[0]
+        results = [
+            item.step(state, z[item.group], u, k, why)
+            for item, state, why in zip(self.alike, own, reasons, strict=True)
+        ]
         estimates = tuple(one.estimate for _, one in results)
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
         heard = {
-            name: told_step(item, central[name], joined, u, k, self.retains) for name, item in self.central.items()
+            name: told_step(item, central[name], joined, u, k, self.retains, self.judges, skip and skip[1][name])
+            for name, item in self.central.items()
         }
         fused = {name: one.estimate for name, (_, one) in heard.items()}
         uplinks: dict[str, PyTree] = {}
@@ -151,6 +163,9 @@ class AllFilters(Module):
         if self.retains:
             result["retained"] = tuple(one.retained for _, one in results)
             result["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
+        if self.judges:
+            result["judged"] = tuple(one.judgement for _, one in results)
+            result["judged_centrally"] = {name: one.judgement for name, (_, one) in heard.items()}
         return following, result
 
     def _centred(

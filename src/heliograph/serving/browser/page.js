@@ -63,7 +63,8 @@ function keys(view) {
   const sum = (name, of) => Object.values(of).reduce((total, link) => total + link[name], 0);
   const all = view.all;
   const rows = [["plants", view.count], ["messages used", sum("used", all)], ["lost", sum("lost", all)],
-    ["too late", sum("late", all)], ["copies", sum("duplicate", all)], ["not readable", view.malformed]];
+    ["too late", sum("late", all)], ["copies", sum("duplicate", all)], ["implausible", sum("implausible", all)],
+    ["not readable", view.malformed]];
   at("keys").replaceChildren(...rows.map(([name, value]) => {
     const key = made("div", undefined, "key");
     key.append(made("dt", name), made("dd", value.toLocaleString("en")));

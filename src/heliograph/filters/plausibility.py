@@ -1,0 +1,202 @@
+"""Whether what came may be used: an innovation's squared distance, and which values are implausible, and why.
+
+What is implausible is never committed: a live estimator, a timeline and a recording refuse it and say so.
+"""
+
+from enum import IntEnum
+from functools import reduce
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import NEGATIVE_TOLERANCE, add, own, rounding, squared_distance, squared_distances
+from heliograph.numerics.types import Array, Float, PyTree
+
+LIMIT = 1e6
+"""Deviations of the innovation beyond which an update loses its digits.
+
+An update moves the mean by up to d of its deviations, since K S K' <= P. So the mean is rounded to eps d of them, and
+what is a difference of second moments there (E[x x'] - m m', the second differences of a quadratic function) to eps d^2
+of the variance. At d = 1e6 these are 2e-10 and 2e-4 in double precision; in single precision 0.1, and nothing is left
+of second moments. Any bound far below would be a statistical gate, which locks a filter out after an outage.
+"""
+FEW = 36  # numbers of a state of six and its covariance
+
+
+class Reason(IntEnum):
+    """Why something is implausible, in the order of precedence."""
+
+    PLAUSIBLE = 0
+    FAR = 1
+    EXCLUDED = 2
+    UNSOUND = 3
+    PREDICTION = 4
+
+
+WORDS = {
+    Reason.FAR: f"more than {LIMIT:.0e} deviations from what was expected".replace("e+06", "e6"),
+    Reason.EXCLUDED: "a value that the model excludes",
+    Reason.UNSOUND: "with it the estimate is no number, or its covariance is none",
+    Reason.PREDICTION: "the prediction to its time is no finite number",
+}
+INPUT = "with it the mean loses its digits to rounding"
+
+
+class Judgement(NamedTuple):
+    """What is said of one step of a filter.
+
+    distance: e' S^-1 e of the components that arrived, NaN if none did or no covariance is known; arrived: how
+    many did; reason: a `Reason`; input: 1 where the prediction took the mean to where its deviations are below its
+    rounding, NaN where no covariance is claimed. All are numbers, so that a judgement is a row of an array.
+    """
+
+    distance: Float[Array, ""]
+    arrived: Float[Array, ""]
+    reason: Float[Array, ""]
+    input: Float[Array, ""]
+
+    @property
+    def implausible(self) -> Array:
+        """Whether the measurement may not be used."""
+        return self.reason > 0
+
+
+def in_words(reason: float, distance: float) -> str:
+    """Why something is implausible."""
+    far = Reason(int(reason)) == Reason.FAR and np.isfinite(distance)
+    return WORDS[Reason(int(reason))] + (f" ({np.sqrt(distance):.3g} of them)" if far else "")
+
+
+def why_values(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+    """Why a measurement is implausible, where some filter finds it so and none can judge it and does not.
+
+    One filter that is lost, and finds all implausible, does not keep what came from the others: it alone leaves it out.
+    A filter that claims no covariance judges nothing but its own state.
+    """
+    distance, _, reason, _ = votes.T
+    bad = reason > 0
+    if not bad.any() or (~bad & ~np.isnan(distance)).any():
+        return None
+    worst = int(np.argmax(bad))
+    return in_words(reason[worst], distance[worst])
+
+
+def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
+    """Why inputs are implausible, by the same rule."""
+    bad = (votes[:, 3] > 0) | (votes[:, 2] == Reason.PREDICTION)
+    if not bad.any() or (~bad & ~np.isnan(votes[:, 3])).any():
+        return None
+    return INPUT
+
+
+def innovation_distance(heard: Innovation) -> tuple[jax.Array, jax.Array]:
+    """e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did."""
+    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
+    present = ~jnp.isnan(value)
+    total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
+    distance = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
+    return distance, jnp.sum(present).astype(distance.dtype)
+
+
+@runs_last
+def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
+    return squared_distance(a, x)
+
+
+def judge(
+    claim: Claim, states: tuple[PyTree, PyTree, PyTree], told: tuple[Estimate, Estimate, Estimate],
+    heard: Innovation, z: Float[Array, " m"], of_atoms: bool,
+) -> Judgement:  # fmt: skip
+    """Judge a step: states and estimates before it, after its prediction and after its correction, and the innovation.
+
+    A value is far where the components that are larger than was expected are more than LIMIT deviations off: one that
+    is smaller takes the mean to where it has more digits, so that an estimate which is far off comes back. It is
+    excluded where nothing of it is free and the model says another, or none of the atoms that a filter is made of
+    leaves it. A state is unsound where the one before it was not:
+    a mean or variance that is no finite number, a negative variance, an infinite number in it.
+    """
+    (before, prior, after), value = told, jnp.asarray(heard.value)
+    z, covariance = jnp.asarray(z), jnp.asarray(heard.covariance)
+    z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter that does not listen
+    present, expected = ~jnp.isnan(value), z - value
+    size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
+    every, certain = _squares(value, covariance, present, size)
+    distance, count = _total(every), _total(present.astype(value.dtype))
+
+    larger = present & ~(jnp.abs(z) <= jnp.abs(expected))
+    part, determined = _squares(value, covariance, larger, size) if len(value) > 1 else (every, certain)
+    free = jnp.where(larger & ~determined, part, 0.0)
+    far = _some((free > LIMIT**2) | (larger & jnp.isinf(value))) | (_total(free) > LIMIT**2)
+    excluded = _some(jnp.isinf(every) & certain) & ~_some(~certain & present)
+    if of_atoms:
+        excluded |= (jnp.asarray(heard.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
+
+    unsound = (_sound(prior, claim, before) & ~_sound(after, claim, prior)) | _overflows(states[1], states[2])
+    predicted = (_finite(before, claim) & ~_finite(prior, claim)) | _overflows(states[0], states[1])
+    reason = jnp.where(far, Reason.FAR, jnp.where(excluded, Reason.EXCLUDED, Reason.PLAUSIBLE))
+    reason = jnp.where(unsound & (count > 0) & ~far, Reason.UNSOUND, reason)
+    reason = jnp.where(predicted, Reason.PREDICTION, reason)
+    digits = _some(_rounded_away(prior) & ~_rounded_away(before)).astype(value.dtype)
+    known = jnp.nan if claim == "none" else digits
+    return Judgement(jnp.where(count > 0, distance, jnp.nan), count, reason.astype(value.dtype), jnp.asarray(known))
+
+
+def _some(which: jax.Array) -> jax.Array:
+    """Whether some are true; of few without a loop, which would cost more than all of them."""
+    flat = which.reshape(-1)
+    if not 0 < len(flat) <= FEW:
+        return jnp.any(flat)
+    return reduce(jnp.logical_or, [jax.lax.index_in_dim(flat, i, keepdims=False) for i in range(len(flat))])
+
+
+def _total(values: jax.Array) -> jax.Array:
+    """Their sum, likewise."""
+    if not 0 < len(values) <= FEW:
+        return jnp.sum(values)
+    return add([jax.lax.index_in_dim(values, i, keepdims=False) for i in range(len(values))])
+
+
+def _squares(value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Squared distances of the components in use, one after another, and which of these the others determine."""
+    if not len(value):
+        return jnp.zeros(0), jnp.zeros(0, dtype=bool)
+    known = jnp.where(used[:, None] & used, covariance, jnp.eye(len(value), dtype=value.dtype))
+    squares, determined = squared_distances(known, jnp.where(used, value, 0.0), jnp.where(used, size, 0.0))
+    return jnp.where(used, squares, 0.0), used & determined
+
+
+def _finite(told: Estimate, claim: Claim) -> jax.Array:
+    finite = ~_some(~jnp.isfinite(jnp.asarray(told.mean)))
+    return finite if claim == "none" else finite & ~_some(~jnp.isfinite(jnp.asarray(told.covariance)))
+
+
+def _sound(told: Estimate, claim: Claim, before: Estimate) -> jax.Array:
+    """Finite, and no variance below zero by more than the rounding of what was there before."""
+    if claim == "none":
+        return _finite(told, claim)
+    left, whole = own(jnp.asarray(told.covariance)), own(jnp.asarray(before.covariance))
+    rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
+    return _finite(told, claim) & ~_some(left < -rounded)
+
+
+def _overflows(before: PyTree, after: PyTree) -> jax.Array:
+    """Whether some number of a state became infinite."""
+    pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
+    each = [_some(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
+    return reduce(jnp.logical_or, each, jnp.asarray(False))
+
+
+def _is_real(leaf: Array) -> bool:
+    return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
+
+
+def _rounded_away(told: Estimate) -> jax.Array:
+    """Of each state whether its deviation is there but below the rounding of its mean."""
+    mean = jnp.asarray(told.mean)
+    variance = own(jnp.asarray(told.covariance))
+    unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)
+    return (variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit)

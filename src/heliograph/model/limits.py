@@ -1,0 +1,76 @@
+"""What no honest sensor says: numbers outside its range, and the codes by which it says that it failed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from heliograph.numerics.check import fail, shown
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import ArrayLike, Bool, Float
+
+LimitsLike = ArrayLike | Sequence[Sequence[float | None]] | None
+
+
+def limits_of(received: int, limits: LimitsLike, invalid: ArrayLike) -> "Limits | None":
+    """Limits of so many received numbers; None where there are none."""
+    return None if limits is None and np.size(invalid) == 0 else Limits(received, limits, invalid)
+
+
+class Limits(Module):
+    """Which received numbers count as not arrived: those below `low` or above `high`, and those equal to a code.
+
+    Shapes: low, high (m,), -inf and inf where there is no limit; invalid (codes,).
+    """
+
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+    invalid: Float[np.ndarray, " codes"]
+
+    def __init__(self, received: int, limits: LimitsLike = None, invalid: ArrayLike = ()):
+        pairs = _pairs(limits, received)
+        self.low, self.high = pairs[:, 0], pairs[:, 1]
+        codes = _numbers("invalid values", invalid)
+        if codes.ndim > 1 or not np.all(np.isfinite(codes)):
+            raise fail("invalid values", "a finite number or several", shown(invalid))
+        self.invalid = np.atleast_1d(codes)
+
+    def outside(self, z: Float[np.ndarray, "... m"]) -> Bool[np.ndarray, "... m"]:
+        """Which numbers do not count; NaN is none of them."""
+        codes = (z[..., None] == self.invalid).any(axis=-1) if len(self.invalid) else False
+        return np.asarray((z < self.low) | (z > self.high) | codes)
+
+    def why(self, z: Float[np.ndarray, " m"], names: Sequence[str]) -> str:
+        """What of a measurement does not count, in words; "" where all does."""
+        said = []
+        for i in np.flatnonzero(self.outside(z)).tolist():
+            code = np.any(z[i] == self.invalid)
+            said.append(
+                f"{names[i]} {z[i]:g} " + ("is a code" if code else f"is outside {self.low[i]:g} to {self.high[i]:g}")
+            )
+        return ", ".join(said)
+
+
+def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
+    everything = [-np.inf, np.inf]
+    if limits is None:
+        return np.tile(everything, (received, 1))
+    expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
+    found = np.asarray(limits, dtype=object)
+    if found.shape not in ((2,), (received, 2)):
+        raise fail("limits", expected, shown(limits))
+    rows = np.tile(found, (received, 1)) if found.ndim == 1 else found
+    pairs = [[end if one is None else one for one, end in zip(row, everything, strict=True)] for row in rows]
+    result = _numbers("limits", pairs, expected)
+    if np.any(~(result[:, 0] < result[:, 1])):
+        raise fail("limits", "a low end below the high one", shown(limits))
+    return result
+
+
+def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
+    try:
+        found = np.asarray(value)
+        if found.size and found.dtype.kind not in "fiu":
+            raise ValueError
+    except ValueError:
+        raise fail(name, expected, shown(value)) from None
+    return found.astype(np.float64)

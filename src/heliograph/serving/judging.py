@@ -1,0 +1,80 @@
+"""Which events of a batch are implausible: those that no filter of their node could use."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.filters.plausibility import Judgement, why_inputs, why_values
+from heliograph.live.event import Known
+from heliograph.live.rows import HeldRow
+from heliograph.numerics.types import Float
+from heliograph.serving.fleet import Fleet
+from heliograph.serving.lanes import Place
+from heliograph.serving.plant import Plant
+from heliograph.simulation.network import FUSED
+
+FLAGS = [Judgement._fields.index(name) for name in ("reason", "input")]
+
+
+class Candidate(NamedTuple):
+    """An event that was used, of the message with this number, and its row."""
+
+    message: int
+    plant: Plant
+    event: Known
+    row: HeldRow
+
+
+class Judges:
+    """Reads the filters' judgements of the rows that were just stepped."""
+
+    def __init__(self, fleet: Fleet):
+        self.fleet, places = fleet, fleet.lanes.places
+        central = _columns([place for place in places if place.node == FUSED])
+        self._columns = {}
+        for place, name in enumerate(fleet.network.names):
+            own = _columns([one for one in places if one.node == name and _listens(fleet, one)])
+            self._columns[place] = own if len(own) else central
+        self._every = _columns(places)
+
+    def implausible_inputs(
+        self, plants: Sequence[Plant | None], given: Float[np.ndarray, "plant given"]
+    ) -> list[str | None]:
+        """Why inputs are implausible, by the prediction over one step or one unit of time that they lead to."""
+        if not plants:
+            return []
+        told = self.fleet.trial(plants, given)
+        return [why_inputs(row[self._every]) for row in told]
+
+    def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
+        """Why each of these is implausible, by its place among them, those that are.
+
+        Of a plant with inputs among these the first alone: what comes after it was judged with it.
+        """
+        if not taken:
+            return {}
+        pool = self.fleet.pool
+        told = pool.table[[one.row.slot for one in taken], pool.told]
+        flagged = (told[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
+        found, spoilt = dict[int, str](), dict[str, int]()
+        for i in np.flatnonzero(flagged).tolist():
+            one = taken[i]
+            if one.event.place >= 0:
+                why = why_values(told[i][self._columns[one.event.place]])
+            elif why := why_inputs(told[i][self._every]):
+                first = spoilt.setdefault(one.plant.name, i)
+                spoilt[one.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
+            if why:
+                found[i] = why
+        return {i: why for i, why in found.items() if spoilt.get(taken[i].plant.name, i) == i}
+
+
+def _columns(places: Sequence[Place]) -> np.ndarray:
+    """Where the judgements of these filters stand, (filter, part)."""
+    found = [list(place.judgement) for place in places if place.judgement is not None]
+    return np.array(found, dtype=int).reshape(-1, len(Judgement._fields))
+
+
+def _listens(fleet: Fleet, place: Place) -> bool:
+    return bool(fleet.network.nodes[place.node].filters[place.filter].received)

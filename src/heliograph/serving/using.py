@@ -1,0 +1,158 @@
+"""The messages of a batch, used without what is implausible: its plants are put back, and take the rest again."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime, time
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.live.event import INPUTS, Known, Verdict
+from heliograph.numerics.check import InputError
+from heliograph.serving.fleet import Fleet
+from heliograph.serving.judging import Candidate, Judges
+from heliograph.serving.message import Message, seconds
+from heliograph.serving.plant import Link, Plant
+
+
+class Outcome(NamedTuple):
+    """What became of a message: its plant, None if it began none; a verdict, None if it could not be read; and why.
+
+    `notes`: what of a message that was used was not.
+    """
+
+    plant: Plant | None
+    verdict: Verdict | None
+    why: str = ""
+    notes: tuple[str, ...] = ()
+
+
+class Before(NamedTuple):
+    """A plant before a batch: whether it was there, its time and its tallies."""
+
+    known: bool
+    now: float
+    links: dict[str, Link]
+
+
+class Using:
+    """Gives messages to their plants. `plants` are those in memory, by name."""
+
+    def __init__(self, fleet: Fleet, plants: OrderedDict[str, Plant]):
+        self.fleet, self.plants, self._judges = fleet, plants, Judges(fleet)
+        network = fleet.network
+        self._limits = {name: node.limits for name, node in network.nodes.items() if node.limits is not None}
+        self._names = {name: network.nodes[name].received_names for name in self._limits}
+        self._refused: dict[tuple[int, bool], str] = {}  # why, by the number of a message and whether it is its inputs
+        self._before: dict[str, Before] = {}
+        self._taken: list[Candidate] = []
+
+    def use(self, messages: Sequence[Message | str]) -> list[Outcome]:
+        """What becomes of each message; those that are used are stepped.
+
+        So the plants are as if what is refused as implausible had never come.
+        """
+        self._refused = self._implausible_inputs(messages)
+        outcomes: dict[int, Outcome] = {}
+        left = list(range(len(messages)))
+        while left:
+            self._before, self._taken = {}, []
+            for i in left:
+                outcomes[i] = self._outcome(i, messages[i])
+            self.fleet.step(list({one.plant.name: one.plant for one in self._taken}.values()))
+            found = self._judges.implausible(self._taken)
+            spoilt = set()
+            for i, why in found.items():
+                number, plant, event, _ = self._taken[i]
+                self._refused[number, event.place < 0] = why
+                spoilt.add(plant.name)
+            for name in spoilt:
+                self._undo(name)
+            left = [i for i in left if isinstance(one := messages[i], Message) and one.plant in spoilt]
+        return [outcomes[i] for i in range(len(messages))]
+
+    def _implausible_inputs(self, messages: Sequence[Message | str]) -> dict[tuple[int, bool], str]:
+        """The inputs that lead to no prediction, from what is known before the batch."""
+        given = [(i, one, one.values if one.node == INPUTS else one.inputs)
+                 for i, one in enumerate(messages) if isinstance(one, Message)]  # fmt: skip
+        given = [(i, one, values) for i, one, values in given if values and len(values) == self.fleet.lanes.given]
+        plants = [self.plants.get(one.plant) for _, one, _ in given]
+        numbers = np.array([values for *_, values in given], dtype=np.float64)
+        why = self._judges.implausible_inputs(plants, numbers)
+        return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}
+
+    def _outcome(self, number: int, message: Message | str) -> Outcome:
+        try:
+            if isinstance(message, str):
+                raise InputError(message)
+            return self._use(number, message)
+        except InputError as error:
+            return Outcome(None, None, str(error))
+
+    def _use(self, number: int, message: Message) -> Outcome:
+        """Give a message to its plant, which is None if it would have begun with one that is refused."""
+        plant = self.plants.get(message.plant)
+        origin = self._origin(message) if plant is None else plant.origin
+        at = seconds(message.time, origin)
+        now = at if plant is None else plant.now
+        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin)
+        event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
+        given = message.inputs
+        inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)
+        event, dropped, beyond = self._within(message.node, event)
+        why = self._refused.get((number, event.place < 0)) or (beyond if np.isnan(event.values).all() else "")
+        spoilt = self._refused.get((number, True)) if inputs is not None else None
+        if plant is None:
+            if at > arrival + self.fleet.options.ahead:  # nothing can begin with a wrong clock
+                return Outcome(None, "future")
+            if why and (inputs is None or spoilt):
+                return Outcome(None, "implausible", why)
+            plant = self.plants[message.plant] = self.fleet.begin(message.plant, at, origin)
+            self._before[plant.name] = Before(False, at, {})
+        elif plant.name not in self._before:
+            links = {name: replace(link) for name, link in plant.links.items()}
+            self._before[plant.name] = Before(True, plant.now, links)
+        notes = []
+        if inputs is not None and spoilt is None:
+            self._take(number, plant, inputs)
+        elif spoilt is not None:
+            plant.link(INPUTS).implausible += 1
+            notes.append(f"inputs {given}: {spoilt}; the rest is used")
+        verdict = "implausible" if why else self._take(number, plant, event)
+        link = plant.link(message.node)
+        link.count(verdict, message.sequence, at)
+        if verdict in ("used", "implausible"):
+            link.dropped += dropped
+        if verdict == "used" and beyond:
+            notes.append(f"{beyond}; the rest is used")
+        return Outcome(plant, verdict, why, tuple(notes))
+
+    def _take(self, number: int, plant: Plant, event: Known) -> Verdict:
+        verdict = self.fleet.take(plant, event)
+        if verdict == "used":
+            self._taken.append(Candidate(number, plant, event, plant.changes[-1].row))
+        return verdict
+
+    def _within(self, node: str, event: Known) -> tuple[Known, int, str]:
+        """An event without what is beyond its node's limits: how many values these are, and which, in words."""
+        limits = self._limits.get(node)
+        if limits is None or not (outside := limits.outside(event.values)).any():
+            return event, 0, ""
+        said = limits.why(event.values, self._names[node])
+        return event._replace(values=np.where(outside, np.nan, event.values)), int(outside.sum()), said
+
+    def _undo(self, name: str) -> None:
+        """Have a plant as it was before the batch."""
+        plant, (known, now, links) = self.plants[name], self._before[name]
+        if known:
+            self.fleet.undo(plant, now)
+            plant.links = links
+        else:
+            self.fleet.end(self.plants.pop(name))
+
+    def _origin(self, message: Message) -> datetime | None:
+        """The midnight before a plant's first message, in UTC, where its times are dates."""
+        if not isinstance(message.time, datetime) or self.fleet.lanes.dt is None:
+            return None
+        return datetime.combine(message.time.astimezone(UTC).date(), time(), UTC)

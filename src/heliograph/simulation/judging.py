@@ -1,0 +1,136 @@
+"""Steps of all filters without what they find implausible, and what is said of it over a recording."""
+
+from collections.abc import Mapping, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
+from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.stepping import AllFilters
+from heliograph.simulation.uplinks import Drawn
+
+Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and what is found
+
+
+def implausible(found: Mapping[str, PyTree]) -> jax.Array:
+    """Whether some filter finds what it heard implausible."""
+    each = [jnp.any(one.implausible) for one in (*found["judged"], *found["judged_centrally"].values())]
+    return jnp.any(jnp.stack(each)) if each else jnp.asarray(False)
+
+
+def any_implausible(found: Mapping[str, PyTree]) -> bool:
+    """The same of what was found before."""
+    return any((one.reason > 0).any() for one in (*found["judged"], *found["judged_centrally"].values()))
+
+
+def reasons(found: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+    """Why each filter should not use what it heard, by kind and by name."""
+    return [one.reason for one in found["judged"]], {n: one.reason for n, one in found["judged_centrally"].items()}
+
+
+def step_without(
+    filters: AllFilters,
+    first: Stepped,
+    states: PyTree,
+    z: Sequence[jax.Array],
+    u: jax.Array,
+    k: jax.Array,
+    drawn: Mapping[str, Drawn] | None = None,
+) -> Stepped:
+    """The step again, where each filter leaves out what it found implausible in the first."""
+    after, found = filters.step(states, z, u, k, drawn, reasons(first[1]))
+    return after, found | {name: first[1][name] for name in ("judged", "judged_centrally")}
+
+
+def plausible_step(
+    filters: AllFilters,
+    states: PyTree,
+    z: Sequence[jax.Array],
+    u: jax.Array,
+    k: jax.Array,
+    drawn: Mapping[str, Drawn] | None = None,
+) -> Stepped:
+    """One step of all filters that judge, without what is implausible; the second step is taken only where some is."""
+    first = filters.step(states, z, u, k, drawn)
+    result: Stepped = jax.lax.cond(
+        implausible(first[1]), lambda: step_without(filters, first, states, z, u, k, drawn), lambda: first
+    )
+    return result
+
+
+class Judges:
+    """Reads the filters' judgements by node: of a step, or of a recording, whose axis comes first."""
+
+    def __init__(self, network: Network):
+        self._own: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
+        for (node, name), place in network.places().items():
+            if network.nodes[node].filters[name].received:
+                self._own[node].append(place)
+
+    def of_node(self, found: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
+        """The judgements of the filters that hear a node; where it has none, of the central ones."""
+        return self._rows(found, self._own[node], not self._own[node])
+
+    def of_all(self, found: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
+        """The judgements of all filters."""
+        places = [(k, f, i) for k, one in enumerate(found["judged"]) for f, i in np.ndindex(*one[0].shape[-2:])]
+        return self._rows(found, places, True)
+
+    def _rows(
+        self, found: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
+    ) -> Float[np.ndarray, "... filters 4"]:
+        each = [[part[..., f, i] for part in found["judged"][k]] for k, f, i in places]
+        each += [list(one) for one in found["judged_centrally"].values()] if central else []
+        if not each:
+            return np.zeros((0, len(Judgement._fields)))
+        return np.moveaxis(np.array(each), (0, 1), (-2, -1))
+
+
+def refused_rows(network: Network, found: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
+    """By node the rows of a recording that are implausible there, and why."""
+    judges, result = Judges(network), dict[str, dict[int, str]]()
+    for name in network.names:
+        votes = judges.of_node(found, name)
+        bad = _flagged(votes, "reason")
+        why = {k: said for k in bad if (said := why_values(votes[k]))}
+        if why:
+            result[name] = why
+    return result
+
+
+def doubts(network: Network, found: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
+    """What is to be said of a recording: rows that are implausible, or to one filter alone, and inputs."""
+    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, each in refused.items()
+             for rows, why in [(list(each), next(iter(each.values())))]]  # fmt: skip
+    each = {(node, name): [part[:, f, i] for part in found["judged"][kind]]
+            for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
+    every = {(FUSED, name): list(one) for name, one in found["judged_centrally"].items()}
+    all_rows = {k: "" for rows in refused.values() for k in rows}
+    for (node, name), (distance, _, reason, _) in (each | every).items():
+        known = all_rows if node == FUSED else refused.get(node, {})
+        rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in known]
+        if rows:
+            why = in_words(reason[rows[0]], distance[rows[0]])
+            lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
+    if network.inputs:
+        votes = Judges(network).of_all(found)
+        rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
+        lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
+    return lines
+
+
+def _flagged(votes: Float[np.ndarray, "steps filters 4"], part: str) -> list[int]:
+    """Rows in which some filter says so."""
+    if not votes.size:
+        return []
+    found: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(part)] > 0).any(axis=-1)).tolist()
+    return found
+
+
+def _rows(rows: Sequence[int]) -> str:
+    """Rows from 1, the first few."""
+    listed = ", ".join(str(k + 1) for k in rows[:5]) + (", ..." if len(rows) > 5 else "")
+    return f"{len(rows)} rows ({listed}) are" if len(rows) > 1 else f"row {listed} is"

@@ -1,0 +1,65 @@
+"""Limits and codes: what does not count, what is refused as limits, and what dropping by value costs a claim."""
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+import heliograph as hg
+from heliograph.model.limits import Limits
+
+PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0], [1.0]], np.eye(2), ["near", "far"])
+
+
+def test_what_is_beyond_does_not_count():
+    limits = Limits(2, [(0, 10), (None, 5)], [-999, -1])
+    z = np.array([[0.0, -50.0], [10.1, 5.0], [-999, np.nan], [np.nan, -1.0], [3.0, 5.1]])
+    expected = [[False, False], [True, False], [True, False], [False, True], [False, True]]
+    np.testing.assert_array_equal(limits.outside(z), expected)
+    assert limits.why(z[1], ("near", "far")) == "near 10.1 is outside 0 to 10"
+    assert limits.why(np.array([-999, 6.0]), ("near", "far")) == "near -999 is a code, far 6 is outside -inf to 5"
+    np.testing.assert_array_equal(Limits(2, (-1, 1)).outside(np.array([1.0, 1.5])), [False, True])
+
+
+@pytest.mark.parametrize(
+    ("limits", "invalid", "message"),
+    [
+        ((1, 0), (), "limits: expected a low end below the high one, got"),
+        ((0, 1, 2), (), r"limits: expected \(low, high\), or such a pair for each of 2 received numbers"),
+        ([(0, 1)] * 3, (), r"limits: expected \(low, high\), or such a pair"),
+        (("a", "b"), (), r"limits: expected \(low, high\)"),
+        ((0, np.nan), (), "limits: expected a low end below the high one"),
+        (None, "x", "invalid values: expected numbers, got 'x'"),
+        (None, [np.nan], "invalid values: expected a finite number or several"),
+    ],
+)
+def test_what_are_no_limits_is_refused(limits, invalid, message):
+    with pytest.raises(ValueError, match=message):
+        hg.Node(SENSOR, hg.perfect(2), {}, limits=limits, invalid=invalid)
+    with pytest.raises(ValueError, match=message):
+        hg.Stream(hg.linear_filter(PLANT, SENSOR, hg.perfect(2)), limits=limits, invalid=invalid)
+
+
+def test_a_stream_without_a_component():
+    item = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
+    stream, clean = hg.Stream(item, limits=[(-5, 5), (None, None)], invalid=-999), hg.Stream(item)
+    for z, seen in (([0.1, -999], [0.1, np.nan]), ([6.0, 0.3], [np.nan, 0.3]), ([-999, -999], [np.nan] * 2)):
+        np.testing.assert_array_equal(stream.push(z).mean, clean.push(seen).mean)
+    np.testing.assert_array_equal(stream.dropped, [2, 2])
+    again = hg.Stream.restore(item, stream.save(), invalid=-999)
+    np.testing.assert_array_equal(again.dropped, [2, 2])
+    np.testing.assert_array_equal(again.push([7.0, -999]).mean, clean.push([7.0, np.nan]).mean)
+
+
+@pytest.mark.parametrize("c", [1.0, 2.0, 3.0])
+def test_honest_values_beyond_limits_cost_the_claim_what_is_said(c):
+    """E[e^2] is P - K S K' + r K S K', r = 2 (c phi(c) + Q(c)), where limits are c deviations off; the filter claims
+    P - K S K' where z counts and P else: it is 2 c phi(c) K S K' too small. Four standard errors of 400,000 runs."""
+    rng, p, noise = np.random.default_rng(0), 2.0, 1.0
+    x = rng.normal(0, np.sqrt(p), 400_000)
+    s, k = p + noise, p / (p + noise)
+    z = x + rng.normal(0, np.sqrt(noise), x.size)
+    outside = Limits(1, (-c * np.sqrt(s), c * np.sqrt(s))).outside(z[:, None])[:, 0]
+    squares = np.where(outside, x, x - k * z) ** 2
+    claimed = np.where(outside, p, p - k * s * k).mean()
+    excess = 2 * c * norm.pdf(c) * k * s * k
+    assert abs(squares.mean() - claimed - excess) < 4 * squares.std() / np.sqrt(x.size)

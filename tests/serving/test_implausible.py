@@ -1,0 +1,99 @@
+"""Absurd messages among good ones: what is told is that of a service without them, bit for bit; they are counted."""
+
+import json
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.serving.nowhere import Nowhere
+from heliograph.serving.service import Service
+from tests.serving.test_service import finals, served
+from tests.serving.worlds import HOP, SENSOR, fleet, lines, messages, moving, stepping
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+from absurd_soak import stained
+
+
+@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("size", [1, 16, 400])
+def test_absurd_messages_leave_no_trace(whole, size):
+    network = stepping() if whole else moving()
+    good = messages(3, 60, seed=5, whole=whole)
+    bad, _ = stained(good, 0.1, np.random.default_rng(1))
+    _, wanted = served(network, lines(good), size)
+    service, told = served(network, lines(bad), size)
+    refused = Counter(one["reason"] for one in told if one["kind"] == "refused")
+    assert refused["implausible"] > 10 and service.malformed == 0
+    for plant in ("p0", "p1", "p2"):
+        assert finals(told, plant) == finals(wanted, plant) != []
+    counted = [link.implausible for plant in service.plants.values() for link in plant.links.values()]
+    began = [one for one in told if one["kind"] == "refused" and one["reason"] == "implausible"]
+    assert len(began) - 6 <= sum(counted) <= len(began)  # a message that would have begun a plant has no link
+
+
+def test_a_plant_does_not_begin_with_an_absurd_value():
+    first = {"plant": "p", "node": "a", "sequence": 0, "time": 1.0, "values": [1e20]}
+    service, told = served(moving(), lines([first]), 1)
+    assert [one["reason"] for one in told] == ["implausible"] and not service.plants
+    assert "1e6 deviations" in told[0]["detail"]
+    service, told = served(moving(), lines([first, first | {"sequence": 1, "time": 0.5, "values": [0.3]}]), 2)
+    assert [one["time"] for one in told if one["kind"] == "final"] == [0.5]
+
+
+def test_of_a_message_its_inputs_or_its_values_are_refused_alone():
+    push = {"plant": "p", "node": "a", "sequence": 0, "time": 0, "values": [0.3], "inputs": [0.1]}
+    after = push | {"sequence": 1, "time": 1}
+    cases = {
+        "values": (after | {"values": [1e20]}, after | {"values": [None]}),
+        "inputs": (after | {"inputs": [1e200]}, after | {"inputs": [None]}),
+    }
+    last = push | {"sequence": 2, "time": 2}
+    for which, (bad, like) in cases.items():
+        service, told = served(stepping(), lines([push, bad, last]), 3)
+        _, wanted = served(stepping(), lines([push, like, last]), 3)
+        assert finals(told, "p")[-1] == finals(wanted, "p")[-1]
+        (refused,) = [one for one in told if one["kind"] == "refused"]
+        assert refused["reason"] == "implausible" and refused["sequence"] == 1
+        assert ("; the rest is used" in refused["detail"]) == (which == "inputs")
+        assert service.plants["p"].links["inputs" if which == "inputs" else "a"].implausible == 1
+
+
+def test_limits_hold_here_too_and_it_is_said_once():
+    plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5)
+    item = hg.linear_filter(plant, SENSOR, HOP)
+    network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, {"f": item}, limits=(-5, 5), invalid=-999)})
+    said = []
+    from heliograph.serving.fleet import Fleet, Options
+    from heliograph.serving.lanes import Lanes
+
+    service = Service(Fleet(Lanes(network), Options(5.0)), Nowhere(), said.append)
+    sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
+    told = [json.loads(one.body) for one in service.take(lines(sent))]
+    details = [one["detail"] for one in told if one["kind"] == "refused"]
+    assert details == ["y0 -999 is a code", "y0 6 is outside -5 to 5", "y0 1e+20 is outside -5 to 5"]
+    link = service.plants[""].links["a"]
+    assert (link.used, link.implausible, link.dropped, link.lost) == (2, 3, 3, 0)
+    assert len(said) == 1 and said[0].startswith("warning: message 1 of 'a' is implausible: y0 -999 is a code; ")
+    hidden = fleet(stepping())  # the identity of a store knows the limits
+    assert hidden.lanes.network is not network
+
+
+def test_a_filter_that_alone_leaves_a_value_out_says_so():
+    plant = hg.LinearPlant([[0.95]], 0.04, [1.0], 0.5)
+    lost = hg.linear_filter(
+        hg.LinearPlant([[0.95]], 1e-16, [0.0], 1e-16), hg.LinearSensor([[1.0]], 1e-16), hg.perfect()
+    )
+    filters = {"lost": lost, "fine": hg.linear_filter(plant, SENSOR, HOP)}
+    network = hg.Network(plant, {"a": hg.Node(SENSOR, HOP, filters)})
+    from heliograph.serving.fleet import Fleet, Options
+    from heliograph.serving.lanes import Lanes
+
+    service = Service(Fleet(Lanes(network), Options(5.0)), Nowhere())
+    (told,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))
+    found = json.loads(told.body)["estimates"]["a"]
+    assert found["lost"]["mean"] == [0.0] and found["lost"]["nis"] is None and found["lost"]["heard"] == 0
+    assert "1e6 deviations" in found["lost"]["implausible"] and "implausible" not in found["fine"]
