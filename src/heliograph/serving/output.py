@@ -47,7 +47,7 @@ class Refused(BaseModel):
     node: str | None
     sequence: int | None
     time: float | str | None
-    reason: Literal["duplicate", "conflict", "late", "future", "malformed"]
+    reason: Literal["duplicate", "conflict", "late", "future", "malformed", "damaged"]
     detail: str
 
 

@@ -53,6 +53,7 @@ class Service:
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller = Teller(fleet.lanes)
         self._told: int | None = None  # up to where, since the last commit
+        self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
         """Use messages, each a JSON object, and commit; what is to be told of it.
@@ -101,6 +102,9 @@ class Service:
             try:
                 if isinstance(message, str):
                     raise InputError(message)
+                if message.plant in self._damage:
+                    entries.append(_refusal(message, "damaged", self._damage[message.plant]))
+                    continue
                 plant, verdict = self._use(message)
             except InputError as error:
                 malformed += 1
@@ -112,7 +116,7 @@ class Service:
                 used.add(message.plant)
             else:
                 known += verdict in ("duplicate", "late")
-                entries.append(_refusal(message, verdict))
+                entries.append(_refusal(message, verdict, WHY[verdict]))
         settled = self.fleet.settle(touched.values())
         entries += self._finals(settled)
         provisional = self._provisional([each for each in settled if each.plant.name in used])
@@ -145,7 +149,11 @@ class Service:
 
     def _load(self, names: Iterable[str]) -> None:
         """Have the plants of these names in memory, where they are kept."""
+        self._damage = {}
         for name, kept in self.store.load([name for name in names if name not in self.plants]).items():
+            if kept.damage:
+                self._damage[name] = kept.damage
+                continue
             plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
             plant.version = kept.version
 
@@ -217,10 +225,10 @@ def _read(payload: bytes) -> Message | str:
         return str(error)
 
 
-def _refusal(message: Message, why: Verdict) -> Entry:
+def _refusal(message: Message, why: str, detail: str) -> Entry:
     moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
     parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-    return _refused(message.plant, parts, why, WHY[why])
+    return _refused(message.plant, parts, why, detail)
 
 
 def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
