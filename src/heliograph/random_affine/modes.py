@@ -28,6 +28,7 @@ from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, 
 from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.lift import Lift
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
@@ -105,6 +106,10 @@ class _Chosen(AbstractRandomAffine):
 
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
+
+    def moments(self, order: int) -> Moments:
+        matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
+        return Moments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
 
 class Revealed(AbstractModal):

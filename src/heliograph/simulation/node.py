@@ -13,6 +13,7 @@ from heliograph.numerics.check import fail, shown, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.simulation.flags import check_flags
 
 
 @readable
@@ -22,7 +23,9 @@ class Node(Module):
     With a `fed_back_filter` among them the sensor sends what that filter does not expect.
 
     Raises:
-        ValueError: a sensor and a channel that do not fit, a filter that hears beside one that is fed back.
+        ValueError: a filter that takes another number of values than arrive, or flags of another step than those that
+            do; a filter that hears beside one that is fed back. Whether sensor and channel fit, and the filters' states
+            are the plant's, a `Network` checks.
     """
 
     sensor: AnySensor
@@ -34,6 +37,8 @@ class Node(Module):
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
         check_filters(self.filters, self.received)
+        for name, item in self.filters.items():
+            check_flags(f"filter {name!r}", item, [first(channel)])
         hearing = [name for name, item in self.filters.items() if item.received]
         if self.told_by is not None and hearing != [self.told_by]:
             raise fail("node whose sensor hears back", f"no filter that hears beside {self.told_by!r}", hearing)
