@@ -69,8 +69,9 @@ def test_what_is_older_than_the_window_is_used_if_nothing_newer_is_final(network
 
 REFUSED = [
     (("b", 0, 1.0, 1.0), "node of an event: expected one of a, inputs, got 'b'"),
-    (("a", 0.5, 1.0, 1.0), "event of 'a', sequence: expected a whole number, got 0.5"),
-    (("a", 2**63, 1.0, 1.0), "event of 'a', sequence: expected a number of 64 bits, got"),
+    (("a", 0.5, 1.0, 1.0), r"event of 'a', sequence: expected a whole number from 0 to 2\^63 - 1, got 0.5"),
+    (("a", 2**63, 1.0, 1.0), r"event of 'a', sequence: expected a whole number from 0 to 2\^63 - 1, got 9223"),
+    (("a", -1, 1.0, 1.0), r"event of 'a', sequence: expected a whole number from 0 to 2\^63 - 1, got -1"),
     (("a", 0, np.nan, 1.0), "event of 'a', time: expected a finite number, got nan"),
     (("a", 0, "1", 1.0), "event of 'a', time: expected a finite number, got '1'"),
     (("a", 0, 1.0, [1.0, 2.0]), r"event of 'a': expected 1 number, got shape \(2,\)"),
