@@ -6,7 +6,7 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.fed_back import FedBackFilter
-from heliograph.model.channel import Channel
+from heliograph.model.channel import Channel, check_sent
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
 from heliograph.numerics.check import fail, shown, table
@@ -23,9 +23,8 @@ class Node(Module):
     With a `fed_back_filter` among them the sensor sends what that filter does not expect.
 
     Raises:
-        ValueError: a filter that takes another number of values than arrive, or flags of another step than those that
-            do; a filter that hears beside one that is fed back. Whether sensor and channel fit, and the filters' states
-            are the plant's, a `Network` checks.
+        ValueError: a sensor and a channel that do not fit; a filter that takes another number of values than arrive,
+            or flags of another step than those that do; a filter that hears beside one that is fed back.
     """
 
     sensor: AnySensor
@@ -36,6 +35,7 @@ class Node(Module):
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
+        check_sent(first(sensor), first(channel))
         check_filters(self.filters, self.received)
         for name, item in self.filters.items():
             check_flags(f"filter {name!r}", item, [first(channel)])
