@@ -111,9 +111,9 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
         table = pq.ParquetFile(path).read()
         found = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
         for name in found.keys() - {NODE, VALUES}:
-            for row, cell in enumerate(found[name], 1):
+            for at, cell in enumerate(found[name], 1):
                 if isinstance(cell, str) and not (name in (TIME, ARRIVAL) and looks_like_date(cell)):
-                    raise fail(f"{path}, row {row}, column {name!r}", "a number", f"text, {shown(cell)}")
+                    raise fail(f"{path}, row {at}, column {name!r}", "a number", f"text, {shown(cell)}")
         return found
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -87,7 +87,8 @@ class LinearSystem(Module):
         """The first step from which on all steps are as the last."""
         changes = [0]
         for field in (*self.steps, self.rounding, self.heard_rounding):
-            changed = np.flatnonzero(np.any((field[1:] != field[:-1]).reshape(len(field) - 1, -1), axis=1))
+            moved = field[1:] != field[:-1]
+            changed = np.flatnonzero(np.any(moved, axis=tuple(range(1, moved.ndim))))
             changes += (changed[-1:] + 1).tolist()
         return max(changes)
 

@@ -142,6 +142,26 @@ def file_path(name: str, value: object) -> Path:
     return Path(value)
 
 
+def rank(name: str, value: object) -> int:
+    """Return the number of axes of what may become an array."""
+    try:
+        return np.ndim(cast(ArrayLike, value))
+    except ValueError:  # rows of different lengths
+        raise fail(name, "an array of numbers", shown(value)) from None
+
+
+def flag(name: str, value: object) -> bool:
+    """Return True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise fail(name, "True or False", shown(value))
+    return bool(value)
+
+
+def text(name: str, value: object) -> str:
+    """Return a text."""
+    return instance(name, value, str, "a text")
+
+
 def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
     """Return a number for each of `count` steps, from one for all or one each."""
     try:
@@ -280,5 +300,5 @@ def names(name: str, value: Sequence[str] | None, count: int, prefix: str) -> tu
         return tuple(f"{prefix}{i}" for i in range(count))
     result = tuple(str(v) for v in items(name, value, "names"))
     if len(result) != count or len(set(result)) != count:
-        raise fail(name, f"{count} distinct names", list(result))
+        raise fail(name, f"{count} distinct names", shown(list(result)))
     return result

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail, instance, scalar, shown
+from heliograph.numerics.check import array, check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise, known
@@ -246,6 +246,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     Raises:
         ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
     """
+    check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
     each = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]

@@ -6,7 +6,7 @@ from sqlalchemy import Connection, create_engine, event
 from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import ArgumentError
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, text
 
 PLACE = "a file, or a URL as postgresql://host/database"
 
@@ -30,6 +30,7 @@ def url_of(place: str) -> URL:
     Raises:
         ValueError: no path, or the URL of another kind of database.
     """
+    text("store", place)
     try:
         url = make_url(place) if "://" in place else URL.create("sqlite", database=place)
     except ArgumentError:

@@ -7,7 +7,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapter, ValidationError, WithJsonSchema
 from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, instance, shown
 from heliograph.numerics.dates import instant
 
 Name = Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")]  # PostgreSQL keeps no NUL
@@ -56,6 +56,7 @@ def read_message(payload: bytes) -> Message:
     Raises:
         ValueError: what is no message; one line that names the part.
     """
+    instance("message", payload, bytes, "bytes")
     if len(payload) > LONGEST:
         raise fail("message", f"at most {LONGEST} bytes", len(payload))
     try:

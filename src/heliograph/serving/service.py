@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 from heliograph.live.event import INPUTS, Verdict
-from heliograph.numerics.check import InputError, shown
+from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Fleet, Settled
 from heliograph.serving.keeping import ConflictError, Entry, Keeps, Kept
 from heliograph.serving.kept import plant_bytes, plant_from
@@ -48,6 +48,7 @@ class Service:
     """
 
     def __init__(self, fleet: Fleet, store: Keeps):
+        instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store = fleet, store
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)

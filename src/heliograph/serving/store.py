@@ -11,7 +11,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import SQLAlchemyError
 
 from heliograph.live.identity import Identity, check_same
-from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.database import engine_at
 from heliograph.serving.keeping import ConflictError, Damage, Entry, Kept
 from heliograph.serving.output import Output
@@ -45,7 +45,7 @@ class Store:
         self.process, self.journal = process, journal
         self._engine = engine_at(place)
         self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
-        mine = mine | {"layout of the store": LAYOUT}
+        mine = table("identity of a store", mine, "texts") | {"layout of the store": LAYOUT}
         try:
             with self._saying("a database that can be written"):
                 check_same(f"store {self.name}", mine, self._whose(mine))
