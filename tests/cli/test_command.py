@@ -55,6 +55,16 @@ def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")
 
 
+def test_an_output_that_takes_nothing_is_named(capsys, monkeypatch):
+    with open("/dev/full", "w") as full:
+        monkeypatch.setattr(sys, "stdout", full)
+        assert cli.main(["--version"]) == 2
+        monkeypatch.undo()
+        with pytest.raises(OSError, match="No space"):
+            full.close()
+    assert capsys.readouterr().err == "heliograph: standard output: No space left on device\n"
+
+
 @pytest.mark.parametrize(
     "bug",
     [

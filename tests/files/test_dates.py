@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.files.columns import columns_of
 from heliograph.files.table import read_table, write_table
-from heliograph.numerics.dates import dates, in_iso, seconds_between
+from heliograph.numerics.dates import dates, in_iso, instant, seconds_between
 
 PLANT = hg.Plant(lambda x, u: x + u[0], 0.1, [0.0], [[1.0]], states=["p"], inputs=["dt"])
 SENSOR = hg.Sensor(lambda x: x, noise=0.1, outputs=["pos"])
@@ -161,3 +161,24 @@ def test_a_column_of_dates_in_a_table_is_dates(tmp_path):
     assert np.isnat(found["when"][1]) and found["x"].tolist() == [1, 2]
     write_table(found, tmp_path / "u.parquet")
     np.testing.assert_array_equal(read_table(tmp_path / "u.parquet")["when"], found["when"])
+
+
+@settings(max_examples=100, derandomize=True)
+@given(moment=MOMENTS, zone=ZONES, space=st.booleans())
+def test_an_instant_is_the_date_that_python_says(moment, zone, space):
+    aware = moment.replace(tzinfo=zone)
+    assert instant(aware.isoformat(sep=" " if space else "T")) == aware
+
+
+@pytest.mark.parametrize(
+    "text", ["0.1", "1e9", "", "2026-11-21T10:00:00", "2026-11-21", "0001-01-01T00:00+10:00", "9999-12-31T23:59-10:00",
+             "2026-13-01T00:00Z", "2026-11-21T25:00Z", "2026-11-21T10:00:00+99:00", "20261121T100000Z", "nan"]
+)  # fmt: skip
+def test_no_other_text_is_an_instant(text):
+    with pytest.raises(ValueError):
+        instant(text)
+
+
+def test_text_among_numbers_is_no_number():
+    with pytest.raises(ValueError, match=r"column 'x': expected numbers or dates, got '2\.0'"):
+        columns_of({"x": np.array([1.0, "2.0"], dtype=object)})

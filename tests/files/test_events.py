@@ -87,8 +87,13 @@ def test_every_way_to_write_events_is_read_alike(tmp_path, network):
     ("place", "cell", "message"),
     [
         (0, "robot", "row 2, column 'node': expected one of cart, inputs, got 'robot'"),
-        (1, "1.5", "row 2, column 'sequence': expected a whole number, got '1.5'"),
+        (1, "1.5", "row 2, column 'sequence': expected a whole number from 0 to .*, got '1.5'"),
         (1, "", "row 2, column 'sequence': expected a number, got ''"),
+        (1, "-1", "row 2, column 'sequence': expected a whole number from 0 to .*, got -1"),
+        (1, str(10**30), f"row 2, column 'sequence': expected a whole number from 0 to .*, got {10**30}"),
+        (1, "1e300", "row 2, column 'sequence': expected a whole number from 0 to .*, got '1e300'"),
+        (1, "9" * 5000, "row 2, column 'sequence': expected"),
+        (2, "1_0", "row 2, column 'time': expected a number, got '1_0'"),
         (2, "soon", "row 2, column 'time': expected a number, got 'soon'"),
         (3, "", "row 2, column 'arrival': expected a number, got ''"),
         (4, "inf", "row 2, column 'left': expected a number or an empty cell, got 'inf'"),
@@ -99,6 +104,29 @@ def test_a_cell_that_is_none_is_named(tmp_path, network, place, cell, message):
     rows[1][place] = cell
     with pytest.raises(ValueError, match=message):
         read_events(written(tmp_path / "events.csv", HEADER, rows), network)
+
+
+def test_a_sequence_keeps_every_digit(tmp_path, network):
+    rows = [list(row) for row in ROWS]
+    for cell, number in ((str(2**63 - 1), 2**63 - 1), ("4.0", 4), ("0007", 7)):
+        rows[1][1] = cell
+        assert read_events(written(tmp_path / "events.csv", HEADER, rows), network)[0][1].sequence == number
+
+
+@pytest.mark.parametrize("name", ["sequence", "time", "arrival", "left"])
+def test_text_in_a_table_of_types_is_no_number(tmp_path, network, name):
+    """In CSV everything is text, and quotes mean nothing."""
+    table = dict(zip(HEADER, zip(*ROWS, strict=True), strict=True))
+    typed = {column: [float(x) if x else None for x in table[column]] for column in HEADER[1:]}
+    columns = {"node": list(table["node"]), **typed, name: ["1.0"] * len(ROWS)}
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    with pytest.raises(ValueError, match=f"row 1, column '{name}': expected a number, got text, '1.0'"):
+        read_events(tmp_path / "a.parquet", network)
+    quoted = [[f'"{cell}"' for cell in row] for row in ROWS]
+    (tmp_path / "b.csv").write_text("\n".join([",".join(HEADER), *(",".join(row) for row in quoted)]))
+    same(
+        read_events(written(tmp_path / "a.csv", HEADER, ROWS), network)[0], read_events(tmp_path / "b.csv", network)[0]
+    )
 
 
 def test_columns_that_nobody_knows_or_that_lack_are_named(tmp_path, network):

@@ -1,5 +1,6 @@
 """The lift against the printed Lemma 4 (corrected), against all atoms, and in the limits that have a known answer."""
 
+import time
 from dataclasses import replace
 from itertools import pairwise
 
@@ -7,6 +8,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.linear import lifted_system, lmmse
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import half, model, random_law, scalar_system, two_sensors
 
@@ -191,3 +193,31 @@ def test_skewed_vector_noise_gains_in_every_direction():
         for d in (1, 2)
     ]
     assert np.linalg.eigvalsh(both[0] - both[1]).min() > 0
+
+
+def test_steps_after_the_moments_have_come_to_stay_are_copied():
+    """To rounding they are what is computed step by step, which a model in `over_time` is."""
+    plant, sensor = hg.LinearPlant([[0.5]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    hop = hg.hop(hg.Rayleigh(1.0), 0.1)
+    burst = hg.gilbert_elliott(hop, hg.hop(0.2, 0.1), 0.2, 0.2)
+    for channel in (hop, burst):
+        still = lifted_system(plant, sensor, channel, 2, 200)
+        each = lifted_system(plant, sensor, hg.model.over_time([channel] * 200), 2, 200)
+        assert still.steady_from < 150
+        for one, two in zip(lmmse(still).gains, lmmse(each).gains, strict=True):
+            np.testing.assert_allclose(one, two, rtol=1e-13, atol=1e-15)
+    begun = time.perf_counter()
+    item = hg.polynomial_filter(plant, sensor, hop, horizon=100_000)
+    assert time.perf_counter() - begun < 20  # 1 s; step by step it was 60 s
+    assert item.horizon is None
+
+
+def test_what_no_double_can_hold_is_refused():
+    plant, sensor = hg.LinearPlant([[1.1]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
+    burst = hg.gilbert_elliott(hg.hop(1.0, 0.1), hg.hop(0.2, 0.1), 0.2, 0.2)
+    for channel in (hg.perfect(), burst):
+        with pytest.raises(ValueError, match=r"moments of the state up to order 4: expected finite ones .* at step 18"):
+            lifted_system(plant, sensor, channel, 2, 3000)
+    for degree in (32, 50, 10**9):
+        with pytest.raises(ValueError, match=f"degree of the lift: expected at most 31, got {degree}"):
+            hg.polynomial_filter(plant, sensor, hg.perfect(), 5, degree)

@@ -81,7 +81,7 @@ def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixi
         if generator.random() < 0.2:
             pushes.append(event._replace(arrival=arrival + 3 * generator.random(), values=[9.0]))
         if generator.random() < 0.1:
-            pushes.append(event._replace(arrival=event.time - 1.0, sequence=-1))
+            pushes.append(event._replace(arrival=event.time - 1.0, sequence=2**40))
     pushes.sort(key=lambda e: e.arrival)
     item, accepted, counted = timeline(network), [], 0
     stop = generator.integers(len(pushes))

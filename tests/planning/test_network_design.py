@@ -205,7 +205,7 @@ def test_the_envelope_is_concave_above_and_touches():
         ({}, "design: expected a budget of power or a wanted error"),
         ({"budget": 1, "free": []}, "free: expected at least one transmitter"),
         ({"budget": 1, "free": ["z"]}, "free: expected names of transmitters"),
-        ({"budget": -1}, "total power: expected a number from 0"),
+        ({"budget": -1}, "total power: expected a number of at least 0"),
         ({"budget": 1, "free": ["a"]}, "budget: expected a total of at least"),
         ({"wanted": 0.1}, "wanted error: expected more than 0.3104: unlimited power leaves 0.3104"),
         ({"wanted": 0.5, "budget": 3}, "wanted error: expected at least 0.80961, the least found within"),

@@ -69,9 +69,9 @@ def test_the_map_is_drawn():
 
 
 def test_what_cannot_be_is_refused():
-    with pytest.raises(InputError, match="nearest of a radio: expected a number from"):
+    with pytest.raises(InputError, match="nearest of a radio: expected a positive number"):
         Radio(3.0, nearest=0.0)
-    with pytest.raises(InputError, match="kappa of a radio: expected a number from 1"):
+    with pytest.raises(InputError, match="kappa of a radio: expected a number of at least 1"):
         Radio(3.0, kappa=0.9)
     with pytest.raises(InputError, match="sensors of a scene: expected shape"):
         RelayScene([[0.9]], [[0.3]], [[1.0]], [0.1], [[0.0, 0.0, 0.0]], [1.0, 0.0], Radio(3.0))

@@ -124,7 +124,7 @@ def test_more_sensors_at_one_total_lower_the_error_of_a_sum_without_end():
 def test_what_cannot_be_is_refused():
     with pytest.raises(InputError, match="limits of a coherent sum: expected a total or the power of each"):
         coherent_powers(summed(0))
-    with pytest.raises(InputError, match="total power: expected a number from 0"):
+    with pytest.raises(InputError, match="total power: expected a number of at least 0"):
         coherent_powers(summed(0), -1.0)
     with pytest.raises(InputError, match="wanted noise: expected a factor above 1"):
         power_for_noise([1.0], 0.9)

@@ -56,6 +56,20 @@ def test_a_line_without_an_end_is_bounded(monkeypatch):
     assert [len(line) > LONGEST for line in found] == [True, False] and found[-1] == b"b"
 
 
+def test_a_full_disk_and_a_folder_are_named(tmp_path):
+    full, folder = os.open("/dev/full", os.O_WRONLY), os.open(tmp_path, os.O_RDONLY)
+    try:
+        with pytest.raises(OSError, match="No space left") as error:
+            asyncio.run(Pipe(0, full).publish([Output(1, "p", "final", b"x")]))
+        assert error.value.filename == "standard output"
+        with pytest.raises(OSError, match="directory") as error:
+            asyncio.run(Pipe(folder, 1).receive())
+        assert error.value.filename == "standard input"
+    finally:
+        os.close(full)
+        os.close(folder)
+
+
 def test_files_on_disk_are_pipes_too(tmp_path):
     (tmp_path / "in").write_bytes(b"\n".join(lines(messages(1, 10, 0, whole=True))))
     with (tmp_path / "in").open("rb") as source, (tmp_path / "out").open("wb") as target:

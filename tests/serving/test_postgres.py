@@ -7,8 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from heliograph.serving.database import engine_at
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store, engine_at
+from heliograph.serving.store import Store
 from heliograph.serving.whose import identity
 from tests.serving import test_sharing
 from tests.serving.test_store import by_plant, journal, states

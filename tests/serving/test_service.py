@@ -108,9 +108,18 @@ def test_surprise_is_that_of_the_innovation():
 
 
 BAD = {
-    b"no json": "invalid JSON",
-    b"[1]": "",
-    b'{"node": "a"}': "sequence: expected field required",
+    b"no json": "expected a JSON object with no fields but plant, node",
+    b"[1]": "expected a JSON object with no fields but plant, node",
+    b'{"node": "a"}': "sequence: expected a whole number from 0 to 2^63 - 1, got no such field",
+    b'{"node": "a", "sequence": 0, "time": "0.1", "values": [1]}': "time: expected a finite number, not in quotes, or",
+    b'{"node": "a", "sequence": 0, "time": 1, "arrival": "2", "values": [1]}': "arrival: expected a finite number, not",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": ["1"]}': "values: expected a list of finite numbers, not",
+    b'{"node": "a", "sequence": 0, "time": 1, "values": [1], "inputs": ["1"]}': "inputs: expected a list of finite",
+    b'{"node": "a", "sequence": "0", "time": 1, "values": [1]}': "sequence: expected a whole number",
+    b'{"node": "a", "sequence": 0.5, "time": 1, "values": [1]}': "sequence: expected a whole number",
+    b'{"node": "a", "sequence": 0, "time": true, "values": [1]}': "time: expected a finite number",
+    b'{"node": "a", "sequence": 0, "time": "0001-01-01T00:00:00+10:00", "values": [1]}': "got '0001",
+    b'{"node": "a\\u0000", "sequence": 0, "time": 1, "values": [1]}': "node: expected a name of at most 200 characters",
     b'{"node": "c", "sequence": 0, "time": 1, "values": [1]}': "one of a, b, inputs",
     b'{"node": "a", "sequence": 0, "time": 1, "values": [1, 2]}': "1 numbers",
     b'{"node": "a", "sequence": 0, "time": 1, "values": [NaN]}': "values",
@@ -131,7 +140,7 @@ BAD = {
 
 
 def test_what_is_bad_is_told_and_changes_nothing():
-    good = lines(messages(1, 20, seed=4, whole=True))
+    good = lines(messages(1, len(BAD) + 1, seed=4, whole=True))
     bad = {payload.replace(b'{"node"', b'{"plant": "p0", "node"'): reason for payload, reason in BAD.items()}
     mixed = [good[0], *(line for i, one in enumerate(good[1:]) for line in (one, list(bad)[i % len(bad)]))]
     _, clean = served(stepping(), good, 6)
@@ -141,6 +150,25 @@ def test_what_is_bad_is_told_and_changes_nothing():
         _, told = served(stepping(), [good[0], payload], 2)
         refused = [one for one in told if one["kind"] == "refused"]
         assert len(refused) == 1 and reason in refused[0]["reason"] + refused[0]["detail"], (payload, told)
+
+
+def test_a_clock_keeps_its_kind_and_the_refusal_says_how_to_mend_it():
+    date = {"plant": "p q", "node": "a", "sequence": 0, "time": "2026-11-21T10:00:00Z", "values": [1.0]}
+    number = date | {"sequence": 1, "time": 0.2}
+    _, told = served(moving(), lines([date, number]), 2)
+    (refused,) = (one for one in told if one["kind"] == "refused")
+    assert "a date, as this plant's times are, got 0.2; if its first" in refused["detail"]
+    assert "serve --anew 'p q' begins it anew" in refused["detail"]
+    _, told = served(moving(), lines([number, date]), 2)
+    (refused,) = (one for one in told if one["kind"] == "refused")
+    assert "a number, as this plant's times are, got 2026-11-21T10:00:00+00:00; if its" in refused["detail"]
+
+
+def test_a_number_in_quotes_begins_no_clock():
+    quoted = {"node": "a", "sequence": 0, "time": "0.1", "values": [1.0]}
+    right = quoted | {"sequence": 1, "time": 0.2}
+    service, told = served(moving(), lines([quoted, right]), 1)
+    assert service.malformed == 1 and [one["time"] for one in told if one["kind"] == "final"] == [0.2]
 
 
 def test_no_plant_begins_with_a_wrong_clock():

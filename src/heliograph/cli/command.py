@@ -64,12 +64,22 @@ def _command(arguments: Sequence[str] | None) -> int:
             raise
         return _refuse(str(error))
     except OSError as error:
-        return _refuse(f"{error.filename}: {error.strerror or error}" if error.filename else str(error))
+        what = error.filename or ("standard output" if _output_is_lost() else None)
+        return _refuse(f"{what}: {error.strerror or error}" if what else str(error))
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])
         if extra is None:
             raise
         return _refuse(f"{error.name}: expected to be installed, got no such package: {how_to_install(extra)}")
+
+
+def _output_is_lost() -> bool:
+    """Whether what was printed cannot be written: an error of the system does not say where it was."""
+    try:
+        sys.stdout.flush()
+    except OSError:
+        return True
+    return False
 
 
 def _refuse(message: str) -> int:

@@ -9,6 +9,8 @@ from cyclopts import Parameter
 
 from heliograph.cli.app import number, place
 
+LONGEST = 1e6  # seconds that the system sleeps at once
+
 
 def replay(
     recording: Annotated[Path, place("CSV or Parquet: rows of time, inputs and measurements; or events.")],
@@ -28,11 +30,11 @@ def replay(
     from time import monotonic, sleep
 
     from heliograph.files.network_file import load_network
-    from heliograph.numerics.check import check_seed, fail
+    from heliograph.numerics.check import TINY, check_seed, fail, scalar
     from heliograph.serving.replay import Link, along, lines, recorded, through
 
-    if speed is not None and not speed > 0:
-        raise fail("--speed", "a positive number", speed)
+    if speed is not None:
+        scalar("--speed", speed, TINY)
     link = Link(loss, run, delay, duplicates)
     if trace is not None and link != Link():
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
@@ -42,8 +44,8 @@ def replay(
     try:
         for arrival, line in lines(heard, plant, origin):
             first = arrival if first is None else first
-            if speed is not None:
-                sleep(max(0.0, begun + (arrival - first) / speed - monotonic()))
+            while speed is not None and (ahead := begun + (arrival - first) / speed - monotonic()) > 0:
+                sleep(min(ahead, LONGEST))
             print(line, flush=speed is not None)
         sys.stdout.flush()
     except BrokenPipeError:  # nobody reads any more

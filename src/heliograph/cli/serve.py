@@ -23,6 +23,10 @@ def serve(
     ] = None,
     process: Annotated[str, Parameter(help="Name of this process among several that share a store.")] = "",
     from_snapshot: Annotated[Path | None, place("Store of which to begin from the plants.")] = None,
+    anew: Annotated[
+        list[str] | None,
+        Parameter(help="Name of a plant whose state is forgotten at the start; may be given again.", negative=""),
+    ] = None,
     broker: Annotated[str | None, Parameter(help="mqtt:// or nats://host:port/topic, instead of pipes.")] = None,
     parts: Annotated[int | None, Parameter(help="Parts of the plants that processes share among them.")] = None,
     page: Annotated[str | None, Parameter(help="Port of a page to watch it on, or address:port.")] = None,
@@ -55,4 +59,5 @@ def serve(
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
     kept = store_of(network, store, parts)
-    asyncio.run(run(Wanted(load_network(network), options, kept, process, from_snapshot, where, parts, page)))
+    wanted = Wanted(load_network(network), options, kept, process, from_snapshot, where, parts, page, tuple(anew or ()))
+    asyncio.run(run(wanted))

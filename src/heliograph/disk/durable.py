@@ -29,8 +29,8 @@ def replace(partial: Path, path: Path) -> None:
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
-    """Have errors of the system name the file or folder that was to be written: a full disk does not."""
+def naming(path: Path | str) -> Iterator[None]:
+    """Have errors of the system name the file, folder or stream that they are about: a full disk does not."""
     try:
         yield
     except OSError as error:

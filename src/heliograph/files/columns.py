@@ -61,7 +61,10 @@ def _of_objects(found: np.ndarray, name: str) -> np.ndarray:
     some = next((each for each in found if each is not None), None)
     if isinstance(some, str) or hasattr(some, "isoformat"):
         return dates(found, name)
+    texts = [each for each in found if isinstance(each, str | bytes)]  # text is no number, though it may read as one
     try:
+        if texts:
+            raise TypeError
         return np.array([np.nan if each is None else float(each) for each in found])
-    except (TypeError, ValueError):
-        raise fail(name, "numbers or dates", shown(some)) from None
+    except (TypeError, ValueError, OverflowError):
+        raise fail(name, "numbers or dates", shown(texts[0] if texts else some)) from None

@@ -52,6 +52,8 @@ def read_design(path: Path) -> DesignFile:
     Raises:
         ValueError: no TOML, keys or values that are none, a network that cannot be loaded; one line with the key.
     """
+    if not path.is_file():
+        raise fail(f"design {path}", "a TOML file", "a folder" if path.is_dir() else "no file of that name")
     try:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

@@ -9,13 +9,14 @@ import numpy as np
 
 from heliograph.disk.output_file import FORMATS
 from heliograph.files.recording import TIME_STEP, write_estimates
-from heliograph.live.event import INPUTS, Event
+from heliograph.live.event import INPUTS, Event, whole
 from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, looks_like_date
 from heliograph.simulation.network import Network
 from heliograph.simulation.record import Record
 
+EXACT = 2.0**53  # up to here doubles hold every whole number
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES = "node", "sequence", "time", "arrival", "values"
 
 
@@ -33,7 +34,8 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
     Columns: `node` (a name, or "inputs"), `sequence`, `time`, `arrival` (may be left out: at once), and what was heard:
     one column for each component, named as the sensor's outputs or the plant's inputs, or one column `values` with all
     of the node's numbers, separated by spaces or as a list. An empty cell did not arrive. Dates are ISO 8601, with a
-    zone each or none; the moment returned is the earliest `time`.
+    zone each or none; the moment returned is the earliest `time`. A sequence keeps every digit. In CSV quotes around a
+    cell mean nothing; in Parquet text is no number.
 
     Raises:
         ValueError: missing or unknown columns, a cell that is none of this; one line that names the row, from 1.
@@ -56,10 +58,8 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
         if node not in components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(components)}", shown(node))
         values = _heard({name: column[row] for name, column in columns.items()}, components[node], where)
-        number = _number(columns[SEQUENCE][row], f"{where}, column {SEQUENCE!r}")
-        if number != np.floor(number):
-            raise fail(f"{where}, column {SEQUENCE!r}", "a whole number", shown(columns[SEQUENCE][row]))
-        events.append(Event(node, int(number), float(time[row]), values, float(arrival[row])))
+        number = _whole(columns[SEQUENCE][row], f"{where}, column {SEQUENCE!r}")
+        events.append(Event(node, number, float(time[row]), values, float(arrival[row])))
     return events, origin
 
 
@@ -109,7 +109,12 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
         import pyarrow.parquet as pq
 
         table = pq.ParquetFile(path).read()
-        return {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
+        found = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
+        for name in found.keys() - {NODE, VALUES}:
+            for at, cell in enumerate(found[name], 1):
+                if isinstance(cell, str) and not (name in (TIME, ARRIVAL) and looks_like_date(cell)):
+                    raise fail(f"{path}, row {at}, column {name!r}", "a number", f"text, {shown(cell)}")
+        return found
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *rows = [[cell.strip() for cell in line] for line in csv.reader(file, strict=True) if line]
@@ -157,12 +162,25 @@ def _heard(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarr
     return np.array([_number(row.get(name), f"{where}, column {name!r}", empty=True) for name in names])
 
 
+def _whole(cell: Any, name: str) -> int:
+    """A count, every digit of it; one written as a float if that holds it exactly."""
+    try:
+        found = int(cell) if isinstance(cell, str) else cell
+    except ValueError:
+        found = _number(cell, name)
+    if isinstance(found, float) and found.is_integer() and abs(found) < EXACT:
+        found = int(found)
+    return whole(name, found if isinstance(found, int) else cell)
+
+
 def _number(cell: Any, name: str, empty: bool = False) -> float:
     if empty and (cell is None or cell == ""):
         return np.nan
     try:
+        if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
+            raise ValueError
         found = float(cell)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = np.inf
     if np.isinf(found) or (np.isnan(found) and not empty):
         raise fail(name, "a number or an empty cell" if empty else "a number", shown(cell))

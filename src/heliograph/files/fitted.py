@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.files.network_file import load_network
 from heliograph.learning.description import describe
 from heliograph.learning.fitting import Fit
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.network import Network
 
 FITTED = "fitted.json"
@@ -85,7 +85,8 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
     Raises:
         ValueError: as `load_network`; no such file of numbers, or numbers that are not those which are free.
     """
-    path, description = Path(fitted), describe(NetworkAgain(str(reference)))
+    file_path("network", reference)
+    path, description = file_path("fitted numbers", fitted), describe(NetworkAgain(str(reference)))
     try:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TypeVar
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, file_path
 from heliograph.simulation.network import Network
 
 T = TypeVar("T")
@@ -29,7 +29,8 @@ def load_network(reference: str) -> Network:
         ValueError: no such module, an error inside it (with its type, message and line), no network, or several
             and no name. One line that names the module.
     """
-    place, _, name = reference.rpartition(":")
+    file_path("network", reference)
+    place, _, name = str(reference).rpartition(":")
     if not place or not name.isidentifier():  # no name, or the colon of a drive letter
         place, name = reference, ""
     if place.endswith(".py") or os.sep in place or Path(place).is_file():

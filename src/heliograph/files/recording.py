@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.files.columns import TIME, columns_of
 from heliograph.files.table import write_table
 from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import backwards, backwards_text, fail
+from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
@@ -48,6 +48,7 @@ def read_recording(table: object, network: Network, name: str = "recording") -> 
             infinite numbers; times that go backwards. One line that names the row, from 1, and the column.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
+    instance("network", network, Network, "a Network")
     source = str(table) if isinstance(table, str | Path) else name
     return _recording_of(columns_of(table, source), network, source)
 
@@ -59,6 +60,8 @@ def write_recording(recording: Recording, network: Network, path: str | Path) ->
         ValueError: names that coincide, another format, or a folder that cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
+    instance("recording", recording, Recording, "a Recording")
+    instance("network", network, Network, "a Network")
     columns = {TIME: recording.time, **dict(zip(network.inputs, recording.inputs.T, strict=True))}
     for node, names in _received_columns(network).items():
         if node in recording.measurements:
@@ -130,6 +133,7 @@ def write_estimates(record: Record, path: str | Path) -> None:
         ValueError: another format, or a folder that cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
+    instance("record", record, Record, "a Record")
     write_table(estimate_columns(record), path)
 
 

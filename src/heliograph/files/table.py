@@ -11,7 +11,7 @@ import numpy as np
 from heliograph.disk.output_file import check_output, format_of
 from heliograph.disk.quoting import from_cell, in_cell
 from heliograph.disk.whole_file import whole_file
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, file_path, shown, table
 from heliograph.numerics.dates import dates, in_iso, looks_like_date
 
 SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "bars"}
@@ -29,7 +29,7 @@ def read_table(path: str | Path) -> dict[str, np.ndarray]:
             number.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    path = Path(path)
+    path = file_path("table", path)
     kind = format_of(path)
     if not path.is_file():
         raise fail(str(path), "a file", "a folder" if path.is_dir() else "nothing of that name")
@@ -48,10 +48,22 @@ def write_table(columns: Mapping[str, np.ndarray], path: str | Path) -> None:
         ValueError: another format, or a folder that cannot be written.
         ModuleNotFoundError: Parquet without pyarrow (extra "tables").
     """
-    path = Path(path)
+    path = file_path("table", path)
+    _check_columns(columns)
     check_output(path)
     with whole_file(path) as partial:
         (_write_csv if format_of(path) == ".csv" else _write_parquet)(columns, partial)
+
+
+def _check_columns(columns: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError unless these are arrays of one axis and one length, by name."""
+    named = table("columns of a table", columns, "arrays")
+    for name, column in named.items():
+        if not isinstance(column, np.ndarray) or column.ndim != 1 or column.dtype.kind not in "fiubM":
+            raise fail(f"column {name!r}", "an array of numbers or dates", shown(column))
+    lengths = {name: len(column) for name, column in named.items()}
+    if len(set(lengths.values())) != 1:
+        raise fail("columns of a table", "at least one, all of one length", lengths)
 
 
 def _check_distinct(path: Path, header: Sequence[str]) -> None:

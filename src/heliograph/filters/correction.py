@@ -12,7 +12,7 @@ import numpy as np
 
 from heliograph.filters.precise import precise_update
 from heliograph.filters.scalars import smallest_scalars, young_omega, young_sweep, zero_mean_sweep
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import Pick, runs_last, runs_last_of, where_any, where_each
 from heliograph.numerics.readable import readable
@@ -73,7 +73,9 @@ class Scalars(Module):
 
 def as_array(scalars: Scalars | None) -> np.ndarray:
     """Two numbers, NaN where the trace is to be minimised over them."""
-    return np.full(2, np.nan) if scalars is None else scalars.values
+    if scalars is None:
+        return np.full(2, np.nan)
+    return instance("scalars", scalars, Scalars, "Scalars").values
 
 
 def as_scalars(values: np.ndarray) -> Scalars | None:

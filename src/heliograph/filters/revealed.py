@@ -17,9 +17,10 @@ from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.fading import uncertain_chain
-from heliograph.model.over_time import at, first
+from heliograph.model.over_time import OverTime, at, first, unstack
 from heliograph.model.plant import AnyPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import ArrayLike, Bool, Float
 from heliograph.random_affine.base import AbstractRandomAffine, given, memories
@@ -165,11 +166,11 @@ def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
 def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> RevealedFilter:
     """The best linear filter that is told, with each measurement, what the links remember: modes, or drifting gains.
 
-    It hears what `with_flag` delivers. Claim: "exact", given what is told; "nominal" where probabilities within a mode
-    are uncertain.
+    It takes what `with_flag(link)` delivers; a `Node` refuses flags of the step before. Claim: "exact", given what is
+    told; "nominal" where probabilities within a mode are uncertain.
 
     Raises:
-        ValueError: a plant or sensor that is not linear, or parts that do not fit.
+        ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
     Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
     """
     return _revealed(plant, sensor, channel, late=False)
@@ -178,10 +179,11 @@ def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> R
 def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> RevealedFilter:
     """The best linear filter that is told, with each measurement, what the links remembered at the step before.
 
-    It hears what `with_flag(late=True)` delivers. Claim: as `mode_known_filter`.
+    It takes what `with_flag(link, late=True)` delivers; a `Node` refuses flags of the same step. Claim: as
+    `mode_known_filter`.
 
     Raises:
-        ValueError: a plant or sensor that is not linear, or parts that do not fit.
+        ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
     Source: the Kalman filter given the modes, and one update with the law of the mode that follows the last.
     """
     return _revealed(plant, sensor, channel, late=True)
@@ -189,6 +191,10 @@ def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Re
 
 def _revealed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> RevealedFilter:
     check_linear("filter that is told the mode", plant, sensor)
+    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
+    if any(one.erases for one in steps if isinstance(one, AbstractRandomAffine)):
+        wanted = "a channel without erasures (told_filter with flags=np.eye(modes) takes them)"
+        raise fail("filter that is told the mode", wanted, "one that loses packets")
     start = first(plant)
     check_link(first(sensor), first(channel), len(start.states))
     return RevealedFilter(

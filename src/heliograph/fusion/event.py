@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.fusion.quantizer import AbstractQuantizer, Quantized
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, rank
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Bool, Float
@@ -38,7 +38,7 @@ class EventSending(AbstractQuantizer):
     told: bool = eqx.field(static=True, default=True)
 
     def __init__(self, threshold: ArrayLike, told: bool = True):
-        self.threshold = array("threshold", threshold, () if np.ndim(threshold) == 0 else (None,))
+        self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)
         self.told = told

@@ -20,7 +20,8 @@ def level_weights(levels: ArrayLike) -> Float[np.ndarray, "N"]:
         ValueError: levels that are not positive.
     Source: H-infinity quantized fusion over amplify-and-forward relays, Theorem 4, in closed form.
     """
-    inverse = _levels(levels) ** -2.0
+    gamma = _levels(levels)
+    inverse = (gamma.min() / gamma) ** 2  # relative to the smallest level: at most 1, so that nothing overflows
     return np.asarray(inverse / inverse.sum())
 
 

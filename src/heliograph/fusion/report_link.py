@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
-from heliograph.numerics.check import check_count, fail, instance, probabilities
+from heliograph.numerics.check import check_count, fail, instance, probabilities, rank
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -40,7 +40,7 @@ class ReportLink(Module):
         self.channel, self.every = channel, check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")
-        if np.ndim(delay) == 0:
+        if rank("delay", delay) == 0:
             steps = check_count("delay of a report link", delay, 0)
             self.delay = np.eye(steps + 1)[steps]
         else:

@@ -7,7 +7,7 @@ import numpy as np
 from heliograph.fusion.rules import AbstractFusion, Covariances, Fused, Means
 from heliograph.fusion.weights import matrix_weights, weighted
 from heliograph.model.estimate import Claim, weakest
-from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, array, fail, rank
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import Array, ArrayLike, Float
 
@@ -33,7 +33,7 @@ class SplitIntersection(AbstractFusion):
     known: Float[Array, "node n node n"]
 
     def __init__(self, known: ArrayLike):
-        found = array("known part", known, (None,) * np.ndim(known))
+        found = array("known part", known, (None,) * rank("known part", known))
         if found.ndim == 3 and found.shape[1] == found.shape[2]:
             nodes, n, _ = found.shape
             each = np.arange(nodes)

@@ -1,9 +1,13 @@
 """Best linear unbiased weights of several estimates whose errors' joint covariance is known, also a singular one."""
 
+from collections.abc import Callable
+from functools import wraps
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.linalg import eigh, regular_solve, symmetrize
 from heliograph.numerics.types import Array, Float
@@ -11,6 +15,23 @@ from heliograph.numerics.types import Array, Float
 RANK = 4096  # units of rounding of the largest eigenvalue: directions below have no error
 
 
+Weights = Callable[..., Float[jax.Array, "n node n"]]
+
+
+def _of_joint(weights: Weights) -> Weights:
+    """Weights that refuse what is no joint covariance."""
+
+    @wraps(weights)
+    def call(joint: Array, *rest: Array) -> Float[jax.Array, "n node n"]:
+        shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
+        if len(shape) != 4 or shape[:2] != shape[2:]:
+            raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or shown(joint))
+        return weights(joint, *rest)
+
+    return call
+
+
+@_of_joint
 @compiled
 def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """W_i with sum_i W_i = I that make W P W' smallest: W = (E' U^+ E)^-1 E' U^+, E = [I; ...; I], U = P + E D E'.
@@ -56,6 +77,7 @@ def factored_weights(
     return jnp.asarray(unbiased.reshape(n, nodes, n))
 
 
+@_of_joint
 @compiled
 def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """The best weights for each component of the state by itself, diagonal W_i."""
@@ -65,6 +87,7 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     return jnp.einsum("ai,ab->aib", each, jnp.eye(n))
 
 
+@_of_joint
 @compiled
 def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n node n"]:
     """One number for each estimate, W_i = w_i I, that make tr W P W' smallest."""

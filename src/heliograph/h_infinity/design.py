@@ -109,6 +109,7 @@ def smallest_recursive_level(
         ModuleNotFoundError: cvxpy or the solver is not installed.
     Source: H-infinity fusion over amplify-and-forward relays, Theorem 2.
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem")
     check_choice("objective", objective, Objective)
     check_choice("solver", solver, Solver)
     start = None if initial is None else _weight(initial, system.states)
@@ -138,6 +139,7 @@ def horizon_design(
         ModuleNotFoundError: cvxpy or the solver is not installed.
     Source: H-infinity fusion over amplify-and-forward relays, Theorems 1 and 2, solved jointly (not in the paper).
     """
+    instance("system", system, GrowthSystem, "a GrowthSystem")
     check_choice("solver", solver, Solver)
     n, m = system.states, system.received
     given = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))

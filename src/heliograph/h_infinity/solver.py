@@ -16,7 +16,7 @@ from heliograph.h_infinity.step import (
     independent_parts,
     linear_forms,
 )
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.extras import how_to_install
 from heliograph.numerics.types import Float
 
@@ -47,8 +47,8 @@ def solvers() -> ModuleType:
 
 def check_choice(name: str, value: str, choices: object) -> None:
     """Raise ValueError unless `value` is one of a Literal's choices."""
-    if value not in get_args(choices):
-        raise fail(name, f"one of {', '.join(get_args(choices))}", repr(value))
+    if not isinstance(value, str) or value not in get_args(choices):
+        raise fail(name, f"one of {', '.join(get_args(choices))}", shown(value))
 
 
 def run_solver(problem: "Problem", solver: Solver) -> str:

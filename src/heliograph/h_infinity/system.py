@@ -148,8 +148,11 @@ def _growth(steps: int, name: str, value: Varying | tuple[Varying, Varying]) -> 
 def _weight(value: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     weight = np.asarray(value, dtype=np.float64) * np.eye(2 * n) if np.ndim(value) == 0 else value
     result: np.ndarray = array("initial weight", weight, (2 * n, 2 * n))
-    if smallest_eigenvalue(symmetric_weight("initial weight", result)) <= 0:
-        raise fail("initial weight", "a positive definite matrix", f"eigenvalues {np.linalg.eigvalsh(result)}")
+    unit = float(np.max(np.abs(result), initial=0.0)) or 1.0  # of the largest doubles no eigenvalue is found
+    symmetric = symmetric_weight("initial weight", result / unit)
+    if smallest_eigenvalue(symmetric) <= 0:
+        smallest = smallest_eigenvalue(symmetric) * unit
+        raise fail("initial weight", "a positive definite matrix", f"smallest eigenvalue {smallest:.3g}")
     return result
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from inspect import signature
 
 import jax
 import numpy as np
@@ -54,6 +55,10 @@ def describe(network: Build) -> Description:
         expected = "a function that returns it with hg.free(...) in it, so that it can be built with other numbers"
         raise fail("network to be learned", expected, "a Network")
     function("network to be learned", network, "nothing that returns a Network")
+    try:
+        signature(network).bind()
+    except TypeError as error:
+        raise fail("network to be learned", "a function without arguments", str(error)) from None
     asking = Asking()
     with reading(asking), jax.enable_x64(True):
         checked(network())

@@ -9,7 +9,7 @@ import numpy as np
 
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.transforms import to_line
-from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.check import array, fail, rank, shown
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.network import Network
@@ -40,12 +40,12 @@ def free(start: ArrayLike, name: str | None = None, kind: Kind | None = None) ->
     Raises:
         ValueError: a start that is no number, or an unknown kind.
     """
-    if kind is not None and kind not in get_args(Kind):
+    if kind is not None and not (isinstance(kind, str) and kind in get_args(Kind)):
         raise fail("kind of a free number", f"one of {', '.join(get_args(Kind))}", shown(kind))
     if name is not None and (not isinstance(name, str) or not name):
         raise fail("name of a free number", "a text", shown(name))
     what = "free number" if name is None else name
-    value = array(f"start of {what}", start, (None,) * np.ndim(np.asarray(start)))
+    value = array(f"start of {what}", start, (None,) * rank(f"start of {what}", start))
     reader = _reader.get()
     return (value if value.ndim else float(value)) if reader is None else reader.read(value, name, kind)
 

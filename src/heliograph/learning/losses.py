@@ -12,7 +12,7 @@ from heliograph.learning.loss_law import AbstractLossLaw, IndependentLosses, Mar
 from heliograph.learning.loss_tests import LossMemory, loss_memory
 from heliograph.learning.running_losses import RunningRateLosses
 from heliograph.learning.stretches import Fates, as_fates
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import fail, scalar, table
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import AbstractRandomAffine
 
@@ -84,7 +84,7 @@ def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict
     Raises:
         ValueError: as `learn_losses`.
     """
-    return {name: learn_losses(own, held_out) for name, own in fates.items()}
+    return {name: learn_losses(own, held_out) for name, own in table("fates", fates, "fates").items()}
 
 
 def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:

@@ -1,11 +1,11 @@
 """What became of packets: 0 arrived, 1 lost, NaN nobody knows, in stretches between which nothing is known."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, fail, items, rank, table
 from heliograph.numerics.types import ArrayLike, Float
 
 Fates = list[Float[np.ndarray, " packets"]]
@@ -61,6 +61,7 @@ def fates_by_node(
     Raises:
         ValueError: as `fates_of_sequence`; not one node for each number.
     """
+    items("names of nodes", node, "names")
     names = np.asarray([str(name) for name in node])
     numbers = array("sequence numbers", sequence, (len(names),))
     when = None if sent is None else array("times of sending", sent, (len(names),))
@@ -80,7 +81,7 @@ def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
     Raises:
         ValueError: no hops, other values, a packet heard behind a hop but not before it.
     """
-    if not arrived:
+    if not table("arrivals by hop", arrived, "arrays"):
         raise fail("arrivals by hop", "at least one hop", "none")
     result: dict[str, Fates] = {}
     before: np.ndarray | None = None
@@ -111,8 +112,9 @@ def fates_of_measurements(measurements: Mapping[str, ArrayLike]) -> dict[str, Fa
         ValueError: no table of numbers.
     """
     result: dict[str, Fates] = {}
-    for node, value in measurements.items():
-        found = np.asarray(value, dtype=np.float64)
+    for node, value in table("measurements", measurements, "arrays").items():
+        name = f"measurements of {node!r}"
+        found = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
         gone = np.isnan(
             array(f"measurements of {node!r}", found[:, None] if found.ndim == 1 else found, (None, None), True)
         )
@@ -129,9 +131,9 @@ def as_fates(value: object) -> Fates:
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
-    items: list[Any] = list(value) if isinstance(value, Sequence | np.ndarray) else [value]
-    several = len(items) > 0 and all(np.ndim(item) == 1 for item in items)
-    parts = [array("fates", part, (None,), missing=True) for part in (items if several else [np.asarray(value)])]
+    items: list[Any] = list(value) if isinstance(value, Sequence | np.ndarray) and rank("fates", value) else [value]
+    several = len(items) > 0 and all(rank("fates", item) == 1 for item in items)
+    parts = [array("fates", part, (None,), missing=True) for part in (items if several else [cast(ArrayLike, value)])]
     for part in parts:
         if np.any((part != 0) & (part != 1) & ~np.isnan(part)):
             raise fail(

@@ -7,7 +7,8 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.linear.modal_lift import lifted_modes
-from heliograph.linear.system import LinearSystem, Steps
+from heliograph.linear.moments_over_time import Settling, check_moments
+from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -27,6 +28,7 @@ from heliograph.random_affine.second_moments import has_known_gain
 
 T = TypeVar("T")
 EPS = float(np.finfo(np.float64).eps)
+HIGHEST = 31  # degree: C(62, 31) is below 2^63
 KEPT_ENTRIES = 100_000  # of a matrix that is kept for the whole horizon
 
 
@@ -64,28 +66,47 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
         distinct = {id(r.measurement): r.measurement for r in routes}
         modes = {place: joint_modes(item, order=degree) for place, item in distinct.items()}
         each = [modes[id(r.measurement)] for r in routes]
+        refuse_lift(degree, n, m, horizon, max(len(one.initial) for one in modes.values()))
         return lifted_modes([r.plant for r in routes], each, degree, moments, want)
-    parts, lost = [], []
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
+    varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
+    steps, process_rounding, heard_rounding = _lifted_steps(routes, degree, moments, varies)
+    return LinearSystem(steps, mean, spread, linear_rows(n, degree), process_rounding, heard_rounding, start_lost)
+
+
+def _lifted_steps(
+    routes: Sequence[Route], degree: int, moments: Float[np.ndarray, "M"], varies: tuple[bool, bool]
+) -> tuple[Steps, np.ndarray, np.ndarray]:
+    """The system's steps and the rounding of both noises; `varies`: whether the plant does, and what measures it.
+
+    Where nothing varies and the moments of the state have come to stay, all later steps are as the last, to rounding.
+    """
+    parts, lost = [], []
+    settling = Settling(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
-    for route in routes:
-        if last is None or not eqx.tree_equal(route.plant, last.plant):
-            move = Lifted(route.plant, degree, isinstance(plant, OverTime))
-        if last is None or not eqx.tree_equal(route.measurement, last.measurement):
-            varies = isinstance(sensor, OverTime) or isinstance(channel, OverTime)
-            listen = Lifted(route.measurement, degree, varies)
+    for k, route in enumerate(routes):
+        if settling.stays(moments):
+            break
+        if last is None or not _same(route.plant, last.plant):
+            move = Lifted(route.plant, degree, varies[0])
+        if last is None or not _same(route.measurement, last.measurement):
+            listen = Lifted(route.measurement, degree, varies[1])
         last = route
         process, process_lost = move.conditional_spread(moments)
         moments = move.push(moments)
+        check_moments(moments, k, 2 * degree)
         noise, noise_lost = listen.conditional_spread(moments)
         parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
         lost.append((process_lost, noise_lost))
-    steps = Steps(*map(np.array, zip(*parts, strict=True)))
-    process_rounding, heard_rounding = map(np.array, zip(*lost, strict=True))
-    want = linear_rows(n, degree)
-    return LinearSystem(steps, mean, spread, want, process_rounding, heard_rounding, start_lost)
+    steps = Steps(*(over_horizon(part, len(routes)) for part in zip(*parts, strict=True)))
+    process_rounding, heard_rounding = (over_horizon(part, len(routes)) for part in zip(*lost, strict=True))
+    return steps, process_rounding, heard_rounding
+
+
+def _same(one: AbstractRandomAffine, two: AbstractRandomAffine) -> bool:
+    return one is two or bool(eqx.tree_equal(one, two))
 
 
 class Lifted:
@@ -108,9 +129,10 @@ class Lifted:
 
     def push(self, moments: Float[Array, "M"]) -> Float[np.ndarray, "L"]:
         """E[mono(z)] from E[mono(y)], both of twice the degree."""
-        if self.whole is not None:
-            return np.asarray(self.whole @ np.asarray(moments))
-        return np.asarray(push(self.route, 2 * self.degree, moments))
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            if self.whole is not None:
+                return np.asarray(self.whole @ np.asarray(moments))
+            return np.asarray(push(self.route, 2 * self.degree, moments))
 
     def conditional_spread(self, moments: Float[Array, "M"]) -> tuple[Float[np.ndarray, "m m"], Float[np.ndarray, "m"]]:
         """E[Cov(Z | y)] = E[Z Z'] - K E[Y Y'] K', and the rounding of its diagonal.
@@ -221,15 +243,19 @@ def each_step(item: T | OverTime, horizon: int) -> list[T]:
     return unstack(item)[:horizon]
 
 
-def refuse_lift(degree: int, states: int, outputs: int, horizon: int) -> None:
+def refuse_lift(degree: int, states: int, outputs: int, horizon: int, modes: int = 1) -> None:
     """Raise ValueError for a horizon or degree below 1 or a lifted system of more than MEMORY_LIMIT_ENTRIES numbers."""
     check_horizon(horizon)
-    check_count("degree of the lift", degree)
+    if check_count("degree of the lift", degree) > HIGHEST:
+        got = f"{degree}: binomials of twice the degree are no numbers of 64 bits"
+        raise fail("degree of the lift", f"at most {HIGHEST}", got)
     n, m = count(states + 1, degree), count(outputs + 1, degree)
-    entries = horizon * (2 * n * n + n * m + m * m)
+    entries = horizon * (2 * (n * modes) ** 2 + n * modes * m + m * m)
+    of_modes = f" in {modes} modes" if modes > 1 else ""
     if entries > MEMORY_LIMIT_ENTRIES:
         got = (
-            f"{entries:,} ({n - 1} monomials of {states} states and {m - 1} of {outputs} outputs, {horizon} steps); "
+            f"{entries:,} ({n - 1} monomials of {states} states{of_modes} and {m - 1} of {outputs} outputs, "
+            f"{horizon} steps); "
             "use a lower degree, a shorter horizon, or fewer states or outputs"
         )
         raise fail(f"lift of degree {degree}", f"at most {MEMORY_LIMIT_ENTRIES:,} entries", got)

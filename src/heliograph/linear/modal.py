@@ -8,7 +8,7 @@ from heliograph.model.channel import Channel
 from heliograph.model.over_time import first
 from heliograph.numerics.check import array, covariance, fail
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.random_affine.base import memories
+from heliograph.random_affine.base import as_maps, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import joint_modes
@@ -40,6 +40,8 @@ def modal_system(
         ValueError: maps whose sizes do not fit, gains in `move` that drift (no finitely many functions of them are
             closed), fewer steps than the horizon.
     """
+    for what, part in (("move", move), ("measure", measure)):
+        as_maps(what, [first(part)])
     n = first(move).inputs
     sizes = {"outputs of the move": first(move).outputs, "inputs of the measurement": first(measure).inputs}
     for name, size in sizes.items():

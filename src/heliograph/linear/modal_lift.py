@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heliograph.linear.system import LinearSystem, Steps
+from heliograph.linear.moments_over_time import EPS, Settling, check_moments
+from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.modes import JointModes
@@ -32,16 +33,23 @@ def lifted_modes(
     before = second_moments(moments, n + 1, degree)
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
-    parts, rounding = [], []
+    parts, rounding, earlier = [], [], law
     distinct = {id(heard): heard for heard in measurements}
     of_modes = {place: heard.moments(degree) for place, heard in distinct.items()}
     of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
-    for plant, heard in zip(plants, measurements, strict=True):
+    # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
+    settling = Settling(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
+    for k, (plant, heard) in enumerate(zip(plants, measurements, strict=True)):
+        if settling.stays(moments) and np.array_equal(law, earlier) and k > 1:
+            break
+        earlier = law
         moved, means = of_plant[id(plant)], of_modes[id(heard)]
-        moments = np.asarray(push(plant, 2 * degree, moments))
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
+            moments = np.asarray(push(plant, 2 * degree, moments))
+        check_moments(moments, k, 2 * degree)
         after, carried = second_moments(moments, n + 1, degree), moved @ before @ moved.T
         chosen = np.einsum("i,ij,ijl->jl", law, rows, np.eye(modes)[None] - rows[:, None, :])
-        law = law @ rows
+        law = _stays(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise = np.zeros((1, 1))
         for p, matrix, route in zip(law, means, heard.maps, strict=True):
@@ -50,7 +58,12 @@ def lifted_modes(
         output = np.concatenate(list(means), axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
         parts.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
-        rounding.append(np.finfo(float).eps * np.kron(law, np.diag(after)))
+        rounding.append(EPS * np.kron(law, np.diag(after)))
         before, rows = after, np.asarray(heard.transition)
-    steps = Steps(*map(np.array, zip(*parts, strict=True)))
-    return LinearSystem(steps, mean, start, np.tile(want, (1, modes)), rounding)
+    steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*parts, strict=True)))
+    return LinearSystem(steps, mean, start, np.tile(want, (1, modes)), over_horizon(rounding, len(plants)))
+
+
+def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:
+    """The law after a step; itself where it only flips last bits."""
+    return law if np.allclose(law, after, rtol=4 * EPS, atol=0) else after

@@ -6,13 +6,14 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.linear.schedule import Gains, Schedule
-from heliograph.linear.system import LinearSystem, Steps
+from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.estimate import Claim, weakest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.small_matrix import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
+SPAN, STILL = 100, 1e-12  # steps over which a covariance that changes by less, relatively, has settled
 DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
 
 
@@ -68,7 +69,13 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     instance("system", system, LinearSystem, "a LinearSystem")
     spread, want, parts = system.covariance, system.want, []
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
+    steady = system.steady_from
+    last: tuple[np.ndarray, np.ndarray] | None = None
     for k in range(system.horizon):
+        if k > steady and (k - steady) % SPAN == 0:
+            if last is not None and _is_still(spread, last[0]) and _is_still(rounding, last[1]):
+                break  # what follows is the same, to rounding
+            last = spread, rounding
         s = system.step(k)
         gain, predicted, spread = covariance_step(spread, s)
         keep = np.eye(len(spread)) - gain @ s.output
@@ -83,7 +90,14 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         error = np.diag(want @ rounding @ want.T)
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
-    return Schedule(Gains(*map(np.array, zip(*parts, strict=True))), system.mean, _supported(claim, worst, when))
+    gains = Gains(*(over_horizon(part, system.horizon) for part in zip(*parts, strict=True)))
+    return Schedule(gains, system.mean, _supported(claim, worst, when))
+
+
+def _is_still(after: Float[np.ndarray, "N N"], before: Float[np.ndarray, "N N"]) -> bool:
+    """Whether covariances differ by less than rounding adds up to over SPAN steps."""
+    unit = np.sqrt(np.abs(np.diag(after)))
+    return bool(np.all(np.abs(after - before) <= STILL * np.outer(unit, unit)))
 
 
 def _supported(claim: Claim, lost: float, step: int) -> Claim:

@@ -1,5 +1,6 @@
 """A linear system whose noises are white: what plant, relays and sensors become before gains are computed."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -80,6 +81,22 @@ class LinearSystem(Module):
     def step(self, k: int) -> Steps:
         """The matrices of one step, without time axis."""
         return Steps(*(field[k] for field in self.steps))
+
+    @property
+    def steady_from(self) -> int:
+        """The first step from which on all steps are as the last."""
+        changes = [0]
+        for field in (*self.steps, self.rounding, self.heard_rounding):
+            moved = field[1:] != field[:-1]
+            changed = np.flatnonzero(np.any(moved, axis=tuple(range(1, moved.ndim))))
+            changes += (changed[-1:] + 1).tolist()
+        return max(changes)
+
+
+def over_horizon(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
+    """Parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
+    found = np.array(parts)
+    return np.concatenate([found, np.repeat(found[-1:], horizon - len(found), axis=0)])
 
 
 def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:

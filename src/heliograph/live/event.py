@@ -9,6 +9,7 @@ from heliograph.numerics.types import ArrayLike, Float
 
 Verdict = Literal["used", "duplicate", "conflict", "late", "future", "implausible"]
 VERDICTS: tuple[Verdict, ...] = get_args(Verdict)
+WHOLE = "a whole number from 0 to 2^63 - 1"
 INPUTS = "inputs"  # the node whose events are the plant's inputs
 
 
@@ -41,11 +42,9 @@ class Known(NamedTuple):
 
 
 def whole(name: str, value: object) -> int:
-    """A whole number."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise fail(name, "a whole number", shown(value))
-    if abs(int(value)) >= 2**63:
-        raise fail(name, "a number of 64 bits", value)
+    """A whole number that counts: from 0, of 63 bits."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= int(value) < 2**63:
+        raise fail(name, WHOLE, shown(value))
     return int(value)
 
 

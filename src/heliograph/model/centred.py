@@ -11,7 +11,7 @@ from heliograph.model.fading import without_memory
 from heliograph.model.over_time import OverTime, at, first, over_time, steps_covered
 from heliograph.model.plant import AnyPlant, check_plant
 from heliograph.model.sensor import AnySensor, check_sensor
-from heliograph.numerics.check import array, check_horizon, fail
+from heliograph.numerics.check import array, check_horizon, fail, rank
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.traced import library
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -48,6 +48,7 @@ def _centred(channel: AbstractRandomAffine, reference: ArrayLike | OverTime) -> 
     if channel.past or channel.erases:
         what = "late" if channel.past else "one that erases"
         raise fail("channel less a reference", "neither late nor lossy by itself (put `centred` inside)", what)
+    rank("reference", reference)
     r = array("reference", library(reference).atleast_1d(reference), (channel.inputs,))
     forgets = without_memory(channel)
     assert isinstance(forgets, AbstractRandomAffine)

@@ -183,5 +183,10 @@ def check_link(sensor: AbstractSensor, channel: AbstractRandomAffine, states: in
     if channel.past and not late:
         expected = "one without delays (linear_filter knows them; hg.filters.late_filter a constant one for any filter)"
         raise fail("channel", expected, f"one that is late by up to {channel.past} steps")
+    check_sent(sensor, channel)
+
+
+def check_sent(sensor: AbstractSensor, channel: AbstractRandomAffine) -> None:
+    """Raise ValueError unless a channel takes as many numbers as the sensor sends."""
     if sent(channel) != len(sensor.outputs):
         raise fail("channel", f"one that takes the sensor's {len(sensor.outputs)} outputs", f"{sent(channel)} inputs")

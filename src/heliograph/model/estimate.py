@@ -4,6 +4,7 @@ from typing import Literal
 
 import equinox as eqx
 
+from heliograph.numerics.check import fail, items, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
@@ -45,5 +46,14 @@ class Innovation(Module):
 
 
 def weakest(claims: list[Claim]) -> Claim:
-    """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them."""
+    """The strongest claim that all of `claims` support: of exact, upper, nominal and none the last among them.
+
+    Raises:
+        ValueError: no claims, or something else among them.
+    """
+    if not items("claims", claims, "claims"):
+        raise fail("claims", "at least one", "none")
+    for claim in claims:
+        if not isinstance(claim, str) or claim not in STRENGTH:
+            raise fail("claim", f"one of {', '.join(STRENGTH)}", shown(claim))
     return min(claims, key=STRENGTH.__getitem__)

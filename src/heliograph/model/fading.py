@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
-from heliograph.numerics.check import array, check_count, fail, scalar
+from heliograph.numerics.check import array, check_count, fail, flag, scalar
 from heliograph.numerics.traced import library
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
@@ -105,6 +105,7 @@ def with_flag(
     Raises:
         ValueError: rows that are no probabilities, or a channel that holds no memory, or several and `chain` not given.
     """
+    late = flag("late", late)
     held = list(memories(channel).values())
     if chain is None and (not held or (probabilities is not None and len(held) > 1)):
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")

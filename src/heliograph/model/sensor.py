@@ -104,7 +104,7 @@ class LinearSensor(AbstractSensor):
         outputs: Sequence[str] | None = None,
         circular: Sequence[str] = (),
     ):
-        self.matrix = array("sensor matrix", matrix, (None, None))
+        self.matrix = array("sensor matrix", matrix, ("outputs", "states"))
         self.noise = as_noise("sensor noise", noise, self.matrix.shape[-2])
         self.outputs = names("sensor outputs", outputs, self.matrix.shape[-2], "y")
         self.circular = _circular(self.outputs, circular)

@@ -6,6 +6,7 @@ from collections.abc import Set as AbstractSet
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +16,7 @@ from heliograph.numerics.traced import is_traced
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units
+TINY = float(np.finfo(np.float64).tiny)  # a lower bound of what is positive
 T = TypeVar("T")
 MOST = 2**32 - 1  # of runs and steps, since each has a key of its own in which 32 bits count
 PROBABILITY_TOLERANCE = 1e-9  # sums of decimal fractions such as .1 + .2 + .7
@@ -35,12 +37,16 @@ def shown(value: object) -> str:
 
 
 def shown_error(error: Exception) -> str:
-    """An error as a short part of one line."""
+    """An error as a short part of one line; of NumPy where JAX has to follow, what to write instead."""
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "one that calls NumPy: write it with jax.numpy"
     return " ".join(f"{type(error).__name__}: {error}".split())[:120]
 
 
-def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: bool = False) -> Any:
-    """Return `value` as a float64 array of the given shape (None: any length); a traced one keeps its precision.
+def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], missing: bool = False) -> Any:
+    """Return `value` as a float64 array of the given shape; a traced one keeps its precision.
+
+    A length in the shape may be any: None, or a name by which an error calls it.
 
     Numbers must be real and finite; `missing` lets NaN pass, as a number that did not arrive. Of what is traced the
     shape alone is checked.
@@ -48,11 +54,10 @@ def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: b
     tell(name, value, REAL)
     result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, result.shape, strict=True)
+        not isinstance(want, int) or want == have for want, have in zip(shape, result.shape, strict=True)
     )
     if not matches:
-        want = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
-        raise fail(name, f"shape {want}", f"shape {result.shape}")
+        raise fail(name, _shape_words(shape, result.ndim), f"shape {result.shape}")
     if is_traced(result):
         return result
     wrong = np.isinf(result) if missing else ~np.isfinite(result)
@@ -60,6 +65,13 @@ def array(name: str, value: ArrayLike, shape: tuple[int | None, ...], missing: b
         got = f"{np.count_nonzero(wrong)} that are not finite"
         raise fail(name, "finite numbers, or NaN for what is missing" if missing else "finite numbers", got)
     return result
+
+
+def _shape_words(shape: tuple[int | str | None, ...], dimensions: int) -> str:
+    """A shape in words, with an example of a table where something else than one came."""
+    lengths = ", ".join("any" if length is None else str(length) for length in shape)
+    example = ", such as [[1, 0]]" if len(shape) == 2 and dimensions < 2 else ""
+    return f"shape ({lengths}){example}"
 
 
 def _numbers(name: str, value: ArrayLike) -> Any:
@@ -82,8 +94,14 @@ def scalar(name: str, value: ArrayLike, low: float = -np.inf, high: float = np.i
     tell(name, value, Domain(low=low, high=high))
     result = array(name, value, ())
     if not is_traced(result) and not low <= result <= high:
-        raise fail(name, f"a number from {low:g} to {high:g}", f"{float(result):g}")
+        raise fail(name, _range_words(low, high), f"{float(result):g}")
     return result
+
+
+def _range_words(low: float, high: float) -> str:
+    if high == np.inf:
+        return "a positive number" if 0 < low <= TINY else f"a number of at least {low:g}"
+    return f"a number of at most {high:g}" if low == -np.inf else f"a number from {low:g} to {high:g}"
 
 
 def items(name: str, value: object, what: str) -> list[Any]:
@@ -122,6 +140,26 @@ def file_path(name: str, value: object) -> Path:
     if not isinstance(value, str | os.PathLike) or "\0" in os.fspath(value):
         raise fail(name, "a path", shown(value))
     return Path(value)
+
+
+def rank(name: str, value: object) -> int:
+    """Return the number of axes of what may become an array."""
+    try:
+        return np.ndim(cast(ArrayLike, value))
+    except ValueError:  # rows of different lengths
+        raise fail(name, "an array of numbers", shown(value)) from None
+
+
+def flag(name: str, value: object) -> bool:
+    """Return True or False."""
+    if not isinstance(value, bool | np.bool_):
+        raise fail(name, "True or False", shown(value))
+    return bool(value)
+
+
+def text(name: str, value: object) -> str:
+    """Return a text."""
+    return instance(name, value, str, "a text")
 
 
 def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
@@ -262,5 +300,5 @@ def names(name: str, value: Sequence[str] | None, count: int, prefix: str) -> tu
         return tuple(f"{prefix}{i}" for i in range(count))
     result = tuple(str(v) for v in items(name, value, "names"))
     if len(result) != count or len(set(result)) != count:
-        raise fail(name, f"{count} distinct names", list(result))
+        raise fail(name, f"{count} distinct names", shown(list(result)))
     return result

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterable
+from datetime import datetime
 from typing import Literal
 
 import numpy as np
@@ -61,6 +62,19 @@ def _instant(match: re.Match[str]) -> int:
         raise ValueError
     ahead = (60 * hours + minutes) * 60 * 10**9
     return local - ahead if zone[0] == "+" else local + ahead
+
+
+def instant(text: str) -> datetime:
+    """A date of ISO 8601 with its zone, to the microsecond.
+
+    Raises:
+        ValueError: a text that is none, one without a zone, a year before 1678 or after 2261.
+    """
+    match = DATE.fullmatch(text)
+    if match is None or match["zone"] is None or int(match["day"][:4]) not in YEARS:
+        raise ValueError
+    zone = "+00:00" if match["zone"] in ("Z", "UTC") else match["zone"]
+    return datetime.fromisoformat(f"{match['day']}T{match['clock'] or '00:00'}{zone}")
 
 
 def seconds_between(time: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import PyTree
@@ -71,4 +72,7 @@ def _traced(tree: PyTree) -> bool:
 
 
 def _as_array(leaf: object) -> object:
-    return np.asarray(leaf) if isinstance(leaf, int | float) else leaf
+    found = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
+    if isinstance(found, np.ndarray) and found.dtype.kind in "OUS":
+        raise fail("argument", "numbers that a double can hold", shown(leaf))
+    return found

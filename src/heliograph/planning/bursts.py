@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.check import array, check_count, fail, items, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.choose import ROUNDING, listening
@@ -59,9 +59,17 @@ def burst_sending(
         ValueError: nothing to compare, powers that are negative or above the peak, paths that are not steady.
     """
     case = listening(paths, powers, error, states)
+    if not (isinstance(peak, float) and peak == np.inf):
+        scalar("peak", peak, 0.0)
     p = array("powers", np.broadcast_to(np.asarray(powers, dtype=np.float64), paths.kappa[0].shape), (None,))
     loudest = float(np.min(np.divide(peak, p, out=np.full(p.shape, np.inf), where=p > 0)))
-    kept = [n for n in sorted({check_count("steps between bursts", n) for n in every}) if n <= loudest * (1 + ROUNDING)]
+    kept = [
+        n
+        for n in sorted(
+            {check_count("steps between bursts", n) for n in items("steps between bursts", every, "whole numbers")}
+        )
+        if n <= loudest * (1 + ROUNDING)
+    ]
     if not kept:
         raise fail("steps between bursts", f"some of at most {loudest:.6g}, which the peak allows", "none")
     told = case.told / np.where((each := heard(paths, p[None]).information[0]) > 0, each, 1.0)[:, None, None]

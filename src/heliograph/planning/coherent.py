@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import array, covariance, fail, scalar
+from heliograph.numerics.check import array, covariance, fail, instance, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.allocation import no_error_below
@@ -108,6 +108,7 @@ def coherent_powers(
     Raises:
         ValueError: no limit, a negative one.
     """
+    instance("coherent sum", heard, CoherentSum, "a CoherentSum")
     sum_, limit = _limits(heard, total, each)
     count = len(heard.signal)
     if sum_ == 0 or not np.any(limit * heard.signal):
@@ -122,6 +123,7 @@ def coherent_least_power(heard: CoherentSum, wanted: ArrayLike) -> CoherentDesig
     Raises:
         ValueError: an error that no power reaches, with the one that unlimited power leaves.
     """
+    instance("coherent sum", heard, CoherentSum, "a CoherentSum")
     wanted = float(scalar("wanted error", wanted, 0.0))
     b2 = heard.signal**2
     loud = np.divide(b2, heard.spread, out=np.where(b2 > 0, np.inf, 0.0), where=heard.spread > 0).sum()
@@ -152,6 +154,7 @@ def coherent_programme(
         ValueError: no limit, a negative one, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
+    instance("coherent sum", heard, CoherentSum, "a CoherentSum")
     cp = solvers()
     sum_, limit = _limits(heard, total, each)
     unit = np.sqrt(heard.second)

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import equinox as eqx
 import numpy as np
 
-from heliograph.numerics.check import array, check_count, covariance, fail
+from heliograph.numerics.check import array, check_count, covariance, fail, flag
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -46,7 +46,7 @@ class Error(Module):
             self.weight = dict(weight)
         else:
             self.weight = None if weight is None else covariance(WEIGHT, weight)
-        self.worst, self.at_end = bool(worst), bool(at_end)
+        self.worst, self.at_end = flag("worst", worst), flag("at_end", at_end)
         self.horizon = None if horizon is None else check_count("horizon of the error", horizon)
         self.period = check_count("period of the error", period)
         if self.horizon is not None and self.period > 1:

@@ -10,6 +10,7 @@ from heliograph.filters.linear import linear_filter
 from heliograph.model.channel import parallel
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import instance
 from heliograph.numerics.types import Float
 from heliograph.planning.criterion import Error
 from heliograph.planning.reallocation import allocated
@@ -24,6 +25,8 @@ T = TypeVar("T")
 
 def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "steps"]], error: Error) -> Network:
     """Every node with the filter "best" behind its channel, and with several nodes "best" of all that they receive."""
+    instance("network", network, Network, "a Network")
+    instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     if error.horizon is None:
         seconds = np.tile(steady_second(network.plant), (error.period, 1, 1))

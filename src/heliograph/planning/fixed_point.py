@@ -9,7 +9,7 @@ powers leads down, for the linearised cost is concave in p; how far to go the sl
 import numpy as np
 from scipy.optimize import brentq
 
-from heliograph.numerics.check import InputError, fail, scalar
+from heliograph.numerics.check import InputError, fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.allocation import Allocation, LeastPower
 from heliograph.planning.budget import Allowed, Budget
@@ -153,7 +153,7 @@ def swapped(paths: Paths, budget: Budget | None, error: Error | None, states: tu
     Raises:
         ValueError: a budget with a total.
     """
-    if budget is not None and budget.total is not None:
+    if budget is not None and instance("budget", budget, Budget, "a Budget").total is not None:
         raise fail("budget of least power", "limits of single transmitters, since the total is to be small", "a total")
     problem = one_hop(paths, Budget(1.0) if budget is None else budget, error, states)
     return _with_total(problem, np.inf)

@@ -79,7 +79,7 @@ class Followed:
         of_powers = jax.tree.map(lambda part: jnp.zeros((size, *part.shape)), m)._replace(powers=each)
         asked = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), of_error, of_powers)
         found = jax.vmap(pull)(asked)[0]
-        return Slopes(found[0], found[1:].reshape(*m.powers.shape, -1))
+        return Slopes(found[0], found[1:].reshape(*m.powers.shape, len(x)))
 
 
 @lru_cache(PROGRAMS)

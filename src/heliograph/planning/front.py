@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import array, fail
+from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.planning.task import Task
@@ -34,6 +34,8 @@ def error_over_power(
     Raises:
         ValueError: totals that are not positive, what `design` refuses.
     """
+    instance("network", network, Network, "a Network")
+    instance("task", task, Task, "a Task")
     powers = np.unique(array("budgets of the front", totals, (None,)))
     if not len(powers) or powers[0] <= 0:
         raise fail("budgets of the front", "positive numbers", list(totals))

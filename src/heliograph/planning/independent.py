@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heliograph.numerics.check import array, covariance, fail, names
+from heliograph.numerics.check import array, covariance, fail, instance, names, rank
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import Plants
 from heliograph.planning.criterion import Error
@@ -36,9 +36,9 @@ def independent_paths(
     Raises:
         ValueError: wrong shapes, kappa below 1, negative variances, a plant that settles nowhere, no law of x_0.
     """
-    error = Error() if error is None else error
+    error = instance("error", Error() if error is None else error, Error, "an Error")
     a = array("transition of paths", transition, (None, None))
-    n, hops = len(a), 1 if np.ndim(alpha) < 2 else np.shape(alpha)[1]
+    n, hops = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1]
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
     c = array("rows of paths", rows, (None, n))
     r = at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))

@@ -46,7 +46,7 @@ def limits_of(allowed: Allowed | None, wanted: float | None, shape: tuple[int, i
     steps, hops = shape
     if allowed is None:
         return Limits(np.zeros((0, steps * hops)), np.zeros(0), wanted)
-    each = [np.tile(one, steps) / steps for one in np.eye(hops)]
+    each = np.tile(np.eye(hops), steps) / steps
     rows = np.concatenate([np.eye(steps * hops), each, np.ones((1, steps * hops)) / steps])
     most = np.concatenate([allowed.peak.ravel(), allowed.each, [allowed.total]])
     kept = np.isfinite(most)

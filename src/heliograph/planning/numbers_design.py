@@ -34,6 +34,7 @@ def design_numbers(
     if least == 0:
         raise fail("wanted error", "a number above zero", "0")
     problem.at(problem.numbers.start)  # what cannot be is refused before any descent
+    problem.check_ends()
     limits = limits_of(_allowed(problem, budget), least, (error.steps, len(problem.names)))
     best = _best(problem, limits, starts, seed)
     if not np.isfinite(best.value):
@@ -52,7 +53,7 @@ def _allowed(problem: Problem, budget: Budget | ArrayLike | None) -> Allowed | N
         return None
     hops = len(problem.names)
     room = allowed(as_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((problem.asked.steps, hops)))
-    if min(np.min(room.peak), np.min(room.each), room.total) <= 0:
+    if min(np.min(room.peak, initial=np.inf), np.min(room.each, initial=np.inf), room.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return room
 

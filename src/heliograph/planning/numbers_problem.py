@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from heliograph.model.over_time import first
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import InputError, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.criterion import Error
 from heliograph.planning.followed import Followed, Slopes, programs
@@ -17,6 +17,8 @@ from heliograph.planning.modes_told import Measured, Settled, settled
 from heliograph.planning.state_power import check_stable
 from heliograph.planning.weighing import Weighing, weighing
 from heliograph.simulation.network import Network
+
+INSIDE = 1e-9  # of the way from an end to the start
 
 
 class Point(NamedTuple):
@@ -62,6 +64,23 @@ class Problem:
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
+
+    def check_ends(self) -> None:
+        """Raise ValueError where a number near an end of its own, the others at their starts, makes no network.
+
+        An end itself may be one that is never reached, as a noise of variance zero.
+        """
+        starts = {name: one.start for name, one in self.numbers.each.items()}
+        for name, (start, low, high) in self.numbers.each.items():
+            for end in (low, high):
+                near = np.where(np.isfinite(end), end, start)
+                near = near + INSIDE * (start - near)
+                values = {other: near if other == name else begin for other, begin in starts.items()}
+                try:
+                    self.network(np.concatenate([part.ravel() for part in values.values()]))
+                except InputError as error:
+                    what = f"{' '.join(str(end).split())}, where: {error}"
+                    raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
     def at(self, x: Vector, weighing: Weighing | None = None) -> Point:
         """Everything at a point, of an eigenvalue as sharp as the weighing has it.

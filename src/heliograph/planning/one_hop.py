@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import fail, instance, names
 from heliograph.numerics.types import Float
 from heliograph.planning.adjoint import covariances
 from heliograph.planning.budget import Allowed, allowed, as_budget
@@ -60,7 +60,8 @@ def one_hop(paths: Paths, budget: object, error: Error | None, states: tuple[str
     if error.steps != steps or (error.horizon is None) != (paths.plants.start is None):
         raise fail("error", f"one over the {steps} steps for which the paths were made", f"{error.steps}")
     n = paths.rows.shape[-1]
-    matrix = error.matrix(tuple(f"x{i}" for i in range(n)) if states is None else states)
+    states = names("states", states, n, "x")
+    matrix = error.matrix(states)
     weights = error.over()[:, None, None] * matrix
     everyone = np.ones(hops, dtype=bool)
     return OneHop(paths, weights, allowed(as_budget(budget), paths.names, everyone, np.zeros((steps, hops))))

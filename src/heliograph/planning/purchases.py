@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.channel import amplify_and_forward
+from heliograph.numerics.check import instance
 from heliograph.numerics.readable import readable
 from heliograph.planning.outcome import NetworkDesign
 from heliograph.planning.task import Task
@@ -45,6 +46,9 @@ def purchases_of(
     noise; without an exponent of the path loss, relays are not tried. A change that a design refuses, such as a last
     sensor left out, is not listed.
     """
+    instance("network", network, Network, "a Network")
+    instance("task", task, Task, "a Task")
+    instance("design", found, NetworkDesign, "a NetworkDesign")
     again = replace(task, starts=min(task.starts, STARTS))
     result = []
     for name, (changed, asked) in _changes(network, again, exponent).items():

@@ -7,7 +7,7 @@ import numpy as np
 
 from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.sensor import LinearSensor, refuse_angles
-from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.adjoint import Plants
 from heliograph.planning.channel_power import sent_powers
@@ -138,6 +138,8 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         ValueError: a network that is not of independent paths, a plant that is not linear or, without a horizon, not
             stable.
     """
+    instance("network", network, Network, "a Network")
+    instance("error", error, Error, "an Error")
     plant, steps = network.plant, error.steps
     check_constant_noise(plant)
     if first(plant).inputs:

@@ -21,6 +21,8 @@ from heliograph.planning.splits import path_noise, split_power
 GRID = 400  # lengths of the short hops that are tried, evenly and on a logarithmic scale
 SHORTEST = 1e-9  # of the way
 
+LARGE = 1e6  # a kappa of more is a hop of which nothing arrives
+
 
 @readable
 class RelayLine(NamedTuple):
@@ -64,7 +66,7 @@ def relay_line(
         ValueError: a negative rho, kappa below 1, hops that are longer together than the way.
     """
     r, e = float(scalar("rho", rho, 0.0)), float(scalar("path loss exponent", exponent, 0.0))
-    k, least = float(scalar("kappa", kappa, 1.0)), float(scalar("nearest", nearest, 0.0, 1.0))
+    k, least = float(scalar("kappa", kappa, 1.0, LARGE)), float(scalar("nearest", nearest, 0.0, 1.0))
     hops = check_count("relays", relays, 0) + 1
     if hops * least > 1:
         raise fail("relays", f"hops of {least:g} of the way each", f"{hops} of them")

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.check import check_count, fail, items
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.planning.adjoint import corrected
@@ -64,8 +64,9 @@ def best_schedule(
     Raises:
         ValueError: no periods, more sensors at once than there are, paths that are not steady.
     """
+    check_count("schedules compared", compared, 0)
     case = listening(paths, powers, error, states)
-    wanted = sorted({check_count("period", period) for period in periods})
+    wanted = sorted({check_count("period", period) for period in items("periods", periods, "whole numbers")})
     if not wanted:
         raise fail("periods", "at least one", "none")
     if check_count("sensors at once", at_once) > len(case.told):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.adjoint import covariances
 from heliograph.planning.allocation import Allocation, LeastPower
@@ -43,7 +43,7 @@ def semidefinite_powers(
         ValueError: paths of several hops, a budget without limit, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
-    worst = error is not None and error.worst
+    worst = _is_worst(error)
     problem = one_hop(paths, budget, error, states)
     programme = _Programme(problem, worst)
     programme.solve(programme.error, programme.within(problem.allowed))
@@ -66,7 +66,7 @@ def semidefinite_least_power(
         ValueError: an error that no power reaches, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
-    worst, wanted = error is not None and error.worst, float(scalar("wanted error", wanted, 0.0))
+    worst, wanted = _is_worst(error), float(scalar("wanted error", wanted, 0.0))
     problem = swapped(paths, budget, error, states)
 
     def value(p: Powers) -> float:
@@ -238,3 +238,7 @@ def _factor(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n r"]:
     values, vectors = np.linalg.eigh(matrix)
     kept = values > KEPT * max(values[-1], 0.0)
     return np.asarray(vectors[:, kept] * np.sqrt(values[kept]))
+
+
+def _is_worst(error: Error | None) -> bool:
+    return error is not None and instance("error", error, Error, "an Error").worst

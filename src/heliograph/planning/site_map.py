@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import array, fail, function, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.planning.outcome import NetworkDesign
@@ -44,6 +44,10 @@ def error_over_sites(
     Raises:
         ValueError: a function that builds no network, what `design` refuses.
     """
+    function("network of a map", build, "x and y")
+    instance("task", task, Task, "a Task")
+    instance("design", found, NetworkDesign, "a NetworkDesign")
+    x, y = array("x of a map", x, (None,)), array("y of a map", y, (None,))
     errors = np.zeros((len(y), len(x)))
     asked = replace(task.at(found.total), starts=min(task.starts, STARTS))
     for row, north in enumerate(y):

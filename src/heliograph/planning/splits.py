@@ -12,6 +12,8 @@ from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.independent import at_least
 
+FAR = 1e60  # beyond it squares of noise over power leave the range of doubles
+
 
 def split_power(alpha: ArrayLike, total: ArrayLike) -> Float[np.ndarray, "H"]:
     """The powers p_h >= 0 of this sum that make prod_h (1 + alpha_h / p_h) least; alpha (H,) is noise in sent power.
@@ -20,11 +22,14 @@ def split_power(alpha: ArrayLike, total: ArrayLike) -> Float[np.ndarray, "H"]:
     nothing.
 
     Raises:
-        ValueError: a negative noise or total, no hops.
+        ValueError: a negative noise or total, no hops, a total beyond all measure of the noise.
     """
     a, sum_ = _alphas(alpha), float(scalar("total power", total, 0.0))
     if sum_ == 0 or not np.any(a):
         return np.zeros(len(a))
+    within = a[a > 0]
+    if sum_ > FAR * within.min() or sum_ < within.max() / FAR:
+        raise fail("total power", f"one within a factor of {FAR:g} of each hop's noise", f"{sum_:g}")
     if len(a) == 2:
         share = np.sqrt(a * (sum_ + a[::-1]))
         return np.asarray(sum_ * share / share.sum())
@@ -49,7 +54,7 @@ def path_noise(alpha: ArrayLike, total: ArrayLike) -> float:
     Two hops, u and v being their alphas over the power: (sqrt((1 + u) (1 + v)) + sqrt(u v))^2.
 
     Raises:
-        ValueError: a negative noise or total, no hops.
+        ValueError: a negative noise or total, no hops, a total beyond all measure of the noise.
     """
     a, p = _alphas(alpha), split_power(alpha, total)
     if np.any((p == 0) & (a > 0)):

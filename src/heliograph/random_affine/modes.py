@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.numerics.check import array, fail, instance, scalar, shown
+from heliograph.numerics.check import array, check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise, known
@@ -28,6 +28,7 @@ from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, 
 from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.lift import Lift
+from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
@@ -105,6 +106,10 @@ class _Chosen(AbstractRandomAffine):
 
     def sample(self, key: jax.Array) -> jax.Array:
         return jnp.stack([m.sample(key) for m in self.maps])[self.index]
+
+    def moments(self, order: int) -> Moments:
+        matrices = [jnp.asarray(m.moments(order).matrix) for m in self.maps]
+        return Moments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
 
 class Revealed(AbstractModal):
@@ -241,6 +246,7 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     Raises:
         ValueError: more than MODES modes, or a map inside that remembers in a way of its own.
     """
+    check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
     each = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]

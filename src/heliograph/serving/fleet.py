@@ -10,7 +10,7 @@ import numpy as np
 from heliograph.live.event import INPUTS, Known, Verdict
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.model.over_time import steps_covered
-from heliograph.numerics.check import check_count, fail, scalar
+from heliograph.numerics.check import check_count, fail, instance, scalar
 from heliograph.numerics.types import Float
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Plant
@@ -49,6 +49,8 @@ class Fleet:
     """
 
     def __init__(self, lanes: Lanes, options: Options):
+        instance("lanes", lanes, Lanes, "Lanes")
+        instance("options", options, Options, "Options")
         network = self.network = lanes.network
         self.options, self.lanes = _checked(options), lanes
         self.pool = Pool(lanes)

@@ -7,10 +7,21 @@ from heliograph.serving.output import Kind, Output
 
 
 class Kept(NamedTuple):
-    """A plant in the store; its version counts its commits, 0 before the first."""
+    """A plant in the store; its version counts its commits, 0 before the first.
+
+    `damage`: what is wrong with what the store has of it; then there is no body.
+    """
 
     version: int
     body: bytes
+    damage: str = ""
+
+
+class Damage(NamedTuple):
+    """A row that is not what was written: whether its name is, and the checksum that stands there."""
+
+    named: bool
+    checksum: object
 
 
 class Entry(NamedTuple):
@@ -35,7 +46,7 @@ class Keeps(Protocol):
     keeps: bool
 
     def load(self, names: Iterable[str]) -> dict[str, Kept]:
-        """The plants of these names that are kept."""
+        """The plants of these names that are kept, and those of which only damage is left."""
 
     def commit(
         self, plants: Mapping[str, Kept], entries: Sequence[Entry], malformed: int, told: int | None

@@ -14,7 +14,7 @@ from heliograph.live.mould import Mould, cast
 from heliograph.live.player import player
 from heliograph.live.tape import Ears
 from heliograph.model.estimate import Claim
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.types import Float, PyTree
 from heliograph.serving.flat import Flat, flat_like, row_of
@@ -58,6 +58,7 @@ class Lanes:
     """
 
     def __init__(self, network: Network):
+        instance("network", network, Network, "a Network")
         if not any(network.claims().values()):
             raise fail("network", "at least one filter to run", "none")
         shared = player(network)

@@ -1,15 +1,32 @@
 """What comes in: one event of one plant, as JSON; its schema is the documentation that a sender needs."""
 
 from datetime import datetime
+from shlex import quote
 from typing import Annotated
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, GetPydanticSchema, TypeAdapter, ValidationError, WithJsonSchema
+from pydantic_core.core_schema import no_info_after_validator_function, str_schema
 
-from heliograph.numerics.check import fail, shown
+from heliograph.numerics.check import fail, instance, shown
+from heliograph.numerics.dates import instant
 
-Name = Annotated[str, Field(max_length=200)]
-Moment = float | AwareDatetime
-MOMENT = "a finite number, or an ISO 8601 date with a zone"
+Name = Annotated[str, Field(max_length=200, pattern=r"^[^\x00]*$")]  # PostgreSQL keeps no NUL
+# Text that is no date is refused: "0.1" is no number of seconds, nor a moment of 1970.
+Date = Annotated[
+    datetime,
+    GetPydanticSchema(lambda _, __: no_info_after_validator_function(instant, str_schema())),
+    WithJsonSchema({"type": "string", "format": "date-time"}),
+]
+Moment = float | Date
+WANTED = {
+    "plant": "a name of at most 200 characters, without NUL",
+    "node": "a name of at most 200 characters, without NUL",
+    "sequence": "a whole number from 0 to 2^63 - 1",
+    "time": "a finite number, not in quotes, or an ISO 8601 date with a zone",
+    "arrival": "a finite number, not in quotes, or an ISO 8601 date with a zone",
+    "values": "a list of finite numbers, not in quotes; null for what did not arrive",
+    "inputs": "a list of finite numbers, not in quotes; null for what stays as it was",
+}
 LONGEST = 1 << 20  # bytes of a message; what is longer is refused unread
 
 
@@ -39,6 +56,7 @@ def read_message(payload: bytes) -> Message:
     Raises:
         ValueError: what is no message; one line that names the part.
     """
+    instance("message", payload, bytes, "bytes")
     if len(payload) > LONGEST:
         raise fail("message", f"at most {LONGEST} bytes", len(payload))
     try:
@@ -46,22 +64,26 @@ def read_message(payload: bytes) -> Message:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         part = str(first["loc"][0]) if first["loc"] else ""
-        wanted = MOMENT if part in ("time", "arrival") else first["msg"][:1].lower() + first["msg"][1:]
-        raise fail(f"message, {part}" if part else "message", wanted, shown(first["input"])) from None
+        if part not in WANTED:  # no JSON object, or one with a field more
+            fields = f"a JSON object with no fields but {', '.join(WANTED)}"
+            raise fail("message", fields, shown(part) if part else f"{shown(payload)} ({first['msg']})") from None
+        came = "no such field" if first["type"] == "missing" else shown(first["input"])
+        raise fail(f"message, {part}", WANTED[part], came) from None
 
 
-def seconds(moment: float | datetime, origin: datetime | None) -> float:
+def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:
     """A time as a number: of dates the seconds since `origin`, exact to the microsecond before they are one.
 
     Raises:
         ValueError: a date where times are numbers, or a number where they are dates.
     """
+    mend = f"if its first message was wrong, serve --anew {quote(plant)} begins it anew"
     if isinstance(moment, datetime):
         if origin is None:
-            raise fail("message, time", "a number, as this plant's times are", moment.isoformat())
+            raise fail("message, time", "a number, as this plant's times are", f"{moment.isoformat()}; {mend}")
         return (moment - origin).total_seconds()
     if origin is not None:
-        raise fail("message, time", "a date, as this plant's times are", moment)
+        raise fail("message, time", "a date, as this plant's times are", f"{moment}; {mend}")
     return moment
 
 

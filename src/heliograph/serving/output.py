@@ -48,7 +48,7 @@ class Refused(BaseModel):
     node: str | None
     sequence: int | None
     time: float | str | None
-    reason: Literal["duplicate", "conflict", "late", "future", "implausible", "malformed"]
+    reason: Literal["duplicate", "conflict", "late", "future", "implausible", "malformed", "damaged"]
     detail: str
 
 

@@ -9,6 +9,8 @@ what a NATS server computes itself; a sender to MQTT writes the part into the to
 from typing import NamedTuple
 from urllib.parse import quote
 
+from heliograph.numerics.check import check_count, text
+
 OFFSET, PRIME = 0x811C9DC5, 0x01000193
 NAMELESS = "_"  # the word for the plant that has no name
 
@@ -25,11 +27,13 @@ WHOLE = Part()
 
 def word(plant: str) -> str:
     """A plant's name as one word of a topic or subject: letters, digits and hyphens stay, others are %XX."""
+    text("plant", plant)
     return quote(plant, safe="").replace(".", "%2E").replace("_", "%5F").replace("~", "%7E") or NAMELESS
 
 
 def part_of(plant: str, parts: int) -> int:
     """The part that a plant is in."""
+    check_count("parts", parts)
     value = OFFSET
     for byte in word(plant).encode():
         value = (value ^ byte) * PRIME & 0xFFFFFFFF

@@ -4,6 +4,7 @@ import asyncio
 import os
 from collections.abc import Callable, Sequence
 
+from heliograph.disk.durable import naming
 from heliograph.serving.message import LONGEST
 from heliograph.serving.output import Output
 from heliograph.serving.transport import Batch, nothing
@@ -26,7 +27,8 @@ class Pipe:
         loop = asyncio.get_running_loop()
         while True:
             await _ready(self.source, loop.add_reader, loop.remove_reader)
-            data = os.read(self.source, READ)
+            with naming("standard input"):
+                data = os.read(self.source, READ)
             if lines := self._lines(data):
                 return Batch(lines, nothing)
             if not data:
@@ -50,7 +52,8 @@ class Pipe:
         loop = asyncio.get_running_loop()
         while rest:
             await _ready(self.target, loop.add_writer, loop.remove_writer)
-            rest = rest[os.write(self.target, rest[:AT_ONCE]) :]
+            with naming("standard output"):
+                rest = rest[os.write(self.target, rest[:AT_ONCE]) :]
 
     async def close(self) -> None:
         """Nothing to do: whoever opened the files closes them."""

@@ -11,9 +11,10 @@ from heliograph.files.columns import columns_of
 from heliograph.files.events import holds_events, read_events
 from heliograph.files.recording import TIME_STEP, read_recording
 from heliograph.live.event import INPUTS, Event
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import check_seed, fail, file_path, instance, items, scalar
 from heliograph.simulation.network import Network
 
+FAR = 1e12  # a mean delay of more is no time
 DELAY = "delay"  # the column of a trace: seconds or steps on the way, nan where a message was lost
 
 
@@ -39,6 +40,8 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     Raises:
         ValueError: what reading the file refuses.
     """
+    path = file_path("recording", path)
+    instance("network", network, Network, "a Network")
     if holds_events(path):
         return read_events(path, network)
     table = read_recording(path, network)
@@ -61,10 +64,14 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     """What arrives of events, in the order of arrival; inputs arrive as they are sent.
 
     Raises:
-        ValueError: a probability that is none, a run shorter than 1 or than losses of this probability can be.
+        ValueError: a probability that is none, a negative delay, a run shorter than 1 or than losses of this
+            probability can be.
     """
-    chance = np.random.default_rng(seed)
+    instance("link", link, Link, "a Link")
+    events = items("events", events, "events")
+    chance = np.random.default_rng(check_seed("seed", seed))
     loss, twice = scalar("loss", link.loss, 0, 1), scalar("duplicates", link.duplicates, 0, 1)
+    scalar("delay", link.delay, 0, FAR)
     stays = 1 - 1 / scalar("run", link.run, 1)  # lost again after a loss
     falls = 1.0 if loss == 1 else loss * (1 - stays) / (1 - loss) if link.run > 1 else loss
     if falls > 1:
@@ -88,6 +95,7 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
     Raises:
         ValueError: no column `delay`, or a negative one.
     """
+    trace = file_path("trace", trace)
     columns = columns_of(str(trace), str(trace))
     if DELAY not in columns:
         raise fail(f"trace {trace}", f"a column {DELAY!r}, nan where a message was lost", list(columns))

@@ -4,15 +4,16 @@ import asyncio
 import os
 import socket
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
 from heliograph.serving.broker import connected
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.keeping import Keeps
+from heliograph.serving.keeping import Damage, Keeps
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
 from heliograph.serving.nowhere import Nowhere
@@ -25,11 +26,13 @@ from heliograph.serving.whose import identity
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing
+LISTED = 10  # damaged plants in one line
 
 
 @dataclass(frozen=True)
 class Wanted:
-    """What a service is to be; `parts`: how many parts of the plants several processes share among them.
+    """What a service is to be; `parts`: how many parts of the plants several processes share among them;
+    `anew`: names of plants that begin anew.
 
     Raises:
         ValueError: parts without a store and a broker, which all processes share; a snapshot without a store.
@@ -43,6 +46,7 @@ class Wanted:
     broker: Address | None = None
     parts: int | None = None
     page: str | None = None
+    anew: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.snapshot is not None:
@@ -50,6 +54,8 @@ class Wanted:
                 raise fail("--from-snapshot", "a store to begin in (--store FILE)", "none")
             if not self.snapshot.is_file():
                 raise fail(f"snapshot {self.snapshot}", "a store's file", "nothing of that name")
+        if self.anew and self.store is None:
+            raise fail("--anew", "a store that has the plants (--store FILE)", "none")
         if self.parts is not None:
             check_count("--parts", self.parts)
             if self.store is None or self.broker is None:
@@ -126,8 +132,23 @@ def _kept(wanted: Wanted, fleet: Fleet) -> Keeps:
     kept = Store(wanted.store, mine, wanted.process)
     if wanted.snapshot is not None:
         kept.begin_from(str(wanted.snapshot), mine)
+    kept.begin_anew(wanted.anew)
+    if kept.damaged:
+        _say(f"store {kept.name}: {told_damage(kept.damaged)}")
     _say(f"the state is kept in {kept.name}, plants so far: {kept.count()} (--store {NOTHING} keeps nothing)")
     return kept
+
+
+def told_damage(plants: Mapping[str, Damage]) -> str:
+    """What a user is told of plants that are damaged: their names, and whether these are as they were written."""
+    named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
+    more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
+    new = (
+        ""
+        if all(each.named for each in plants.values())
+        else "; one has lost its name, so that no new plant begins before"
+    )
+    return f"damaged plants, whose messages are refused until they begin anew ({named}{more}){new}"
 
 
 def _say(what: str) -> None:
@@ -136,17 +157,20 @@ def _say(what: str) -> None:
 
 async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:
     """One process of several: the parts that it leases."""
+    from heliograph.serving.database import engine_at
     from heliograph.serving.leases import Leases
-    from heliograph.serving.store import Store, engine_at
+    from heliograph.serving.store import Store
 
     place, broker = str(wanted.store), wanted.broker
     assert broker is not None  # as Wanted checked
     fleet = Fleet(lanes, wanted.options)
-    _kept(wanted, fleet).close()
+    first = _kept(wanted, fleet)
+    assert isinstance(first, Store)  # as Wanted checked
+    first.close()
     mine = identity(fleet)
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        kept = Store(place, mine, f"part {number} of {parts}")  # whoever has the part tells what it had to tell
+        kept = Store(place, mine, f"part {number} of {parts}", opened=first)  # who has it tells what it had to tell
         try:
             service = look(Service(Fleet(lanes, wanted.options), kept, _say))
             await serve_until(stop, service, connected(broker, Part(number, parts)))

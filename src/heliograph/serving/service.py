@@ -9,7 +9,7 @@ from time import perf_counter
 from typing import NamedTuple
 
 from heliograph.live.event import Verdict
-from heliograph.numerics.check import InputError, shown
+from heliograph.numerics.check import InputError, instance, shown
 from heliograph.serving.fleet import Fleet, Settled
 from heliograph.serving.keeping import ConflictError, Entry, Keeps, Kept
 from heliograph.serving.kept import plant_bytes, plant_from
@@ -51,11 +51,13 @@ class Service:
     """
 
     def __init__(self, fleet: Fleet, store: Keeps, say: Callable[[str], None] | None = None):
+        instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
         self._told: int | None = None  # up to where, since the last commit
+        self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
         """Use messages, each a JSON object, and commit; what is to be told of it.
@@ -100,8 +102,13 @@ class Service:
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
         """Use messages and commit; what is to be told, and how long the commit took."""
         touched, used, entries, malformed, known = dict[str, Plant](), set[str](), list[Entry](), 0, 0
-        for message, payload, outcome in zip(messages, payloads, self._using.use(messages), strict=True):
-            plant, verdict, why, notes = outcome
+        damage = [self._damage.get(m.plant) if isinstance(m, Message) else None for m in messages]
+        outcomes = iter(self._using.use([m for m, why in zip(messages, damage, strict=True) if why is None]))
+        for message, payload, damaged in zip(messages, payloads, damage, strict=True):
+            if isinstance(message, Message) and damaged is not None:
+                entries.append(_refusal(message, "damaged", damaged))
+                continue
+            plant, verdict, why, notes = next(outcomes)
             if isinstance(message, str) or verdict is None:
                 malformed += 1
                 entries.append(_refused(None, {}, "malformed", f"{why}: {shown(payload)}"))
@@ -112,7 +119,7 @@ class Service:
                 used.add(message.plant)
             else:
                 known += verdict in ("duplicate", "late")
-                entries.append(_refusal(message, verdict, why))
+                entries.append(_refusal(message, verdict, why or WHY[verdict]))
             entries += [_refusal(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
@@ -156,7 +163,11 @@ class Service:
 
     def _load(self, names: Iterable[str]) -> None:
         """Have the plants of these names in memory, where they are kept."""
+        self._damage = {}
         for name, kept in self.store.load([name for name in names if name not in self.plants]).items():
+            if kept.damage:
+                self._damage[name] = kept.damage
+                continue
             plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
             plant.version = kept.version
 
@@ -202,10 +213,10 @@ def _read(payload: bytes) -> Message | str:
         return str(error)
 
 
-def _refusal(message: Message, verdict: Verdict, why: str) -> Entry:
+def _refusal(message: Message, why: str, detail: str) -> Entry:
     moment = message.time.isoformat() if isinstance(message.time, datetime) else message.time
     parts = {"node": message.node, "sequence": message.sequence, "time": moment}
-    return _refused(message.plant, parts, verdict, why or WHY[verdict])
+    return _refused(message.plant, parts, why, detail)
 
 
 def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from urllib.parse import unquote, urlsplit
 
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, table, text
 
 PORTS = {"mqtt": 1883, "mqtts": 8883, "nats": 4222, "nats+tls": 4222}
 SECURE = ("mqtts", "nats+tls")
@@ -55,6 +55,8 @@ def address(url: str, environment: Mapping[str, str] = os.environ) -> Address:
     Raises:
         ValueError: another kind of URL, no host, a topic with wildcards. It never tells the password.
     """
+    text("broker", url)
+    environment = table("environment", environment, "texts")
     shape = f"{', '.join(f'{scheme}://' for scheme in PORTS)} and host:port/topic"
     try:
         parts = urlsplit(url)

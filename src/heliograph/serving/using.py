@@ -94,9 +94,9 @@ class Using:
         """Give a message to its plant, which is None if it would have begun with one that is refused."""
         plant = self.plants.get(message.plant)
         origin = self._origin(message) if plant is None else plant.origin
-        at = seconds(message.time, origin)
+        at = seconds(message.time, origin, message.plant)
         now = at if plant is None else plant.now
-        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin)
+        arrival = max(now, at) if message.arrival is None else seconds(message.arrival, origin, message.plant)
         event = self.fleet.known(message.node, message.sequence, at, message.values, arrival)
         given = message.inputs
         inputs = None if given is None else self.fleet.known(INPUTS, message.sequence, at, given, arrival)

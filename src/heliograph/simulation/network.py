@@ -25,6 +25,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
 from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
+from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
@@ -112,6 +113,8 @@ class Network(Module):
                 check_type(f"fused {name!r}", item, AbstractFilter)
                 check_received(f"fused {name!r}", item, sum(node.received for node in self.nodes.values()))
                 check_sizes(f"fused {name!r}", item, self.states, self.inputs)
+                links = [first(node.channel) for node in self.nodes.values() if isinstance(node, Node)]
+                check_flags(f"fused {name!r}", item, links)
 
     @staticmethod
     def of_relays(

@@ -6,7 +6,7 @@ import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.fed_back import FedBackFilter
-from heliograph.model.channel import Channel
+from heliograph.model.channel import Channel, check_sent
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import first
 from heliograph.model.sensor import AbstractSensor, AnySensor
@@ -15,6 +15,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.simulation.flags import check_flags
 
 
 @readable
@@ -28,7 +29,8 @@ class Node(Module):
     data beyond that count as not arrived, are counted and named. Claims stand as far as no honest number is among them.
 
     Raises:
-        ValueError: a sensor and a channel that do not fit, a filter that hears beside one that is fed back, limits that
+        ValueError: a sensor and a channel that do not fit; a filter that takes another number of values than arrive,
+            or flags of another step than those that do; a filter that hears beside one that is fed back; limits that
             are none.
     """
 
@@ -48,8 +50,11 @@ class Node(Module):
         self.sensor, self.channel, self.filters = sensor, channel, table("filters of a node", filters, "filters")
         check_type("sensor", first(sensor), AbstractSensor)
         check_type("channel", first(channel), AbstractRandomAffine)
+        check_sent(first(sensor), first(channel))
         check_filters(self.filters, self.received)
         self.limits = limits_of(self.received, limits, invalid)
+        for name, item in self.filters.items():
+            check_flags(f"filter {name!r}", item, [first(channel)])
         hearing = [name for name, item in self.filters.items() if item.received]
         if self.told_by is not None and hearing != [self.told_by]:
             raise fail("node whose sensor hears back", f"no filter that hears beside {self.told_by!r}", hearing)

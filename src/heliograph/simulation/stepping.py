@@ -17,7 +17,7 @@ from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import stack
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, instance, text
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.module import Module
@@ -252,6 +252,8 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
         ValueError: no fusion of this name, or one by another rule.
     Source: the best linear receiver behind relays that filter and forward; the relays are the nodes' filters.
     """
+    instance("network", network, Network, "a Network")
+    text("fusion", name)
     fusion = network.fused.get(name)
     if not isinstance(fusion, Fusion) or not fusion.rule.hears_reports:
         hearing = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.hears_reports]

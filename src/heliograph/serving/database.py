@@ -1,0 +1,55 @@
+"""The database of a store: SQLite at a path or PostgreSQL at a URL, and how transactions begin and end there."""
+
+from typing import Any
+
+from sqlalchemy import Connection, create_engine, event
+from sqlalchemy.engine import URL, Engine, make_url
+from sqlalchemy.exc import ArgumentError
+
+from heliograph.numerics.check import fail, text
+
+PLACE = "a file, or a URL as postgresql://host/database"
+
+
+def engine_at(place: str) -> Engine:
+    """Open the database of a store.
+
+    Raises:
+        ValueError: no path, or the URL of another kind of database; it never tells a password.
+    """
+    engine = create_engine(url_of(place))
+    if engine.dialect.name == "sqlite":
+        event.listen(engine, "connect", _durably)
+        event.listen(engine, "begin", _at_once)
+    return engine
+
+
+def url_of(place: str) -> URL:
+    """Read the place of a store.
+
+    Raises:
+        ValueError: no path, or the URL of another kind of database.
+    """
+    text("store", place)
+    try:
+        url = make_url(place) if "://" in place else URL.create("sqlite", database=place)
+    except ArgumentError:
+        raise fail("store", PLACE, "something else") from None
+    if url.get_backend_name() not in ("sqlite", "postgresql"):
+        raise fail("store", PLACE, url.get_backend_name())
+    if url.get_backend_name() == "sqlite" and (url.database or "").strip() in ("", ":memory:"):
+        raise fail("store", f"{PLACE}; none keeps nothing", repr(place))
+    return url.set(drivername="postgresql+psycopg") if url.get_backend_name() == "postgresql" else url
+
+
+def _durably(connection: Any, _: object) -> None:
+    """Each commit is on the disk before it returns; readers do not wait for it."""
+    connection.isolation_level = None  # transactions begin where the engine says so
+    connection.text_factory = lambda data: data.decode(errors="backslashreplace")  # a damaged name can be told
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "busy_timeout=30000"):
+        connection.execute(f"PRAGMA {pragma}")
+
+
+def _at_once(connection: Connection) -> None:
+    """A transaction that will write waits for others before it reads."""
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
