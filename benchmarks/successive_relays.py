@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.papers.successive_relays import setting
 from heliograph.relays.design import start_moments
 from heliograph.relays.own_error import _propagate_own
+from heliograph_studies.successive_relays import setting
 
 STEPS = 100
 LIMIT = 0.020  # seconds, warm, one core

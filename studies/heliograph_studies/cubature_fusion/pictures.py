@@ -1,0 +1,126 @@
+"""Figs 1 to 12 and the strong scenario, as curves over time."""
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.report.curves import Panel, curves_over_time
+from heliograph.report.figures import (
+    AMBER,
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    PURPLE,
+    STYLE,
+    VERMILION,
+    WIDTH,
+    Curve,
+    label_right,
+)
+from heliograph_studies.cubature_fusion.compute import Outcome, Reproduction
+from heliograph_studies.cubature_fusion.setting import NODES, STATES
+
+METHOD, TWIN = "cubature_printed_fixed", "extended_printed_fixed"
+COLOURS = {
+    "open_loop": MUTED, "mean_gain": AMBER, "cubature_printed_fixed": VERMILION, "cubature_printed": PURPLE,
+    "cubature_tight": INK, "cubature_polytope": BLUE, "cubature_zero_mean": GREEN, "ci_equal": BLUE,
+    "ci_optimal": PURPLE, "central": INK,
+}  # fmt: skip
+LABELS = {"cubature_printed_fixed": "printed, fixed β", "ci_equal": "equal weights", "ci_optimal": "optimal weights"}
+NODE_COLOURS = (BLUE, AMBER, GREEN, PURPLE)
+
+
+def drawings(result: Reproduction) -> dict[str, Figure]:
+    """All figures by file name."""
+    printed, figures = result.printed, {}
+    for i, state in enumerate(STATES):
+        figures[f"fig{i + 1:02d}_{state}"] = _states(printed, i)
+    figures["fig06_trace"] = _traces(printed)
+    figures["fig07_rmse_and_bound"] = _below_bound(printed)
+    for i, node in enumerate(NODES):
+        figures[f"fig{i + 8:02d}_node{node}"] = _against_extended(printed, i)
+    figures["fig12_fusion"] = _fusion(printed)
+    figures["strong_filters"] = _strong_filters(result.strong)
+    figures["strong_fusion"] = _strong_fusion(result.strong)
+    return figures
+
+
+def label(name: str) -> str:
+    """A filter's name for reading."""
+    return LABELS.get(name, name.removeprefix("cubature_").replace("_", " "))
+
+
+def _states(o: Outcome, i: int) -> Figure:
+    assert o.shown.truth is not None
+    truth = o.shown.truth[0, :, i]
+    local = [np.asarray(o.shown.estimates[n][METHOD].mean)[0, :, i] for n in NODES]
+    fused = np.asarray(o.shown.estimates["fused"]["ci_printed"].mean)[0, :, i]
+    estimates = [*(Curve("nodes", MUTED, v) for v in local), Curve("fused", VERMILION, fused)]
+    errors = [Curve(c.name, c.colour, c.values - truth) for c in estimates]
+    panels = [Panel(STATES[i], [*estimates, Curve("true", INK, truth)]), Panel("error", errors)]
+    return curves_over_time(o.shown.time, panels)
+
+
+def _trace(o: Outcome, name: str) -> np.ndarray:
+    return np.asarray(np.trace(o.pooled(name).claimed(), axis1=-2, axis2=-1))
+
+
+def _traces(o: Outcome) -> Figure:
+    local, fused = o.claimed_trace(METHOD), _trace(o, "ci_printed")
+    nodes = [Curve("nodes", MUTED, v) for v in local]
+    gain = Curve("fused", VERMILION, 100 * (1 - fused / local.min(axis=0)))
+    traces = Panel("trace of the bound", [*nodes, Curve("fused", VERMILION, fused)])
+    return curves_over_time(o.shown.time, [traces, Panel("below best node (%)", [gain])])
+
+
+def _below_bound(o: Outcome) -> Figure:
+    bound = Curve("√trace, fused", BLUE, np.sqrt(_trace(o, "ci_printed")))
+    error = Curve("RMSE, fused", VERMILION, o.pooled("ci_printed").rmse_over_time())
+    local = [Curve("√trace, nodes", MUTED, np.sqrt(v)) for v in o.claimed_trace(METHOD)]
+    errors = [Curve("RMSE, nodes", AMBER, v) for v in o.rmse(METHOD)]
+    return curves_over_time(o.shown.time, [Panel("root of squared error", [*local, *errors, bound, error])])
+
+
+def _against_extended(o: Outcome, i: int) -> Figure:
+    pairs = ((TWIN, "extended", BLUE), (METHOD, "cubature", VERMILION))
+    curves = [Curve(text, colour, o.rmse(name)[i]) for name, text, colour in pairs]
+    return curves_over_time(o.shown.time, [Panel(f"RMSE, node {NODES[i]}", curves)])
+
+
+def _fusion(o: Outcome) -> Figure:
+    panels = []
+    for name, fused, text in ((METHOD, "ci_printed", "RMSE"), ("open_loop", "ci_open_loop", "RMSE, no measurements")):
+        curves = [Curve(f"node {n}", c, v) for n, c, v in zip(NODES, NODE_COLOURS, o.rmse(name), strict=True)]
+        panels.append(Panel(text, [*curves, Curve("fused", VERMILION, o.pooled(fused).rmse_over_time())]))
+    return curves_over_time(o.shown.time, panels)
+
+
+def _over_nodes(o: Outcome, name: str) -> np.ndarray:
+    """Root of the mean squared error over the nodes, (time,)."""
+    return np.asarray(np.sqrt(np.mean(o.rmse(name) ** 2, axis=0)))
+
+
+def _strong_filters(o: Outcome) -> Figure:
+    names = ("mean_gain", "open_loop", "cubature_printed_fixed", "cubature_printed", "cubature_tight",
+             "cubature_polytope", "cubature_zero_mean")  # fmt: skip
+    curves = [Curve(label(n), COLOURS[n], _over_nodes(o, n)) for n in names]
+    return _from_zero(o, "RMSE over the nodes", curves)
+
+
+def _strong_fusion(o: Outcome) -> Figure:
+    single = Curve("one node", GREEN, _over_nodes(o, "cubature_zero_mean"))
+    curves = [Curve(label(n), COLOURS[n], o.pooled(n).rmse_over_time()) for n in ("ci_optimal", "ci_equal", "central")]
+    return _from_zero(o, "RMSE", [single, *curves])
+
+
+@matplotlib.rc_context(STYLE)
+def _from_zero(o: Outcome, text: str, curves: list[Curve]) -> Figure:
+    """Curves on an axis that starts at zero, so that what is low has room for its name."""
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    axes = figure.subplots()
+    for curve in curves:
+        axes.plot(o.shown.time, curve.values, color=curve.colour, linewidth=1.4)
+    axes.set(xlim=(o.shown.time[0], o.shown.time[-1]), ylim=(0.0, None), xlabel="step", ylabel=text)
+    label_right(axes, {c.name: (float(c.values[-1]), c.colour) for c in curves}, 0.055)
+    return figure
