@@ -12,7 +12,7 @@ import matplotlib
 import pytest
 
 from heliograph import cli
-from heliograph.cli.studies import found
+from heliograph.cli.studies import studies_of
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
@@ -155,7 +155,7 @@ def test_every_method_finds_what_it_needs(after_make_demo, monkeypatch):
         raise BegunError
 
     monkeypatch.setattr("heliograph.report.results.whole_folder", begin)
-    for method in found("publication"):
+    for method in studies_of("publication"):
         with pytest.raises(BegunError):
             cli.main(["reproduce", method, "--out", "out"])
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from heliograph import cli
-from heliograph.cli.studies import found, print_list
+from heliograph.cli.studies import print_list, studies_of
 
 MODULE = '''
 """Says a number.
@@ -47,7 +47,7 @@ def test_a_study_of_another_package_is_listed_and_runs(package, capsys):
     assert cli.main(["example"]) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("number "))
     assert line.split(maxsplit=1)[1] == "Says a number."
-    assert "number" not in found("publication")
+    assert "number" not in studies_of("publication")
     assert cli.main(["example", "number", "--seed", "3", "--set", "mean=0.3", "--out", "out"]) == 0
     assert json.loads((package / "out" / "number" / "summary.json").read_text()) == {"seed": "3", "mean": "0.3"}
 
@@ -67,7 +67,7 @@ def test_one_name_has_one_study(package, capsys):
 
 
 def test_every_study_says_what_it_shows():
-    known = {**found("example"), **found("publication")}
+    known = {**studies_of("example"), **studies_of("publication")}
     assert "demo" in known and "quadratic-bias" in known and "hello" not in known
     with pytest.raises(ValueError, match=r"example: expected one of .*demo, .*, got 'nothing'"):
         cli.studies.run(["nothing"], None, {}, "example")

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from heliograph_studies.smoothing import compute, example
+from heliograph_studies import smoothing
 
 # A moving point: deviations sqrt(P_xx + P_yy) and mean traces, and variances of a lag's share of the filter's.
 FILTER = {"10": 0.8678, "50": 2.6563, "90": 4.7837, "mean_trace": 9.7282}
@@ -17,10 +17,8 @@ RELAYS = {"0": (5.2417, 5.2899), "1": (2.6024, 2.5493), "2": (1.9132, 1.8996), "
 
 @pytest.fixture(scope="module")
 def summary(tmp_path_factory, fits):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compute, "RUNS", 400)
-        out = tmp_path_factory.mktemp("example")
-        example(out, 0)
+    out = tmp_path_factory.mktemp("example")
+    smoothing.run(smoothing.Setting(runs=400), out)
     fits(out / "smoothing" / "report.html")
     assert {"report.html", "errors.svg", "deviations.svg"} <= {p.name for p in (out / "smoothing").iterdir()}
     return json.loads((out / "smoothing" / "summary.json").read_text())

@@ -73,7 +73,7 @@ def reproduce(
 
     if method == "all" and changes:
         raise fail("--set", "one publication, whose settings these are", "all")
-    names = list(found("publication")) if method == "all" else [method]
+    names = list(studies_of("publication")) if method == "all" else [method]
     run(names, out, changed(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
 
 
@@ -87,7 +87,7 @@ def run(
     """
     from heliograph.numerics.check import fail
 
-    known = found(kind)
+    known = studies_of(kind)
     for name in names:
         if name not in known:
             expected = ", ".join(known) + (" or all" if kind == "publication" else "")
@@ -127,7 +127,7 @@ def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
     return values
 
 
-def found(kind: str) -> dict[str, EntryPoint]:
+def studies_of(kind: str) -> dict[str, EntryPoint]:
     """The studies of a kind, "publication" or "example", that installed packages offer; none of them is imported.
 
     Raises:
@@ -151,7 +151,7 @@ def load(entry: EntryPoint) -> Study:
 
 def print_list(kind: str) -> None:
     """Print the studies of a kind, with the first line of what each says of itself."""
-    known = found(kind)
+    known = studies_of(kind)
     width = max(map(len, known), default=0)
     for name, entry in known.items():
         print(f"{name:{width}}  {first_line(entry.module)}")

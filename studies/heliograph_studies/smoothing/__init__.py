@@ -1,6 +1,8 @@
 """What waiting is worth: smoothing behind fading links and relays, from a lag of one step to a whole run."""
 
-from heliograph_studies.old import Old
-from heliograph_studies.smoothing.run import example as run_example
+from heliograph_studies.smoothing import compute, figures
+from heliograph_studies.smoothing.setting import Setting as Setting
+from heliograph_studies.study import Study
 
-example = Old(run_example)
+example = Study("smoothing", Setting, compute.compute, 4, figures.figures, figures.words)
+run = example.run

@@ -1,15 +1,30 @@
 """Three settings: a moving point behind two fading hops, two relays that take turns, a swinging pendulum."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import check_count, check_seed
 
 STEPS = 100
 STEADY = 1000  # steps after which the relays' receiver does not change any more
 PENDULUM_STEP = 0.05  # s
 SWINGS = {"tame": ((0.4, 0.0), 0.05), "large": ((2.8, 0.0), 0.3)}  # mean angle and speed at the start, variance of both
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How much is simulated."""
+
+    runs: int = 1000
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("runs", self.runs, 2)
+        check_seed("seed", self.seed)
 
 
 def moving_point() -> tuple[hg.LinearPlant, hg.LinearSensor, hg.random_affine.AbstractRandomAffine]:

@@ -6,13 +6,12 @@ import re
 import numpy as np
 import pytest
 
-from heliograph_studies.quadratic_bias import compute, run, setting
-from heliograph_studies.quadratic_bias.run import reproduce
+from heliograph_studies import quadratic_bias
+from heliograph_studies.quadratic_bias import printed, setting
 from heliograph_studies.quadratic_bias.statements import statements
 from heliograph_studies.statement import Sampled
 from tests.oracles import quadratic_bias as oracle
 from tests.studies.readme import README, said_of
-from tests.studies.reproduction import kept
 from tests.studies.verdicts import both, check_verdicts
 
 # Means over t = 31 ... 100 by a separate implementation (enumerated monomials in NumPy), for what the oracle lacks.
@@ -22,9 +21,7 @@ EXPECTED = {"memory": (0.0419766, 0.0393043), "cubic": (0.0328326, 0.0333223), "
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    with kept(run) as (computed, _):
-        run.reproduce(out, runs=128, seed=1)
-    return computed[0], out / "quadratic-bias"
+    return quadratic_bias.run(quadratic_bias.Setting(runs=128, seed=1), out), out / "quadratic-bias"
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +36,8 @@ def numbers(folder):
 
 def test_setting_is_section_4():
     example = oracle.paper_example()
-    plant = setting.plant(3)
+    noises = setting.Noises()
+    plant = setting.plant(3, noises)
     for t in range(3):
         matrix, gain, law = oracle.augmented(example, t)
         np.testing.assert_array_equal(plant.values.matrix[t], matrix)
@@ -47,7 +45,7 @@ def test_setting_is_section_4():
         np.testing.assert_allclose(plant.values.noise.covariance[t], second, rtol=0, atol=1e-15)
     np.testing.assert_array_equal(setting.TABLE_1["eps2"], oracle.TABLE_1["eps2"])
     for name, (second, third, fourth) in setting.TABLE_1.items():
-        moments = [setting.NOISES[name].moment((k,)) for k in (1, 2, 3, 4)]
+        moments = [getattr(noises, name).law().moment((k,)) for k in (1, 2, 3, 4)]
         np.testing.assert_allclose(moments, [0.0, second, third, fourth], rtol=0, atol=5.1e-5)  # four digits printed
 
 
@@ -107,23 +105,23 @@ def test_in_the_outage_scenario_the_printed_filter_loses_while_claiming_to_win(n
 
 
 def test_outage_covariances_are_the_oracles():
-    outage = compute.outage()
+    outage = setting.Setting().outage()
     laws = {
         "l": oracle.Atoms(np.array([[0.0], [1.0]]), np.array([0.7, 0.3])),
         "m": oracle.Atoms(np.array([[0.0], [1.0]]), np.array([0.3, 0.7])),
     }
     shock = oracle.two_point(0.9, -0.1, 0.1)
-    p = setting.SHOCK_PROBABILITY
+    p = setting.Outages().shock_probability
     system = oracle.System(
         A=lambda t: np.array([[0.9]]), E=lambda t: np.array([[0.3]]), B=np.eye(1), F=np.array([[0.8]]), C=np.eye(1),
         D=np.eye(1), Phi=np.eye(1), Psi=np.eye(1), theta=1.0, **laws, x0=oracle.two_point(-1, 1, 0.5),
         eps0=oracle.two_point(-0.3, 0.3, 0.5), w=oracle.two_point((1 - p) * p**-0.5, -(p**0.5), p),
         xi=oracle.two_point(-0.1, 0.1, 0.5), v=shock, varpi=shock, sigma=shock,
     )  # fmt: skip
-    printed = compute.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
+    found = printed.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
     expected = oracle.quadratic(system, 40, repaired=False)
-    np.testing.assert_allclose(printed.true_covariance, expected.true[1:, :2, :2], rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(printed.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.true_covariance, expected.true[1:, :2, :2], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(found.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)
 
 
 def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
@@ -160,13 +158,13 @@ VERDICTS = [
 
 
 def test_verdicts_follow_from_evidence(found):
-    check_verdicts(statements(found[0]), VERDICTS)
+    check_verdicts(statements(found[0])["paper"], VERDICTS)
 
 
 def test_a_folder_with_other_files_and_too_few_runs_are_refused(tmp_path):
     with pytest.raises(ValueError, match="at least 100, got 99"):
-        reproduce(tmp_path, runs=99)
+        quadratic_bias.Setting(runs=99)
     (tmp_path / "quadratic-bias").mkdir()
     (tmp_path / "quadratic-bias" / "thesis.tex").write_text("")
     with pytest.raises(ValueError, match="other files"):
-        reproduce(tmp_path, runs=100)
+        quadratic_bias.run(quadratic_bias.Setting(runs=100), tmp_path)
