@@ -2,7 +2,6 @@
 
 import pickle
 import re
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
@@ -56,11 +55,6 @@ class Stages:
     def progress(self, done: int, total: int) -> None:
         """Show how much of the present stage is done."""
         self.advance(self.stage, done, total)
-
-    def clear(self) -> None:
-        """Remove what is kept: all is done."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
     def _read(self, path: Path, label: tuple[str | None, str, int]) -> tuple[object] | None:
         """What is kept there, if it is that stage's of this study with this setting."""

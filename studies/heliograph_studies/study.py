@@ -2,6 +2,8 @@
 
 import hashlib
 import inspect
+import re
+import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,11 +27,12 @@ if TYPE_CHECKING:
 
 Setting = TypeVar("Setting")
 Outcome = TypeVar("Outcome")
-WIDTH = 80  # of what is printed
+Judged = Mapping[str, Sequence[Statement]]  # what is stated, by name of each list
+WIDTH, KEYS = 80, 4  # of what is printed; key figures in it
 REPEATED = ("runs", "seed")  # what tells two runs of one study apart, not two studies
 
 
-def no_statements(_: object) -> Mapping[str, Sequence[Statement]]:
+def no_statements(_: object) -> Judged:
     """Of an example, which nobody stated anything about."""
     return {}
 
@@ -57,7 +60,7 @@ class Study(Generic[Setting, Outcome]):
     figures: "Callable[[Outcome], Mapping[str, Figure]]"
     words: Callable[[Outcome], Mapping[str, object]]
     publication: str = ""
-    statements: Callable[[Outcome], Mapping[str, Sequence[Statement]]] = no_statements
+    statements: Callable[[Outcome], Judged] = no_statements
     data: Callable[[Outcome, Path], None] = no_data
     needs: Sequence[str] = ()
     page: str = "page.md"
@@ -85,29 +88,36 @@ class Study(Generic[Setting, Outcome]):
                 import_module(name)
             with progress(self.stages) as advance:
                 return self.compute(chosen, Stages(self.name, advance))
-        target, pages = Path(out) / self.name, list[Page]()
-        stages: list[Stages] = []
+        target, lines = Path(out) / self.name, list[str]()
+        folder = target.with_name(f"{self.name}.stages")
 
         def work(advance: Advance) -> Outcome:
-            folder = target.with_name(f"{self.name}.stages")
-            stages.append(Stages(self.name, advance, folder, self._key(chosen)))
-            return self.compute(chosen, stages[0])
+            return self.compute(chosen, Stages(self.name, advance, folder, self._key(chosen)))
 
-        outcome = write_results(
-            target, self.stages, work, lambda outcome: self._results(chosen, pages, outcome), self.needs
-        )
-        stages[0].clear()
-        self._print(pages[0], self.statements(outcome), target)
+        def tell(outcome: Outcome) -> Results:
+            statements = self.statements(outcome)
+
+            def page(pictures: Mapping[str, bytes]) -> Page:
+                made = self.make_page(chosen, outcome, statements, pictures)
+                lines.extend(findings(made, statements))
+                return made
+
+            numbers = self.summary(chosen, outcome, statements)
+            return Results(self.figures(outcome), page, numbers, partial(self.data, outcome))
+
+        outcome = write_results(target, self.stages, work, tell, self.needs)
+        shutil.rmtree(folder, ignore_errors=True)
+        print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome
 
-    def summary(self, setting: Setting, outcome: Outcome) -> dict[str, Any]:
+    def summary(self, setting: Setting, outcome: Outcome, statements: Judged) -> dict[str, Any]:
         """All numbers: the outcome's fields, which setting they are of, and the statements with their evidence."""
         head: dict[str, Any] = {"paper": self.publication} if self.publication else {}
         head |= {name: getattr(setting, name) for name in REPEATED if hasattr(setting, name)}
         changed = {name: {"there": there, "here": here} for name, (there, here) in self._changed(setting).items()}
         if changed:
             head["changed"] = changed
-        judged = [statement.entry() for group in self.statements(outcome).values() for statement in group]
+        judged = [statement.entry() for group in statements.values() for statement in group]
         return {**head, **summary(outcome), **({"claims": judged} if judged else {})}
 
     def command(self, setting: Setting) -> str:
@@ -121,12 +131,12 @@ class Study(Generic[Setting, Outcome]):
             words.append(f"--set {name}={here.strip('[]').replace(' ', '')}")
         return " ".join(words)
 
-    def make_page(self, setting: Setting, outcome: Outcome, pictures: Mapping[str, bytes]) -> Page:
+    def make_page(self, setting: Setting, outcome: Outcome, statements: Judged, pictures: Mapping[str, bytes]) -> Page:
         """The page; `pictures` holds each figure as SVG. What differs from the publication stands first."""
         fields = {name: getattr(outcome, name) for name in vars(outcome)}
         numbers = {"setting": setting, "command": self.command(setting), **fields, **self.words(outcome)}
         template = Path(inspect.getfile(self.words)).with_name(self.page)
-        page = markdown.page(template, numbers, pictures, self.statements(outcome))
+        page = markdown.page(template, numbers, pictures, statements)
         changed = self._changed(setting)
         if not changed:
             return page
@@ -150,21 +160,13 @@ class Study(Generic[Setting, Outcome]):
         source = b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))
         return f"{chosen} {hashlib.sha256(source).hexdigest()} {heliograph.__version__}"
 
-    def _results(self, setting: Setting, pages: list[Page], outcome: Outcome) -> Results:
-        def page(pictures: Mapping[str, bytes]) -> Page:
-            pages.append(self.make_page(setting, outcome, pictures))
-            return pages[0]
 
-        return Results(self.figures(outcome), page, self.summary(setting, outcome), partial(self.data, outcome))
-
-    def _print(self, page: Page, statements: Mapping[str, Sequence[Statement]], target: Path) -> None:
-        """The findings, and where they are; also where the output is no terminal."""
-        keys = [key for section in page.sections for block in section.blocks if isinstance(block, KeyFigures)
-                for key in block.figures]  # fmt: skip
-        lines = [page.title, *(f"- {key.label}: {key.value} ({key.note})" for key in keys[:4])]
-        judged = [statement for group in statements.values() for statement in group]
-        if judged:
-            lines.append(f"Judged by this run: {markdown.counted(judged)}.")
-        for line in lines:
-            print(textwrap.fill(line.replace("**", "").replace("`", ""), WIDTH, subsequent_indent="  "))
-        print(f"Report: {target / 'report.html'}", flush=True)
+def findings(page: Page, statements: Judged) -> list[str]:
+    """What a page says first, as lines to print: its title, key figures, and how the statements were judged."""
+    blocks = [block for section in page.sections for block in section.blocks]
+    keys = [key for block in blocks if isinstance(block, KeyFigures) for key in block.figures]
+    lines = [page.title, *(f"- {key.label}: {key.value} ({key.note})" for key in keys[:KEYS])]
+    judged = [statement for group in statements.values() for statement in group]
+    if judged:
+        lines.append(f"Judged by this run: {markdown.counted(judged)}.")
+    return [textwrap.fill(re.sub(r"\*\*|`", "", line), WIDTH, subsequent_indent="  ") for line in lines]

@@ -1,17 +1,17 @@
 """The reproduction: its quadrature, its numbers, verdicts that follow from evidence, and its files."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from heliograph_studies.intermittent_observations import compute, run, setting
-from heliograph_studies.intermittent_observations.mean_error import from_runs, mean_error, over_patterns
-from heliograph_studies.intermittent_observations.rounding import iterate
+from heliograph_studies import intermittent_observations
+from heliograph_studies.intermittent_observations import setting
+from heliograph_studies.intermittent_observations.mean_error import from_runs, iterate, mean_error, over_patterns
 from heliograph_studies.intermittent_observations.statements import statements
 from tests.riccati import riccati
 from tests.studies.readme import said_of
-from tests.studies.reproduction import kept
 
 MEAN = {(0.1, 0.6): 4.3818, (0.3, 0.6): 6.1303, (0.1, 0.9): 3.6096, (0.4, 0.6): 6.8095}
 BOUND = {(0.1, 0.6): 4.5801, (0.3, 0.6): 6.5848, (0.1, 0.9): 3.6612, (0.4, 0.6): 7.3266}
@@ -21,11 +21,9 @@ BOUND = {(0.1, 0.6): 4.5801, (0.3, 0.6): 6.5848, (0.1, 0.9): 3.6612, (0.4, 0.6):
 def reproduced(tmp_path_factory):
     """What is computed, and the folder that is written of it."""
     out = tmp_path_factory.mktemp("out")
-    with kept(run) as (computed, patch):
-        patch.setattr(compute, "POINTS", 8)  # 0.3, 0.4, ... 1: both sides of the threshold that is looked at
-        patch.setattr(compute, "DIGITS", 5e-7)  # within the 1e-6 of the numbers tested
-        run.reproduce(out, runs=400, seed=1)
-    return computed[0], out / "intermittent-observations"
+    # Points at 0.3, 0.4, ... 1: both sides of the threshold that is looked at; digits within the 1e-6 of those tested.
+    chosen = intermittent_observations.Setting(runs=400, seed=1, points=8, digits=5e-7)
+    return intermittent_observations.run(chosen, out), out / "intermittent-observations"
 
 
 @pytest.fixture(scope="module")
@@ -116,13 +114,13 @@ EXPECTED = {  # what the statements say of the truth
 
 
 def test_verdicts(found):
-    verdicts = [s.verdict for s in statements(found)]
+    verdicts = [s.verdict for s in statements(found)["papers"]]
     assert {v: verdicts.count(v) for v in set(verdicts)} == EXPECTED
 
 
 def changed(found, **changes):
     """Verdicts that differ where the evidence is changed."""
-    pairs = zip(statements(found), statements(found._replace(**changes)), strict=True)
+    pairs = zip(statements(found)["papers"], statements(replace(found, **changes))["papers"], strict=True)
     return {before.text.split(":")[0][:40] for before, after in pairs if before.verdict != after.verdict}
 
 
@@ -160,7 +158,7 @@ def test_verdicts_follow_the_evidence(found):
         assert {any(text.startswith(e) for e in expected) for text in different} == {True}, (changes, different)
         assert all(any(text.startswith(e) for text in different) for e in expected), (expected, different)
         seen |= different
-    assert len(seen) == len(statements(found))
+    assert len(seen) == len(statements(found)["papers"])
 
 
 def test_every_file_is_there(folder, found, fits):

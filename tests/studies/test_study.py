@@ -194,7 +194,7 @@ def test_as_published_nothing_differs_and_nothing_is_written_without_a_folder(st
     before = set(tmp_path.iterdir())
     outcome = study.run()
     assert outcome.total == 1.0 and set(tmp_path.iterdir()) == before
-    page = study.make_page(Setting(runs=3), outcome, {})
+    page = study.make_page(Setting(runs=3), outcome, study.statements(outcome), {})
     assert [section.title for section in page.sections] == ["Table"]
 
 

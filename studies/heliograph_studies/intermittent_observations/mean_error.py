@@ -1,11 +1,11 @@
-"""E P of the filter that is told of losses: by quadrature, from simulated runs, and over all patterns of losses."""
+"""E P of the filter that is told of losses: by quadrature, from runs, over all patterns; and its Riccati equation."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import chebyshev
 
-from heliograph_studies.intermittent_observations.setting import NOISE, Example
+from heliograph_studies.intermittent_observations.setting import Example
 
 DEGREE, LOSSES, SQUARINGS = 40, 400, 8  # of the polynomials; in a row; of the map from arrival to arrival
 
@@ -17,15 +17,15 @@ def mean_error(example: Example, fail: float, recover: float) -> float:
     x from arrival to arrival is that of a smooth random map h(g^l(x)), here on Chebyshev polynomials, and E P the
     mean of x + g(x) + ... + g^l(x) over that of l + 1.
     """
-    a, c, q = (float(np.squeeze(v)) for v in (example.transition, example.output, example.process))
+    a, c, q, r = (float(np.squeeze(v)) for v in (example.transition, example.output, example.process, example.noise))
     lasts = np.arange(LOSSES)
     after = np.where(lasts == 0, 1.0, fail * (1 - recover) ** np.maximum(lasts - 1.0, 0.0))  # P(l >= lasts)
     growth = (a * a) ** lasts.astype(float)
     added = q * (growth - 1) / (a * a - 1)
-    low, high = q, a * a * NOISE / c**2 + q
+    low, high = q, a * a * r / c**2 + q
     nodes = np.cos(np.pi * (np.arange(DEGREE) + 0.5) / DEGREE)
     before = (low + (high - low) * (nodes + 1) / 2)[:, None] * growth + added
-    following = a * a * before * NOISE / (c * c * before + NOISE) + q
+    following = a * a * before * r / (c * c * before + r) + q
     values = chebyshev.chebvander(2 * (following - low) / (high - low) - 1, DEGREE - 1)
     mean_values = np.einsum("l,xld->xd", after - np.append(after[1:], 0.0), values)
     onward = np.linalg.solve(chebyshev.chebvander(nodes, DEGREE - 1), mean_values)
@@ -68,7 +68,7 @@ def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarra
 def over_patterns(example: Example, arrival: float, steps: int) -> np.ndarray:
     """tr E P after 0 ... steps steps from P = Q, over all 2^steps patterns of independent losses."""
     a, c, q = example.transition, example.output, example.process * np.eye(example.states)
-    r, p, weight, found = NOISE * np.eye(len(c)), q[None], np.ones(1), [float(np.trace(q))]
+    r, p, weight, found = example.noise * np.eye(len(c)), q[None], np.ones(1), [float(np.trace(q))]
     for _ in range(steps):
         gain = a @ p @ c.T @ np.linalg.inv(c @ p @ c.T + r)
         loop = a - gain @ c
@@ -77,3 +77,36 @@ def over_patterns(example: Example, arrival: float, steps: int) -> np.ndarray:
         weight = np.concatenate([(1 - arrival) * weight, arrival * weight])
         found.append(float(np.einsum("p,pii->", weight, p)))
     return np.array(found)
+
+
+class Iterated(NamedTuple):
+    """tr V and the largest |V - V'| of each step, by the two forms."""
+
+    subtracted: np.ndarray
+    joseph: np.ndarray
+    skew: np.ndarray
+    joseph_skew: np.ndarray
+
+    @property
+    def skew_growth(self) -> float:
+        """Factor a step by which the subtracted form's skew part grows, from the middle on."""
+        middle = len(self.skew) // 2
+        return float((self.skew[-1] / self.skew[middle]) ** (1 / (len(self.skew) - 1 - middle)))
+
+
+def iterate(example: Example, arrival: float, steps: int) -> Iterated:
+    """The modified Riccati equation as printed and in Joseph's form: V+ = A V A' + Q - arrival K S K'."""
+    a, c, q = example.transition, example.output, example.process * np.eye(example.states)
+    r = example.noise * np.eye(len(c))
+    printed = joseph = q
+    found = []
+    for _ in range(steps):
+        innovation, cross = c @ printed @ c.T + r, a @ printed @ c.T
+        printed = a @ printed @ a.T + q - arrival * cross @ np.linalg.inv(innovation) @ cross.T
+        gain = a @ joseph @ c.T @ np.linalg.inv(c @ joseph @ c.T + r)
+        loop = a - gain @ c
+        squares = loop @ joseph @ loop.T + gain @ r @ gain.T
+        joseph = (1 - arrival) * a @ joseph @ a.T + arrival * squares + q
+        skew = [float(np.abs(v - v.T).max()) for v in (printed, joseph)]
+        found.append((np.trace(printed), np.trace(joseph), *skew))
+    return Iterated(*np.array(found).T)

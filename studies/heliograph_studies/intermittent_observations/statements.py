@@ -1,11 +1,11 @@
-"""What the publications state, beside what is found here; verdicts follow from the numbers in a `Reproduction`."""
+"""What the publications state, beside what is found here; verdicts follow from the numbers of an `Outcome`."""
 
 from typing import Any
 
 import numpy as np
 
-from heliograph_studies.intermittent_observations import setting
-from heliograph_studies.intermittent_observations.compute import Link, Reproduction
+from heliograph_studies.intermittent_observations.compute import Link, Outcome
+from heliograph_studies.intermittent_observations.setting import threshold
 from heliograph_studies.statement import Evidence, Sampled, Statement, Verdict, holds
 
 SINOPOLI = "Sinopoli et al. (2004)"
@@ -16,21 +16,22 @@ DIVERGED = 1e6  # of a covariance that starts near 1, after 100 steps
 MEASURE = 1e-9  # relative: two ways to one covariance
 
 
-def statements(result: Reproduction) -> list[Statement]:
+def statements(result: Outcome) -> dict[str, list[Statement]]:
     """Theorems, special cases, successors, and what is often taken for granted."""
-    return [*_critical(result), *_bounds(result), *_meeting(result), *_losses(result), *_errata(result)]
+    parts = _critical, _bounds, _meeting, _losses, _errata
+    return {"papers": [statement for part in parts for statement in part(result)]}
 
 
-def _critical(result: Reproduction) -> list[Statement]:
+def _critical(result: Outcome) -> list[Statement]:
     found, v = result.critical["scalar"], result.verdicts
-    eigenvalues = np.abs(np.linalg.eigvals(setting.COUPLED.transition))
+    eigenvalues = np.abs(np.linalg.eigvals(result.setting.coupled.transition))
     product = 1 - float(np.prod(eigenvalues[eigenvalues > 1])) ** -2
     coupled = result.critical["coupled"]
     return [
         Statement("An unstable plant has a critical arrival probability: E P diverges below, is bounded above",
             f"{SINOPOLI}, Theorem 2", "1 − 1/a² = 0.36 for a = −1.25",
             f"{found.lower:.6f} to {found.upper:.6f}; just below: {v['below']}, just above: {v['above']}",
-            {"lower": found.lower, "upper": found.upper, "predicted": 1 - 1.25**-2,
+            {"lower": found.lower, "upper": found.upper, "predicted": _predicted(result),
              "impossible_below": float(v["below"] == "impossible"),
              "certified_above": float(v["above"] == "certified")},
             _critical_arrival),
@@ -38,6 +39,10 @@ def _critical(result: Reproduction) -> list[Statement]:
             "Elia (2005); Schenato et al. (2007)", f"{product:.6f} in the coupled example",
             f"certified from {coupled.upper:.6f} on", {"found": coupled.upper, "predicted": product}, _as_predicted),
     ]  # fmt: skip
+
+
+def _predicted(result: Outcome) -> float:
+    return threshold(result.setting.scalar.transition[0, 0])
 
 
 def _critical_arrival(
@@ -51,7 +56,7 @@ def _as_predicted(found: float, predicted: float) -> Verdict:
     return holds(abs(found - predicted) < THRESHOLD)
 
 
-def _bounds(result: Reproduction) -> list[Statement]:
+def _bounds(result: Outcome) -> list[Statement]:
     links = {"scalar": result.scalar, "coupled": result.coupled, "one unstable": result.one_unstable}
     ours = "; ".join(f"{name}: {_between(each)}" for name, each in links.items())
     bursts = "; ".join(f"fail {b.fail:g}, recover {b.recover:g}: {_between(b)}" for b in result.bursts)
@@ -105,7 +110,7 @@ def _between(link: Link) -> str:
     return f"{link.lower:.6g} ≤ {mean} ≤ {link.bound:.8g}"
 
 
-def _meeting(result: Reproduction) -> list[Statement]:
+def _meeting(result: Outcome) -> list[Statement]:
     def gap(*names: str) -> Evidence:
         return {f"gap_of_{name}": result.critical[name].upper - result.critical[name].lower for name in names}
 
@@ -114,9 +119,9 @@ def _meeting(result: Reproduction) -> list[Statement]:
 
     shrinking, growing, turning = (_ratio(values) for values in (result.between, result.below, result.turning[::2]))
     ours = (
-        f"at arrival {setting.BETWEEN:g}, over all patterns of {len(result.between) - 1} steps, the last increment of "
-        f"E tr P is {shrinking:.3f} of the one before; below the lower condition {growing:.3f}; the bound's would grow "
-        f"by {result.between_bound:.3f}. Evidence, no proof"
+        f"at arrival {result.setting.between:g}, over all patterns of {len(result.between) - 1} steps, the last "
+        f"increment of E tr P is {shrinking:.3f} of the one before; below the lower condition {growing:.3f}; the "
+        f"bound's would grow by {result.between_bound:.3f}. Evidence, no proof"
     )
     return [
         Statement("The two conditions meet where the output shows the whole state", f"{SINOPOLI}, C invertible", "meet",
@@ -146,8 +151,9 @@ def _ratio(values: np.ndarray) -> float:
     return float(increments[-1] / increments[-2])
 
 
-def _losses(result: Reproduction) -> list[Statement]:
-    v, expected = result.verdicts, (1 - 2.5**-2, 1 - 1.5**-2)
+def _losses(result: Outcome) -> list[Statement]:
+    v, factors = result.verdicts, np.diag(result.setting.components.transition)
+    expected = [threshold(factor) for factor in factors]
     components = {"first": result.components[0], "second": result.components[1], "first_predicted": expected[0],
                   "second_predicted": expected[1], "certified_above": float(v["both_above"] == "certified"),
                   "impossible_below": float(v["first_below"] == v["second_below"] == "impossible")}  # fmt: skip
@@ -159,7 +165,7 @@ def _losses(result: Reproduction) -> list[Statement]:
             f"{result.components[0]:.6f} and {result.components[1]:.6f}; both above: {v['both_above']}, one below: "
             f"{v['first_below']}", components, _of_their_own),
         Statement("In bursts, a scalar plant's error is bounded if recovery > 1 - 1/a^2, however often links fail",
-            "Huang and Dey (2007)", "0.36", recoveries, {**needed, "predicted": 1 - 1.25**-2}, _all_as_predicted),
+            "Huang and Dey (2007)", "0.36", recoveries, {**needed, "predicted": _predicted(result)}, _all_as_predicted),
     ]  # fmt: skip
 
 
@@ -179,7 +185,7 @@ def _all_as_predicted(predicted: float, **found: float) -> Verdict:
     return holds(all(abs(value - predicted) < THRESHOLD for value in found.values()))
 
 
-def _errata(result: Reproduction) -> list[Statement]:
+def _errata(result: Outcome) -> list[Statement]:
     it, constant, scalar = result.iterated, result.constant, result.critical["scalar"]
     right = abs(it.joseph[-1] / result.coupled.bound - 1)
     wrong = abs(it.subtracted[-1] / result.coupled.bound - 1)

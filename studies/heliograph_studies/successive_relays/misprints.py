@@ -1,13 +1,15 @@
 """Misprints, each taken as a statement: what the printed formula does."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 import heliograph as hg
 from heliograph_studies.statement import Evidence, Statement, Verdict, holds
-from heliograph_studies.successive_relays import setting
-from heliograph_studies.successive_relays.compute import Misprinted, Reproduction, misprinted
+from heliograph_studies.successive_relays.compute import Misprinted, Outcome
+from heliograph_studies.successive_relays.setting import TRANSITION, shadowing
+from heliograph_studies.successive_relays.setting import circuit as matrix_of
 
 ROUNDING = 1e-9  # relative, of traces followed over many steps
 DIGITS = 6e-5  # of the printed matrix, which has four decimals
@@ -68,7 +70,7 @@ def _largest_noise() -> float:
     """Smallest eigenvalue of Xi_1 at k = 40 where relays hear next to nothing and noise is unequal."""
     plant = hg.LinearPlant(0.1 * np.eye(2), np.diag([0.01, 1.0]), np.zeros(2), 0.01 * np.eye(2))
     sensor = hg.LinearSensor([[1.0, 1.0]], [[1.0]])
-    network = _alternating(plant, sensor, setting.shadowing(0.5, 0.1), 1e6, 1e6)
+    network = _alternating(plant, sensor, shadowing(0.5, 0.1), 1e6, 1e6)
     return float(np.linalg.eigvalsh(hg.relays.own_error_design(network, 40).covariance["relay_1"][-1])[0])
 
 
@@ -76,7 +78,7 @@ def _noise_squared() -> tuple[float, int, tuple[float, float]]:
     """P_4 of a scalar system with O = 100, and (52) with o = O^2 and with o = O."""
     tau, w, noise, order = 0.81, 1e-6, 100.0, 4
     plant, sensor = hg.LinearPlant([[0.9]], [[w]], [0.0], [[10.0]]), hg.LinearSensor([[1.0]], [[1e-6]])
-    network = _alternating(plant, sensor, setting.shadowing(1.0, 1e-6), 1e-6, noise)
+    network = _alternating(plant, sensor, shadowing(1.0, 1e-6), 1e-6, noise)
     bounds, upper = [10.0, 10.0], 10.0
     for _ in range(order):
         factors = [o / (o + 4 * upper) for o in (noise**2, noise)]
@@ -85,10 +87,10 @@ def _noise_squared() -> tuple[float, int, tuple[float, float]]:
     return float(hg.relays.own_error_design(network, order).trace("receiver")[-1]), order, (bounds[0], bounds[1])
 
 
-def misprints(result: Reproduction) -> list[Statement]:
+def misprints(result: Outcome) -> list[Statement]:
     """In the recursion."""
     wrong = result.misprints
-    more, less = misprinted("lemma_1", process=4 * setting.VARIANCE), misprinted("lemma_1", sensor=4 * setting.VARIANCE)
+    more, less = wrong["lemma_1_process"], wrong["lemma_1_sensor_noise"]
     gain, seventh = wrong["theorem_1"], wrong["lemma_7"]
     return [
         Statement("Πₖ from Σ V Σ′", "(13), Lemma 1", "V",
@@ -126,17 +128,18 @@ def _percent(ratio: float) -> str:
     return f"{100 * (ratio - 1):+.1f} %"
 
 
-def circuit(result: Reproduction) -> list[Statement]:
+def circuit(result: Outcome) -> list[Statement]:
     """In the example."""
-    gap = {h: float(np.max(np.abs(setting.circuit(h) - setting.TRANSITION))) for h in (0.5, 5.0)}
-    other = hg.relays.own_error_design(setting.network(setting.plant(setting.circuit(0.5))), 10).trace("receiver")[10]
-    plus = setting.circuit(5.0, second_sign=1.0)
-    radius, wrong = float(np.max(np.abs(np.linalg.eigvals(plus)))), float(np.max(np.abs(plus - setting.TRANSITION)))
-    own = float(result.paper.trace("receiver")[10])
+    gap = {h: float(np.max(np.abs(matrix_of(h) - TRANSITION))) for h in (0.5, 5.0)}
+    printed = replace(result.setting, transition=matrix_of(0.5)).network()
+    other = hg.relays.own_error_design(printed, 10).trace("receiver")[10]
+    plus = matrix_of(5.0, second_sign=1.0)
+    radius, wrong = float(np.max(np.abs(np.linalg.eigvals(plus)))), float(np.max(np.abs(plus - TRANSITION)))
+    remote = float(result.trace["remote"][10])
     return [
         Statement("L = 0.5 H gives the printed Γ", "Section IV", "0.5 H",
             f"largest difference {gap[0.5]:.3f}; 5 H gives it to {gap[5.0]:.1g} (four printed decimals). With 0.5 H "
-            f"tr P₁₀ is {other:.3g}, not {own:.3g}",
+            f"tr P₁₀ is {other:.3g}, not {remote:.3g}",
             {"largest_difference": gap[0.5]}, lambda largest_difference: holds(largest_difference <= DIGITS)),
         Statement("second capacitor's equation with + i_L", "Section IV", "+ i_L",
             f"the matrix A has - i_L; with + the plant has spectral radius {radius:.3f}",

@@ -3,13 +3,12 @@
 Everything at k - 1 unless marked; even k: relay 1 receives and relay 2 transmits, odd k the other way round.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph_studies.successive_relays import setting
+from heliograph_studies.successive_relays.setting import Setting
 
 MISPRINTS = ("none", "lemma_1", "theorem_1", "lemma_7", "lemma_6_sign", "lemma_6_last")
 
@@ -23,11 +22,8 @@ class Recursion(NamedTuple):
     remote_trace: np.ndarray  # (N + 1,)
 
 
-@cache  # every misprint is compared with the same right one
-def recursion(
-    misprint: str, horizon: int, process: float = setting.VARIANCE, sensor: float = setting.VARIANCE
-) -> Recursion:
-    """Lemmas 1 to 7 and Theorems 1 and 2 on the example, with W = `process` and V = `sensor`.
+def recursion(misprint: str, horizon: int, setting: Setting) -> Recursion:
+    """Lemmas 1 to 7 and Theorems 1 and 2 on the example.
 
     Misprints: lemma_1, Pi from V in (13); theorem_1, Xi_i for Xi_ij in the gain (30); lemma_7, the variance squared for
     the mean squared before P_i + P_i'; lemma_6_sign, delta for deltabar in (24); lemma_6_last, Xi_i' for Xi_ij' there.
@@ -38,19 +34,19 @@ def recursion(
     """
     if misprint not in MISPRINTS:
         raise fail("misprint", f"one of {list(MISPRINTS)}", repr(misprint))
-    Gam, Psi, n = setting.TRANSITION, setting.SENSING, len(setting.TRANSITION)
-    SS = setting.PROCESS_INPUT @ setting.PROCESS_INPUT.T
-    Q, R = process * SS, setting.SENSOR_INPUT**2 * sensor * np.eye(1)
-    Q1 = sensor * SS if misprint == "lemma_1" else Q
-    G = setting.VARIANCE * np.eye(1)  # and O
-    P = C = setting.INITIAL_COVARIANCE
+    Gam, Psi, n = setting.transition, np.array([setting.sensing]), len(setting.transition)
+    SS = np.outer(setting.process_input, setting.process_input)
+    Q, R = setting.process * SS, setting.sensor_input**2 * setting.sensor_noise * np.eye(1)
+    Q1 = setting.sensor_noise * SS if misprint == "lemma_1" else Q
+    G = setting.noise * np.eye(1)  # and O
+    P = C = setting.initial_covariance
     X, Xx, Pm = ([P, P] for _ in range(3))
-    Pi = P + np.outer(setting.INITIAL_MEAN, setting.INITIAL_MEAN)
+    Pi = P + np.outer(setting.initial_mean, setting.initial_mean)
     K_all, L_all, relay, remote = [], [], [[np.trace(P)] * 2], [np.trace(P)]
-    v, m_3 = setting.SPREAD, setting.MEANS[3]
+    v, m_3 = setting.spread, setting.means[2]
     for k in range(1, horizon + 1):
         i, j = (0, 1) if k % 2 == 0 else (1, 0)
-        m, d = setting.MEANS[1 + i], setting.MEANS[4 + j]
+        m, d = setting.means[i], setting.means[3 + j]
         Cij = C if i == 0 else C.T
         Gb = m * Psi @ Gam + m_3 * Psi
         al = (v + m**2) * (Psi @ Q @ Psi.T + R) + G + v * Psi @ (Pi + Gam @ Pi @ Gam.T) @ Psi.T

@@ -7,9 +7,8 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph_studies.statement import Evidence, Statement, Verdict, holds, vacuous
-from heliograph_studies.successive_relays import setting
 from heliograph_studies.successive_relays.certificate import Bound, RelayCertificate
-from heliograph_studies.successive_relays.compute import FILTERS, Reproduction
+from heliograph_studies.successive_relays.compute import FILTERS, Outcome
 from heliograph_studies.successive_relays.misprints import circuit, misprints, proofs
 
 FALSE_ALARM = 1e-3  # that some step of a right design is told to disagree with the simulation
@@ -19,15 +18,19 @@ LITTLE = 0.05  # a relative difference that does not matter
 HALF = 0.25  # of a mean squared error: half the error
 
 
-def statements(result: Reproduction) -> list[Statement]:
+def statements(result: Outcome) -> dict[str, list[Statement]]:
     """All of them: results first, then bounds, then misprints."""
-    return [*on_filters(result), *on_bounds(result), *on_formulas(result)]
+    return {
+        "filters": [*_designs(result), *_estimates(result)],
+        "bounds": [*_bounds(result), *_scalar_bounds(result), *proofs()],
+        "formulas": [*misprints(result), *circuit(result)],
+    }
 
 
-def worst_z(result: Reproduction, name: str = "receiver") -> tuple[float, int]:
+def worst_z(result: Outcome, name: str = "receiver") -> tuple[float, int]:
     """Largest |designed - simulated| in standard errors over k = 0 .. horizon, and where."""
     simulated = result.simulated
-    z = np.abs(simulated.mean[name] - result.paper.trace(name)) / simulated.error[name]
+    z = np.abs(simulated.mean[name] - result.designs.paper.trace(name)) / simulated.error[name]
     return float(z.max()), int(z.argmax())
 
 
@@ -36,35 +39,25 @@ def z_limit(steps: int) -> float:
     return float(stats.t.isf(FALSE_ALARM / 2 / steps, BATCHES - 1))
 
 
-def tuned_mean_ratio(result: Reproduction, name: str = "tuned") -> float:
-    """Mean over k = 1 .. horizon of tr P_k / tr P_k(paper)."""
-    design = result.tuned if name == "tuned" else result.bounded
-    return float(np.mean(design.trace("receiver")[1:] / result.paper.trace("receiver")[1:]))
-
-
-def on_filters(result: Reproduction) -> list[Statement]:
-    """What the paper claims of its filters."""
-    return [*_designs(result), *_estimates(result)]
-
-
-def _totals(result: Reproduction) -> dict[str, float]:
+def _totals(result: Outcome) -> dict[str, float]:
     """The steady sums of two steps, by design."""
-    return {name: value.even + value.odd for name, value in result.steady.items()}
+    return {name: value.even + value.odd for name, value in result.states.items()}
 
 
-def _designs(result: Reproduction) -> list[Statement]:
-    trace, total = result.paper.trace("receiver"), _totals(result)
-    found = result.certificates["paper"].recomputed
-    bias = max(float(np.max(np.linalg.norm(found.mean[f], axis=1) / np.sqrt(result.paper.trace(f)))) for f in FILTERS)
+def _designs(result: Outcome) -> list[Statement]:
+    paper, total = result.designs.paper, _totals(result)
+    trace, found = paper.trace("receiver"), result.certificates["paper"].recomputed
+    bias = max(float(np.max(np.linalg.norm(found.mean[f], axis=1) / np.sqrt(paper.trace(f)))) for f in FILTERS)
     correlation = max(float(np.max(c)) for c in found.correlation.values())
-    gaps = [np.abs(found.covariance[f] - result.paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
-    sizes = [np.abs(result.paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
+    gaps = [np.abs(found.covariance[f] - paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
+    sizes = [np.abs(paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
     own = float(np.max(np.array(gaps) / np.array(sizes)))
-    ratio, limit = tuned_mean_ratio(result), z_limit(len(trace))
+    ratio, quiet = result.tuned_mean_ratio, result.designs.mean_ratio(result.designs.bounded)
+    limit = z_limit(len(trace))
     z, where = worst_z(result)
     worst = max(worst_z(result, name)[0] for name in FILTERS)
     right = result.misprints["none"]
-    mean = result.paper.moments[:, :3, :3].shape[0]
+    mean = len(paper.moments)
     return [
         Statement("the lemmas, with the corrections below, give the exact error covariances", "Lemmas 1 to 7",
             "recursions for each covariance",
@@ -79,29 +72,30 @@ def _designs(result: Reproduction) -> list[Statement]:
             "concurrently designed optimal recursive filters",
             "each relay's gain is the best for its own next estimate, not for the receiver's: with gains chosen for "
             f"the receiver the mean over k = 1 .. {mean - 1} of tr Pₖ / tr Pₖ(paper) is {ratio:.4f}, and "
-            f"{tuned_mean_ratio(result, 'bounded'):.4f} at no step with more power than the paper's; the steady sum "
+            f"{quiet:.4f} at no step with more power than the paper's; the steady sum "
             f"falls from {total['paper']:.5g} to {total['joint']:.6g}, and to {total['lmmse_tuned']:.5g} with the best "
             "linear receiver",
             {"mean_ratio_when_tuned": ratio, "steady_ratio_when_tuned": total["joint"] / total["paper"]},
             lambda mean_ratio_when_tuned, steady_ratio_when_tuned: holds(
                 min(mean_ratio_when_tuned, steady_ratio_when_tuned) >= 1 - ROUNDING)),
         Statement("the designed covariances are those of the simulated filters", "Figs. 2 to 5", "one run shown",
-            f"remote filter: largest |z| {z:.2f} at k = {where} over {len(trace)} steps and {result.runs} runs "
+            f"remote filter: largest |z| {z:.2f} at k = {where} over {len(trace)} steps and {result.setting.runs} runs "
             f"(limit {limit:.1f}: false alarm {FALSE_ALARM:g} over all steps, t with {BATCHES - 1} degrees of "
             f"freedom); relays included: {worst:.2f}", {"largest_z": worst, "limit": limit},
             lambda largest_z, limit: holds(largest_z < limit)),
         Statement("inter-relay interference is eliminated in the mean", "Remark 2", "E (γ₃ − mean) ŷⱼ = 0",
             f"the estimates are unbiased; but the relay subtracts its own signal for the other's, and fading is what "
             f"costs: the remote error is {trace[10]:.4g} at k = 10, of which the gains' variances make all but 0.3 %"
-            if _without_fading() / trace[10] < 0.004 else "unbiased",
+            if _without_fading(result) / trace[10] < 0.004 else "unbiased",
             {"largest_bias": bias}, lambda largest_bias: holds(largest_bias <= ROUNDING)),
     ]  # fmt: skip
 
 
-def _estimates(result: Reproduction) -> list[Statement]:
-    trace, state = result.paper.trace("receiver"), np.trace(result.paper.moments[:, :3, :3], axis1=1, axis2=2)
+def _estimates(result: Outcome) -> list[Statement]:
+    paper, best = result.designs.paper, result.designs.best_behind
+    trace, state = paper.trace("receiver"), np.trace(paper.moments[:, :3, :3], axis1=1, axis2=2)
     track, total = {f"relative_error_at_{k}": _relative(result, k) for k in (10, 50, 100)}, _totals(result)
-    first = float(np.max(np.abs(result.paper.gains["receiver"][0])))
+    first = float(np.max(np.abs(paper.gains["receiver"][0])))
     return [
         Statement("the estimates track the state", "Section IV, Figs. 2 to 4", "competent",
             f"rms error / rms state {_relative(result, 10):.3f} at k = 10, {_relative(result, 50):.3f} at 50, "
@@ -120,9 +114,9 @@ def _estimates(result: Reproduction) -> list[Statement]:
             lambda over_the_floor: holds(over_the_floor < 2)),
         Statement("behind the paper's relays the remote filter (9) is good", "Theorem 2", "optimal",
             f"the best linear filter gains {100 * (1 - total['lmmse'] / total['paper']):.1f} % in the steady sum and "
-            f"at most {100 * (1 - np.min(result.best_behind / trace[1:])):.1f} % for k ≤ {len(state) - 1}",
+            f"at most {100 * (1 - np.min(best / trace[1:])):.1f} % for k ≤ {len(state) - 1}",
             {"steady_gain": 1 - total["lmmse"] / total["paper"],
-             "largest_gain": float(1 - np.min(result.best_behind / trace[1:]))},
+             "largest_gain": float(1 - np.min(best / trace[1:]))},
             lambda steady_gain, largest_gain: holds(max(steady_gain, largest_gain) < LITTLE)),
         Statement("L₁ carries nothing", "(31)", "not said",
             f"largest entry of L₁ {first:.1g}",
@@ -130,41 +124,29 @@ def _estimates(result: Reproduction) -> list[Statement]:
     ]  # fmt: skip
 
 
-def on_formulas(result: Reproduction) -> list[Statement]:
-    """Each printed formula, taken as a statement."""
-    return [*misprints(result), *circuit(result)]
-
-
-def _relative(result: Reproduction, k: int) -> float:
+def _relative(result: Outcome, k: int) -> float:
     """Root of tr P_k over the root of E |x_k|^2."""
-    state = np.trace(result.paper.moments[k, :3, :3]) + float(np.sum(_state_mean(result, k) ** 2))
-    return float(np.sqrt(result.paper.trace("receiver")[k] / state))
+    paper, setting = result.designs.paper, result.setting
+    mean = np.linalg.matrix_power(setting.transition, k) @ setting.initial_mean
+    state = np.trace(paper.moments[k, :3, :3]) + float(np.sum(mean**2))
+    return float(np.sqrt(paper.trace("receiver")[k] / state))
 
 
-def _state_mean(result: Reproduction, k: int) -> np.ndarray:
-    moved: np.ndarray = np.linalg.matrix_power(setting.TRANSITION, k) @ setting.INITIAL_MEAN
-    return moved
-
-
-def _without_fading() -> float:
+def _without_fading(result: Outcome) -> float:
     """tr P_10 with every gain at its mean."""
+    network = result.setting.network()
     slots = [
         {listener: {s: hg.model.mean_gain(link) for s, link in links.items()} for listener, links in slot.items()}
-        for slot in setting.network().slots
+        for slot in network.slots
     ]
-    network = hg.model.RelayNetwork(setting.plant(), setting.sensor(), ("relay_1", "relay_2"), slots)
-    return float(hg.relays.own_error_design(network, 10).trace("receiver")[10])
+    certain = hg.model.RelayNetwork(network.plant, network.sensor, ("relay_1", "relay_2"), slots)
+    return float(hg.relays.own_error_design(certain, 10).trace("receiver")[10])
 
 
-def on_bounds(result: Reproduction) -> list[Statement]:
-    """Its bounds on the errors, as printed."""
-    return [*_bounds(result), *_scalar_bounds(result), *proofs()]
-
-
-def _bounds(result: Reproduction) -> list[Statement]:
+def _bounds(result: Outcome) -> list[Statement]:
     certificate, tuned = result.certificates["paper"], result.certificates["tuned"]
     bounds = certificate.bounds
-    truth = float(result.paper.trace("receiver")[-1])
+    truth = float(result.trace["remote"][-1])
     upper, lower, alpha = bounds["Theorem 3, upper"], bounds["Theorem 3, lower"], bounds["Theorem 4, lower"]
     state = bounds["state covariance"]
     least = {name: min(_below_state(result.certificates[name], f) for f in FILTERS) for name in ("paper", "tuned")}
@@ -200,8 +182,8 @@ def _bounds(result: Reproduction) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _scalar_bounds(result: Reproduction) -> list[Statement]:
-    scalar, printed = result.counterexample.bounds, _printed_scalar()
+def _scalar_bounds(result: Outcome) -> list[Statement]:
+    scalar, printed = result.certificates["scalar"].bounds, _printed_scalar()
     remote, relay = (_scalar_limit(result, name) for name in ("receiver", "relay_1"))
     highest = [scalar[name].values for name in ("Lemma 8, upper", "Lemma 9, upper")]
     tops = max(values[0] for values in highest if values is not None)
@@ -233,8 +215,8 @@ def _conditional(bound: Bound) -> tuple[Evidence, Callable[..., Verdict]]:
     )
 
 
-def _scalar_limit(result: Reproduction, name: str) -> float:
-    return float(result.counterexample.recomputed.covariance[name][-1, 0, 0])
+def _scalar_limit(result: Outcome, name: str) -> float:
+    return float(result.certificates["scalar"].recomputed.covariance[name][-1, 0, 0])
 
 
 def _printed_scalar() -> dict[str, float]:
