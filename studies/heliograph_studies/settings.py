@@ -50,7 +50,11 @@ def _replaced(part: Any, path: list[str], name: str, text: str, known: list[str]
         return {**part, first: _replaced(part[first], rest, name, text, known)}
     if not is_dataclass(part) or first not in {field.name for field in fields(part)}:
         raise fail("--set", f"one of {', '.join(known)}", repr(name))
-    return replace(part, **{first: _replaced(getattr(part, first), rest, name, text, known)})  # type: ignore[type-var]
+    value = _replaced(getattr(part, first), rest, name, text, known)
+    try:
+        return replace(part, **{first: value})  # type: ignore[type-var]
+    except TypeError:  # an object of the library, which is made of other arguments than it holds
+        raise fail(f"--set {name}", f"a {type(part).__name__} that is set in Python", repr(text)) from None
 
 
 def _read(now: object, name: str, text: str) -> object:
@@ -63,15 +67,24 @@ def _read(now: object, name: str, text: str) -> object:
         return text == "true"
     if isinstance(now, int | float):
         return _number(text, name, type(now))
-    if isinstance(now, tuple | np.ndarray) and np.asarray(now).dtype.kind in "if":
-        try:
-            numbers = np.array(json.loads(f"[{text}]"), dtype=np.float64)
-        except (ValueError, TypeError):
-            raise fail(f"--set {name}", f"{np.size(now)} numbers separated by commas", repr(text)) from None
-        if numbers.ndim != 1 or numbers.size != np.size(now):
-            raise fail(f"--set {name}", f"{np.size(now)} numbers separated by commas", repr(text))
-        return numbers.reshape(np.shape(now)) if isinstance(now, np.ndarray) else tuple(numbers.tolist())
+    numbers = np.asarray(now) if isinstance(now, tuple | np.ndarray) else np.asarray(None)
+    if numbers.dtype.kind in "if":
+        return _row(numbers, name, text, isinstance(now, tuple))
     raise fail(f"--set {name}", "a number; what is none is set in Python", repr(text))
+
+
+def _row(now: np.ndarray, name: str, text: str, as_tuple: bool) -> object:
+    """As many numbers as there are now, in their shape."""
+    try:
+        numbers = np.array([_number(part, name, int if now.dtype.kind == "i" else float) for part in text.split(",")])
+    except ValueError:
+        numbers = np.zeros(0)
+    if numbers.size != now.size:
+        raise fail(f"--set {name}", f"{now.size} numbers separated by commas", repr(text))
+    shaped = numbers.reshape(now.shape)
+    if not as_tuple:
+        return shaped
+    return tuple(shaped.tolist()) if now.ndim == 1 else tuple(map(tuple, shaped.tolist()))
 
 
 def _number(text: str, name: str, kind: type) -> int | float:

@@ -1,7 +1,7 @@
 """A study: other numbers, what is kept of one that fails, what is written, and what is printed."""
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
@@ -54,6 +54,8 @@ The end.
 class Noise:
     mean: float = 0.0
     values: tuple[float, ...] = (1.0, 2.0)
+    pairs: tuple[tuple[int, int], ...] = ((1, 2), (3, 4))
+    law: hg.Discrete = field(default_factory=lambda: hg.Discrete([1.0], [1.0]))
 
 
 @dataclass(frozen=True)
@@ -118,8 +120,11 @@ def study(tmp_path, monkeypatch):
 
 
 def test_other_numbers_by_name():
-    setting = with_values(Setting(), {"noise.mean": "0.3", "seed": "4", "exact": "false", "noise.values": "3,4"})
-    assert setting == Setting(seed=4, exact=False, noise=Noise(0.3, (3.0, 4.0)))
+    setting = with_values(
+        Setting(), {"noise.mean": "0.3", "seed": "4", "exact": "false", "noise.values": "3,4", "noise.pairs": "1,1,2,2"}
+    )
+    assert (setting.seed, setting.exact, setting.noise.mean, setting.noise.values) == (4, False, 0.3, (3.0, 4.0))
+    assert setting.noise.pairs == ((1, 1), (2, 2))
     assert dict(leaves(setting))["noise.values"] == (3.0, 4.0)
     moved = with_values(Setting(matrix=np.eye(2)), {"matrix": "1,2,3,4"})
     np.testing.assert_array_equal(moved.matrix, [[1.0, 2.0], [3.0, 4.0]])
@@ -136,6 +141,8 @@ def test_other_numbers_by_name():
         ("exact", "yes", "--set exact: expected true or false, got 'yes'"),
         ("noise.values", "1", "--set noise.values: expected 2 numbers separated by commas, got '1'"),
         ("noise.values", "1,x", "--set noise.values: expected 2 numbers separated by commas, got '1,x'"),
+        ("noise.pairs", "1,2,3,4.5", "--set noise.pairs: expected 4 numbers separated by commas, got '1,2,3,4.5'"),
+        ("noise.law.values", "2", "--set noise.law.values: expected a Discrete that is set in Python, got '2'"),
         ("plant", "1", "--set plant: expected a number; what is none is set in Python, got '1'"),
     ],
 )

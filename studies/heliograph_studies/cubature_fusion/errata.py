@@ -5,8 +5,8 @@ import numpy as np
 import heliograph as hg
 from heliograph.random_affine.law import Discrete
 from heliograph_studies.cubature_fusion import one_step
-from heliograph_studies.cubature_fusion.compute import Outcome, Reproduction
-from heliograph_studies.cubature_fusion.setting import B4, B6, K1, NODES, PRINTED, STRONG, H, Setting
+from heliograph_studies.cubature_fusion.compute import Outcome, Runs
+from heliograph_studies.cubature_fusion.setting import B4, B6, K1, NODES, H, Scenario
 from heliograph_studies.statement import Sampled, Statement, holds
 
 DRAWS = 100_000  # of the uniform Delta: their spread is known to a third of a percent
@@ -14,52 +14,55 @@ ROUNDING = 1e-9  # relative, of quantities that are worked out in a few steps
 LONG = 100  # steps of the strong scenario
 
 
-def errata(result: Reproduction) -> list[Statement]:
+def errata(result: Outcome) -> list[Statement]:
     """Every erratum: the statement is that the formula is right as printed."""
+    s = result.printed.scenario
     return [
         _sign(result), _raw_minus(), _cross(result), _one_symbol(result), _raw_everywhere(result), _root(result),
-        _fusion(result), _relay_energy(), _process_noise(result), _offset(result), _prediction(), _uncertainty(result),
-        _whiteness(), _units(result), _horizon(),
+        _fusion(result), _relay_energy(s), _process_noise(result), _offset(result), _prediction(s),
+        _uncertainty(result), _whiteness(), _units(result), _horizon(s),
     ]  # fmt: skip
 
 
-def rmse(outcome: Outcome, name: str) -> str:
+def _scenarios(result: Outcome) -> list[Scenario]:
+    return [o.scenario for o in result.both]
+
+
+def rmse(outcome: Runs, name: str) -> str:
     """RMSE with its standard error."""
     return "{:.4f} ± {:.4f}".format(*outcome.pooled(name).rmse())
 
 
-def worst(outcome: Outcome, name: str) -> Sampled:
+def worst(outcome: Runs, name: str) -> Sampled:
     """Actual over claimed covariance in the worst direction."""
     found = outcome.pooled(name).worst_direction()
     return Sampled(found.ratio, found.standard_error)
 
 
-def ratio(outcome: Outcome, name: str) -> str:
+def ratio(outcome: Runs, name: str) -> str:
     """Worst direction: ratio, its excess over 1 in standard errors, step (from 1)."""
     worst = outcome.pooled(name).worst_direction()
     excess = f"z {worst.z:.1f}, " if worst.ratio > 1 else ""
     return f"{worst.ratio:.3f} ({excess}s = {worst.step % outcome.steps + 1})"
 
 
-def change(outcome: Outcome, name: str, reference: str) -> float:
+def change(outcome: Runs, name: str, reference: str) -> float:
     """Relative change of the RMSE in percent."""
     return 100 * (outcome.pooled(name).rmse()[0] / outcome.pooled(reference).rmse()[0] - 1)
 
 
-def _sign(result: Reproduction) -> Statement:
-    terms = [[one_step.box_terms(one_step.channel_of(s), sign).V for sign in (1, -1)] for s in (PRINTED, STRONG)]
-    excess = [100 * one_step.perfect_channel_excess(s) for s in (PRINTED, STRONG)]
+def _sign(result: Outcome) -> Statement:
+    terms = [[one_step.box_terms(one_step.channel_of(s), sign).V for sign in (1, -1)] for s in _scenarios(result)]
+    excess = [100 * one_step.perfect_channel_excess(s) for s in _scenarios(result)]
     strong, printed = result.strong, result.printed
     traces = [strong.pooled(name).mean_trace() for name in ("cubature_printed", "cubature_tight")]
     loose, tight = (printed.pooled(f"cubature_{name}_fixed").mean_trace() for name in ("printed", "tight"))
     ours = (
         f"The variance is at most second moment minus squared mean. Coefficient of Y: {terms[0][0]:.4f} instead of "
         f"{terms[0][1]:.4f} (printed), {terms[1][0]:.3f} instead of {terms[1][1]:.3f} (strong). Through a perfect "
-        f"channel "
-        f"the first step's trace is {excess[0]:.0f} % (printed) and {excess[1]:.0f} % (strong) above the Kalman "
-        f"filter's. "
-        f"In the printed example the trace changes by {loose / tight - 1:.0e} of itself; strong: mean trace "
-        f"{traces[0]:.5f} against {traces[1]:.5f}, RMSE {rmse(strong, 'cubature_printed')} against "
+        f"channel the first step's trace is {excess[0]:.0f} % (printed) and {excess[1]:.0f} % (strong) above the "
+        f"Kalman filter's. In the printed example the trace changes by {loose / tight - 1:.0e} of itself; strong: mean "
+        f"trace {traces[0]:.5f} against {traces[1]:.5f}, RMSE {rmse(strong, 'cubature_printed')} against "
         f"{rmse(strong, 'cubature_tight')}"
     )
     return Statement(
@@ -84,9 +87,9 @@ def _raw_minus() -> Statement:
     )  # fmt: skip
 
 
-def _cross(result: Reproduction) -> Statement:
-    right = one_step.innovation(PRINTED, hg.filters.Cubature()).Pxy
-    error = 100 * np.max(np.abs(one_step.mixed_cross(PRINTED) - right)) / np.max(np.abs(right))
+def _cross(result: Outcome) -> Statement:
+    right = one_step.innovation(result.printed.scenario, hg.filters.Cubature()).Pxy
+    error = 100 * np.max(np.abs(one_step.mixed_cross(result.printed.scenario) - right)) / np.max(np.abs(right))
     strong = result.strong
     ours = (
         f"Not P⁻C′: {error:.0f} % of its largest entry off at Ξ = 1.25 I. As a filter (polytope bound, strong): actual "
@@ -100,12 +103,12 @@ def _cross(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _one_symbol(result: Reproduction) -> Statement:
-    strong, first = result.strong, one_step.innovation(PRINTED, hg.filters.Cubature())
+def _one_symbol(result: Outcome) -> Statement:
+    strong, first = result.strong, one_step.innovation(result.printed.scenario, hg.filters.Cubature())
     ours = (
-        "Y = E[yy′] belongs to the terms of the gains, the covariance of the innovation to the (1 + β₂) term. With the "
-        f"covariance everywhere (polytope bound, strong): actual over claimed {ratio(strong, 'central_moment')}, RMSE "
-        f"{rmse(strong, 'central_moment')} against {rmse(strong, 'cubature_polytope_fixed')}"
+        "Y = E[yy′] belongs to the terms of the gains, the covariance of the innovation to the (1 + β₂) term. With "
+        f"the covariance everywhere (polytope bound, strong): actual over claimed {ratio(strong, 'central_moment')}, "
+        f"RMSE {rmse(strong, 'central_moment')} against {rmse(strong, 'cubature_polytope_fixed')}"
     )
     return Statement(
         "One symbol P^yy serves both moments", "(10), Steps 3 and 4", "defined twice", ours,
@@ -114,7 +117,7 @@ def _one_symbol(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _raw_everywhere(result: Reproduction) -> Statement:
+def _raw_everywhere(result: Outcome) -> Statement:
     strong = result.strong
     traces = [strong.pooled(name).mean_trace() for name in ("raw_moment", "cubature_polytope_fixed")]
     ours = (
@@ -128,9 +131,9 @@ def _raw_everywhere(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _root(result: Reproduction) -> Statement:
-    factors = [s.mean_gain**-0.5 for s in (PRINTED, STRONG)]
-    changes = [change(o, "step_four_gain", "cubature_printed_fixed") for o in result.outcomes]
+def _root(result: Outcome) -> Statement:
+    factors = [s.mean_gain**-0.5 for s in _scenarios(result)]
+    changes = [change(o, "step_four_gain", "cubature_printed_fixed") for o in result.both]
     ours = (
         f"Theorem 2 has μ, Step 4 √μ: the gain is {factors[0]:.2f} (printed) and {factors[1]:.2f} (strong) times too "
         f"large and (31) no longer belongs to it. RMSE {changes[0]:+.1f} % (printed), {changes[1]:+.1f} % (strong)"
@@ -142,7 +145,7 @@ def _root(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _fusion(result: Reproduction) -> Statement:
+def _fusion(result: Outcome) -> Statement:
     local = [result.printed.shown.estimates[node]["cubature_printed_fixed"] for node in NODES]
     means, bounds = (np.stack([np.asarray(getattr(e, a))[0] for e in local], axis=1) for a in ("mean", "covariance"))
     error = one_step.printed_fusion_error(means, bounds)
@@ -154,10 +157,9 @@ def _fusion(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _relay_energy() -> Statement:
-    s = PRINTED
+def _relay_energy(s: Scenario) -> Statement:
     ours = (
-        f"The relay's noise passes the second hop alone: α²Eʳ, as in (17). With Eᵢ = EˡEʳ its power would be "
+        "The relay's noise passes the second hop alone: α²Eʳ, as in (17). With Eᵢ = EˡEʳ its power would be "
         f"{s.sensor_power:g} of what it is. Also (27), (28): λ̄ for λ̌"
     )
     return Statement(
@@ -167,13 +169,12 @@ def _relay_energy() -> Statement:
     )  # fmt: skip
 
 
-def _process_noise(result: Reproduction) -> Statement:
+def _process_noise(result: Outcome) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()[9]
-    gap = one_step.predicted(PRINTED, hg.filters.Linearization(), claimed)[1]
+    gap = one_step.predicted(result.printed.scenario, hg.filters.Linearization(), claimed)[1]
     ours = (
-        f"The cross terms are E[Φeω′] = 0; with e e′ as printed they would double ΦΞΦ′, {np.trace(gap):.2f} of "
-        f"trace at "
-        "s = 10 (printed example)"
+        f"The cross terms are E[Φeω′] = 0; with e e′ as printed they would double ΦΞΦ′, {np.trace(gap):.2f} of trace "
+        "at s = 10 (printed example)"
     )
     return Statement(
         "The cross terms of the prediction hold e e′", "(37)", "", ours,
@@ -182,22 +183,21 @@ def _process_noise(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _offset(result: Reproduction) -> Statement:
+def _offset(result: Outcome) -> Statement:
     claimed = result.printed.statistics["1"]["cubature_printed_fixed"].claimed()
     gaps = []
     for rule in (hg.filters.Cubature(), hg.filters.PolynomialMoments(2)):
         moved, straight = (
-            np.array([one_step.predicted(PRINTED, each, c)[0] for c in claimed])
+            np.array([one_step.predicted(result.printed.scenario, each, c)[0] for c in claimed])
             for each in (rule, hg.filters.Linearization())
         )
         gaps.append(moved - straight)
     size = np.linalg.norm(gaps[0], axis=1)
     same = float(np.max(np.abs(np.array(gaps[0]) - gaps[1])))
     ours = (
-        f"The cubature mean is f(x̂) + ½ tr(HₖΞ). At the claimed covariances of the printed example (node 1) the "
-        f"second "
-        f"part is up to {size.max():.3f} long (s = {size.argmax() + 2}), the exact mean to {same:.0e}; (35) has no "
-        f"place for it"
+        "The cubature mean is f(x̂) + ½ tr(HₖΞ). At the claimed covariances of the printed example (node 1) the "
+        f"second part is up to {size.max():.3f} long (s = {size.argmax() + 2}), the exact mean to {same:.0e}; (35) has "
+        "no place for it"
     )
     return Statement(
         "x⁻ = f(x̂) up to what acts on e", "(35)", "", ours,
@@ -206,10 +206,10 @@ def _offset(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _prediction() -> Statement:
-    exact = one_step.predicted(PRINTED, hg.filters.PolynomialMoments(2))[1]
-    least = np.linalg.eigvalsh(one_step.predicted(PRINTED, hg.filters.Cubature())[1] - exact)[0]
-    start = PRINTED.claimed_initial_variance
+def _prediction(s: Scenario) -> Statement:
+    exact = one_step.predicted(s, hg.filters.PolynomialMoments(2))[1]
+    least = np.linalg.eigvalsh(one_step.predicted(s, hg.filters.Cubature())[1] - exact)[0]
+    start = s.claimed_initial_variance
     ours = (
         f"Theorem 1 needs P̂⁻ ≥ P⁻. At Ξ = {start:g} I the cubature rule misses the products of two states: the least "
         f"eigenvalue of P̂⁻ minus the Gaussian covariance is {least:.4f} = −h²Ξ²; exact moments have none"
@@ -221,16 +221,15 @@ def _prediction() -> Statement:
     )  # fmt: skip
 
 
-def _uncertainty(result: Reproduction) -> Statement:
+def _uncertainty(result: Outcome) -> Statement:
     delta = np.random.default_rng(result.seed).uniform(-0.01, 0.01, (DRAWS, 3))
     misses = np.abs(delta.sum(axis=1))
     miss = misses.mean()
     marginal = np.max(np.abs(delta.mean(axis=0)))
     ours = (
         f"Probabilities would sum to 1 only up to {miss:.4f} on average. Fresh draws have mean zero (here within "
-        f"{marginal:.0e}), so the law of ξ and γ is the nominal one and no RMSE depends on the uncertainty; this "
-        f"run uses "
-        "the nominal law"
+        f"{marginal:.0e}), so the law of ξ and γ is the nominal one and no RMSE depends on the uncertainty; this run "
+        "uses the nominal law"
     )
     return Statement(
         "The Δ are independent, uniform on ±0.01", "Section IV", "three at a time", ours,
@@ -249,7 +248,7 @@ def _whiteness() -> Statement:
     )  # fmt: skip
 
 
-def _units(result: Reproduction) -> Statement:
+def _units(result: Outcome) -> Statement:
     o = result.printed
     trace, error = o.claimed_trace("cubature_printed_fixed"), o.rmse("cubature_printed_fixed")
     ours = (
@@ -263,15 +262,13 @@ def _units(result: Reproduction) -> Statement:
     )  # fmt: skip
 
 
-def _horizon() -> Statement:
-    s: Setting = PRINTED
+def _horizon(s: Scenario) -> Statement:
     drift = H * B6 * s.torque
     reach = np.sqrt(1 - (1 + H * B4) ** 2) / H  # |1 + h b4 + i h (k1 - x5)| < 1
     step = (reach + K1 - 0.15) / drift
     ours = (
-        f"x5 integrates the torque, {drift:+.3f} a step, and |x5 − 2| > {reach:.2f}, reached at s ≈ {step:.0f}, "
-        f"makes the "
-        "Euler step of the rotor unstable: 40 steps are possible, 100 are not"
+        f"x5 integrates the torque, {drift:+.3f} a step, and |x5 − 2| > {reach:.2f}, reached at s ≈ {step:.0f}, makes "
+        "the Euler step of the rotor unstable: 40 steps are possible, 100 are not"
     )
     late = K1 - (0.15 + drift * LONG)
     return Statement(

@@ -10,7 +10,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.filters.transform import AbstractTransform
 from heliograph.numerics.float64 import compiled, to_numpy
-from heliograph_studies.cubature_fusion.setting import OUTPUTS, Setting, Transition, transition
+from heliograph_studies.cubature_fusion.setting import OUTPUTS, Scenario, Transition, transition
 
 Array = np.ndarray
 
@@ -44,7 +44,7 @@ class Terms(NamedTuple):
     X2: float
 
 
-def channel_of(s: Setting) -> Channel:
+def channel_of(s: Scenario) -> Channel:
     """The channel of a scenario."""
     relay, eye = s.amplification**2 * s.relay_power, np.eye(2)
     return Channel(s.amplitude, relay, s.relay_noise * eye, s.receiver_noise * eye, s.relay_gain, s.sensor_gain)
@@ -90,7 +90,7 @@ def theorem_2(v: Innovation, b: tuple[float, float], t: Terms, ch: Channel) -> A
     return np.asarray(ch.c * t.mu * v.Pxy @ np.linalg.inv(omega(v, b, t, ch)))
 
 
-def predicted(s: Setting, rule: AbstractTransform, covariance: Array | None = None) -> tuple[Array, Array]:
+def predicted(s: Scenario, rule: AbstractTransform, covariance: Array | None = None) -> tuple[Array, Array]:
     """Node 1's first prediction by a rule, from Xi_0 or another covariance: mean (5,) and covariance (5, 5)."""
     spread = s.claimed_initial_variance * np.eye(5) if covariance is None else covariance
     mean, moved = _moved(transition(s), rule, np.array(s.guesses[0]), spread)
@@ -110,7 +110,7 @@ def output(node: int) -> Array:
     return np.array([[p, 0, q, 0, 0], [0, p, 0, q, 0]])
 
 
-def innovation(s: Setting, rule: AbstractTransform) -> Innovation:
+def innovation(s: Scenario, rule: AbstractTransform) -> Innovation:
     """Node 1's first innovation."""
     m, P = predicted(s, rule)
     C = output(0)
@@ -124,7 +124,7 @@ def cubature_points(x: Array, P: Array) -> Array:
     return np.concatenate([x + S, x - S])
 
 
-def mixed_cross(s: Setting) -> Array:
+def mixed_cross(s: Scenario) -> Array:
     """Step 3's Pxy as printed: propagated points with outputs of redrawn ones, for node 1's first step."""
     f, m, P = transition(s), *predicted(s, hg.filters.Cubature())
     with jax.enable_x64(True):
@@ -184,7 +184,7 @@ def trace_gradient(v: Innovation, b: tuple[float, float], t: Terms, ch: Channel)
     return float(np.max(np.abs(left - right)) / np.max(np.abs(right)))
 
 
-def perfect_channel_excess(s: Setting) -> float:
+def perfect_channel_excess(s: Scenario) -> float:
     """Relative excess of the printed bound's one-step trace over the right one through a perfect channel."""
     one = hg.Discrete([1.0], [1.0])
     ch = Channel(1.0, 1.0, s.relay_noise * np.eye(2), s.receiver_noise * np.eye(2), one, one)

@@ -19,7 +19,7 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import SecondOrder
 from heliograph_studies.cubature_fusion.loose_interval import LooseInterval
-from heliograph_studies.cubature_fusion.setting import Setting, cubature
+from heliograph_studies.cubature_fusion.setting import Scenario, cubature
 
 
 class AbstractReading(AbstractUpdate):
@@ -123,7 +123,7 @@ class MixedCross(AbstractFilter):
         return Estimate(state.mean, state.covariance, self.claim)
 
 
-def variants(s: Setting, node: int) -> dict[str, AbstractFilter]:
+def variants(s: Scenario, node: int) -> dict[str, AbstractFilter]:
     """The literal readings of one node, all with the scenario's fixed scalars."""
     printed, polytope = (rule(hg.filters.Scalars(*s.beta)) for rule in (LooseInterval, hg.filters.Polytope))
     return {

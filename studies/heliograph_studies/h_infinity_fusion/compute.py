@@ -1,23 +1,13 @@
 """All numbers of the reproduction, in order."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import numpy as np
-
-import heliograph as hg
-from heliograph_studies.h_infinity_fusion import setting
-from heliograph_studies.h_infinity_fusion.discriminating import Discriminating, discriminate
-from heliograph_studies.h_infinity_fusion.example import (
-    RECURSIVE,
-    Outcome,
-    fused_name,
-    mean_and_error,
-    simulate,
-    simulate_told,
-)
-from heliograph_studies.h_infinity_fusion.growth import Growth, growth
-from heliograph_studies.h_infinity_fusion.indices import Indices, Replayed, indices, replay
+from heliograph_studies.h_infinity_fusion.discriminating import discriminate
+from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Runs, simulate, simulate_told
+from heliograph_studies.h_infinity_fusion.growth import Growth, growth, violation
+from heliograph_studies.h_infinity_fusion.indices import indices, replay
 from heliograph_studies.h_infinity_fusion.levels import (
     NodeDesigns,
     Readings,
@@ -26,80 +16,51 @@ from heliograph_studies.h_infinity_fusion.levels import (
     readings,
     true_growth,
 )
+from heliograph_studies.h_infinity_fusion.numbers import numbers, record
 from heliograph_studies.h_infinity_fusion.one_step import enumeration_gap
-from heliograph_studies.h_infinity_fusion.published_level import published_fused_level
-from heliograph_studies.h_infinity_fusion.violation import violation
-from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst
-
-RUNS = 4_000
-STAGES = 6  # as `reproduction` tells them
+from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.setting import NODES, Setting
+from heliograph_studies.outcome import Inline, Unlisted
+from heliograph_studies.stages import Stages
 
 
 @dataclass(frozen=True)
-class Reproduction:
-    """Everything that report and summary tell."""
+class Outcome:
+    """The numbers of the summary, and the parts that they, figures and statements are made of."""
 
-    nodes: list[NodeDesigns]
-    readings: Readings
-    enumeration: float
-    broken: Worst
-    outcome: Outcome
-    told: Outcome
-    replayed: Replayed
-    indices: Indices
-    growth: Growth
-    true_growth: TrueGrowth
-    discriminating: Discriminating
-    seed: int
-
-    @property
-    def fused_level(self) -> float:
-        """The smallest level that Theorem 4 can give, in closed form."""
-        return published_fused_level(setting.LEVELS, hg.fusion.level_weights(setting.LEVELS))
-
-    @property
-    def minkowski(self) -> float:
-        """What the triangle inequality gives for the same weights, without quantization."""
-        return hg.fusion.fused_level(setting.LEVELS, hg.fusion.level_weights(setting.LEVELS))
-
-    def level_of_paper_weights(self, normalised: bool = True) -> float:
-        """sqrt(2 N sum c^2 gamma^2) for the printed weights, which sum to 0.9999."""
-        c = np.array(setting.PAPER_WEIGHTS)
-        scale = float(c.sum())
-        return published_fused_level(setting.LEVELS, c / scale) * (1.0 if normalised else scale)
-
-    def difference(self, quantizer: str, other: str) -> tuple[float, float, float]:
-        """Mean over runs of the difference of fused errors, its standard error, and the share of runs below 0."""
-        gap = (self.outcome.errors(RECURSIVE, quantizer) - self.outcome.errors(RECURSIVE, other)).mean(axis=1)
-        return *mean_and_error(gap), float((gap < 0).mean())
-
-    def saturated(self, quantizer: str, first: int = 0) -> float:
-        """Share of samples out of reach from step `first` on."""
-        uplink = self.outcome.record.uplinks[fused_name(RECURSIVE, quantizer)]
-        return float(uplink.saturated[:, first:].mean())
+    numbers: Inline[dict[str, Any]]
+    parts: Unlisted[Parts]
 
 
-def reproduction(runs: int, seed: int, advance: Callable[[str], None] = lambda what: None) -> Reproduction:
-    """Design, simulate, search and judge; `advance` is told what begins."""
-    advance("designs")
-    nodes = [node_designs(i) for i in range(len(setting.NODES))]
-    more, gap = readings(), max(map(enumeration_gap, range(len(nodes))))
-    advance("worst disturbance of the example")
-    broken = violation(0, nodes[0].horizon)
-    advance(f"example: {runs:,} runs")
-    designs = {
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Design, simulate, search and judge."""
+    nodes, more, gap = stages("designs", lambda: designs(setting))
+    broken = stages("worst disturbance of the example", lambda: violation(setting, 0, nodes[0].horizon))
+    by_name = {
         RECURSIVE: [node.paper for node in nodes],
         "horizon": [node.horizon for node in nodes],
         "zero_gain": [node.zero_gain for node in nodes],
     }
-    outcome, told = simulate(designs, runs, seed), simulate_told(runs, seed)
-    advance("growth constants")
-    replayed, found = replay(outcome), growth(outcome)
-    true = true_growth(found.visited)
-    advance("second example")
-    second = discriminate(runs, seed)
-    advance("indices")
-    judged = indices(outcome, replayed)
-    return Reproduction(
-        nodes, more, gap, broken, outcome, told, replayed, judged, found, true, second, seed
-    )  # fmt: skip
+    runs, told = stages(f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_told(setting)))
+    constants, true = stages("growth constants", lambda: _growth(runs))
+    second = stages("second example", lambda: discriminate(setting.runs, setting.seed))
+    replayed = replay(runs)
+    judged = stages("indices", lambda: indices(runs, replayed))
+    parts = Parts(setting, nodes, more, gap, broken, runs, told, replayed, judged, constants, true, second)
+    return Outcome(numbers(parts), parts)
+
+
+def designs(setting: Setting) -> tuple[list[NodeDesigns], Readings, float]:
+    """Of each node, of other readings, and how far Theorem 1 is from an enumeration."""
+    nodes = [node_designs(setting, i) for i in range(len(NODES))]
+    return nodes, readings(setting), max(enumeration_gap(setting, i) for i in range(len(NODES)))
+
+
+def _growth(runs: Runs) -> tuple[Growth, TrueGrowth]:
+    findings = growth(runs)
+    return findings, true_growth(runs.setting, findings.visited)
+
+
+def write_record(outcome: Outcome, folder: Path) -> None:
+    """Truth, one run, means over the runs and the gains as NetCDF."""
+    record(outcome.parts).to_netcdf(folder / "record.nc", engine="h5netcdf")

@@ -9,25 +9,36 @@ import heliograph as hg
 from heliograph.filters.gaussian import GaussianFilter
 from heliograph.filters.prediction import prediction_of
 from heliograph.fusion.quantizer import Quantizer
-from heliograph_studies.h_infinity_fusion import setting
+from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting
 from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
 
 RECURSIVE = "recursive_trace"  # the paper's filters, at its levels
-QUANTIZERS: dict[str, Quantizer | None] = {
-    "none": None,
-    "dynamic": ZoomQuantizer(setting.SEGMENTS, setting.AMPLITUDE, setting.DECAY, setting.ZOOM),
-    "static": hg.fusion.UniformQuantizer(setting.SEGMENTS, setting.AMPLITUDE),
-}
-MORE_QUANTIZERS: dict[str, Quantizer | None] = {
-    "dynamic_decodable": hg.fusion.EscapeQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE, setting.DECAY, 0.6, 1e-3),
-    "static_p41": hg.fusion.UniformQuantizer(setting.SEGMENTS + 1, setting.AMPLITUDE),
-}
+QUANTIZERS = "none", "dynamic", "static"
+MORE_QUANTIZERS = "dynamic_decodable", "static_p41"  # of the paper's filters only
+
+
+def zoom(setting: Setting) -> ZoomQuantizer:
+    """The paper's dynamic quantizer."""
+    return ZoomQuantizer(setting.segments, setting.amplitude, setting.decay, setting.zoom)
+
+
+def quantizers(setting: Setting) -> dict[str, Quantizer | None]:
+    """All of them by name."""
+    odd, size = setting.segments + 1, setting.amplitude
+    return {
+        "none": None,
+        "dynamic": zoom(setting),
+        "static": hg.fusion.UniformQuantizer(setting.segments, size),
+        "dynamic_decodable": hg.fusion.EscapeQuantizer(odd, size, setting.decay, 0.6, 1e-3),
+        "static_p41": hg.fusion.UniformQuantizer(odd, size),
+    }
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Runs:
     """The runs of one network, with the names of its filters."""
 
+    setting: Setting
     record: hg.Record
     filters: tuple[str, ...]
 
@@ -46,13 +57,16 @@ class Outcome:
 
     def estimates(self, name: str) -> np.ndarray:
         """Local estimates (run, node, time, n)."""
-        return np.stack([np.asarray(self.record.estimates[n][name].mean) for n in setting.NODES], axis=1)
+        return np.stack([np.asarray(self.record.estimates[n][name].mean) for n in NODES], axis=1)
 
     @property
     def truth(self) -> np.ndarray:
         """The state (time, n), the same in all runs."""
         assert self.record.truth is not None
         return np.asarray(self.record.truth[0])
+
+
+Designs = Mapping[str, list[hg.h_infinity.HInfinityDesign]]  # by name, one for each node
 
 
 def mean_and_error(values: np.ndarray) -> tuple[float, float]:
@@ -65,74 +79,89 @@ def fused_name(name: str, quantizer: str) -> str:
     return f"{name}.{quantizer}"
 
 
-def simulate(designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]], runs: int, seed: int) -> Outcome:
+def simulate(setting: Setting, designs: Designs) -> Runs:
     """All filters of one record but those that are told of losses; `designs` by name, one for each node."""
     nodes = {
-        node: hg.Node(setting.disturbed_sensor(i), setting.disturbed_channel(), filters(i, designs))
-        for i, node in enumerate(setting.NODES)
+        node: hg.Node(setting.disturbed_sensor(i), setting.disturbed_channel(), filters(setting, i, designs))
+        for i, node in enumerate(NODES)
     }
-    return _run(nodes, runs, seed)
+    return _run(setting, nodes)
 
 
-def filters(
-    node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]
-) -> dict[str, hg.filters.AbstractFilter]:
+def filters(setting: Setting, node: int, designs: Designs) -> dict[str, hg.filters.AbstractFilter]:
     """The filters of one node that hear the losses as they are."""
     return {
-        **h_infinity_filters(node, designs),
-        "open_loop": hg.filters.open_loop_filter(believed_plant(), *start(node)),
-        "ekf_ignoring": prediction_of(extended(node, setting.lossless)),
-        "ekf_statistics": prediction_of(extended(node, setting.lossy)),
+        **h_infinity_filters(setting, node, designs),
+        "open_loop": hg.filters.open_loop_filter(believed_plant(setting), *start(setting, node)),
+        "ekf_ignoring": prediction_of(extended(setting, node, setting.lossless)),
+        "ekf_statistics": prediction_of(extended(setting, node, setting.lossy)),
     }
 
 
-def h_infinity_filters(
-    node: int, designs: Mapping[str, list[hg.h_infinity.HInfinityDesign]]
-) -> dict[str, hg.filters.AbstractFilter]:
+def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[str, hg.filters.AbstractFilter]:
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
     return {
-        name: hg.filters.h_infinity_filter(*parts, each[node], setting.GUESSES[node]) for name, each in designs.items()
+        name: hg.filters.h_infinity_filter(*parts, each[node], setting.guesses[node]) for name, each in designs.items()
     }
 
 
-def simulate_told(runs: int, seed: int) -> Outcome:
+def simulate_told(setting: Setting) -> Runs:
     """Extended Kalman filters told of each loss, in a network whose losses are erasures; other draws."""
     nodes = {
         node: hg.Node(
             setting.disturbed_sensor(i),
             setting.disturbed_channel(setting.told),
-            {"ekf_told": prediction_of(extended(i, setting.lossless))},
+            {"ekf_told": prediction_of(extended(setting, i, setting.lossless))},
         )
-        for i, node in enumerate(setting.NODES)
+        for i, node in enumerate(NODES)
     }
-    return _run(nodes, runs, seed)
+    return _run(setting, nodes)
 
 
-def believed_plant() -> hg.Plant:
+def believed_plant(setting: Setting) -> hg.Plant:
     """v as white noise, as strong as v_s in the mean over the horizon."""
-    return setting.plant(False, float(np.mean(setting.DISTURBANCES**2)))
+    return setting.plant(False, float(np.mean(setting.disturbances**2)))
 
 
-def start(node: int) -> tuple[np.ndarray, np.ndarray]:
+def start(setting: Setting, node: int) -> tuple[np.ndarray, np.ndarray]:
     """First estimate of a node and the covariance believed of it."""
-    return setting.GUESSES[node], setting.INITIAL_VARIANCE * np.eye(2)
+    return np.array(setting.guesses[node]), setting.initial_variance * np.eye(2)
 
 
-def extended(node: int, hop: setting.Hop) -> GaussianFilter:
+def extended(setting: Setting, node: int, hop: Hop) -> GaussianFilter:
     """An extended Kalman filter of one node, which believes in links of one kind and in white noises."""
-    noise = float(setting.FEEDTHROUGH[node] ** 2 * np.mean(setting.DISTURBANCES**2))
+    noise = float(setting.feedthrough[node] ** 2 * np.mean(setting.disturbances**2))
     return hg.extended_filter(
-        believed_plant(), setting.sensor(node, noise), setting.white_channel(hop), None, *start(node)
+        believed_plant(setting), setting.sensor(node, noise), setting.white_channel(hop), None, *start(setting, node)
     )
 
 
-def _run(nodes: dict[str, hg.Node], runs: int, seed: int) -> Outcome:
+def _run(setting: Setting, nodes: dict[str, hg.Node]) -> Runs:
     names = tuple(next(iter(nodes.values())).filters)
-    rule = hg.fusion.WeightedFusion(hg.fusion.level_weights(setting.LEVELS))
-    fused = {fused_name(n, q): hg.Fusion(n, rule, each) for n in names for q, each in QUANTIZERS.items()}
+    rule = hg.fusion.WeightedFusion(hg.fusion.level_weights(setting.levels))
+    available = quantizers(setting)
+    pairs = [(name, quantizer) for name in names for quantizer in QUANTIZERS]
     if RECURSIVE in names:
-        fused |= {fused_name(RECURSIVE, q): hg.Fusion(RECURSIVE, rule, each) for q, each in MORE_QUANTIZERS.items()}
+        pairs += [(RECURSIVE, quantizer) for quantizer in MORE_QUANTIZERS]
+    fused = {fused_name(n, q): hg.Fusion(n, rule, available[q]) for n, q in pairs}
     network = hg.Network(setting.plant(), nodes, fused)
-    record = hg.monte_carlo(network, setting.STEPS, runs, seed, inputs=setting.inputs())
-    return Outcome(record, names)
+    record = hg.monte_carlo(network, setting.steps, setting.runs, setting.seed, inputs=setting.inputs())
+    return Runs(setting, record, names)
+
+
+def arrivals(outcome: Runs) -> np.ndarray:
+    """beta_1, beta_2, beta_3 of each run, node and step, (run, node, time, 3).
+
+    r = beta_2 (beta_1 y + C_1 rho_1) + C_2 rho_2 and y_2 = sqrt(E_3) beta_3 y + C_3 rho_3, each the nearest of the two
+    values that it can have; beta_1 is NaN where beta_2 = 0, since then nobody can tell.
+    """
+    setting = outcome.setting
+    z = np.stack([outcome.record.measurements[n] for n in NODES], axis=1)
+    n1, n2, n3 = (np.array(setting.noise_gain) * setting.channel_noises).T
+    sensing, through = np.array(setting.sensing)[:, None], np.array(setting.feedthrough)[:, None]
+    y = sensing * outcome.truth.sum(axis=1) + through * setting.disturbances
+    second = z[..., 0] != n2
+    first = np.abs(z[..., 0] - n2 - n1) > np.abs(z[..., 0] - n2 - n1 - y)
+    direct = np.abs(z[..., 1] - n3) > np.abs(z[..., 1] - n3 - np.sqrt(setting.powers[2]) * y)
+    return np.stack([np.where(second, first, np.nan), second, direct], axis=-1).astype(float)

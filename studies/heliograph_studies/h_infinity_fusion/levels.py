@@ -8,7 +8,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.h_infinity.solver import Objective
 from heliograph.numerics.check import fail
-from heliograph_studies.h_infinity_fusion import setting
+from heliograph_studies.h_infinity_fusion.setting import NODES, Constant, Setting
 
 OBJECTIVES: tuple[Objective, ...] = ("trace", "log_determinant", "largest_eigenvalue")
 LARGER_GROWTH = 1.1
@@ -47,10 +47,10 @@ class Readings:
     without_feedthrough: tuple[float, float]
 
 
-def node_designs(node: int) -> NodeDesigns:
+def node_designs(setting: Setting, node: int) -> NodeDesigns:
     """All of one node."""
-    system, level = setting.system(node), setting.LEVELS[node]
-    start = setting.INITIAL * np.eye(4)
+    system, level = setting.system(node), setting.levels[node]
+    start = setting.initial * np.eye(4)
     tried = {o: hg.h_infinity.recursive_design(system, level, start, o, search=False) for o in (*OBJECTIVES, "none")}
     paper, horizon = tried["trace"], hg.h_infinity.horizon_design(system)
     if not paper.feasible:
@@ -83,16 +83,16 @@ def without_gain(system: hg.h_infinity.GrowthSystem, separate: bool = False) -> 
     return hg.h_infinity.horizon_design(system, separate, gains=nothing)
 
 
-def readings() -> Readings:
+def readings(setting: Setting) -> Readings:
     """Levels of the example read in other ways."""
     larger = [
         [hg.h_infinity.horizon_design(setting.system(i, LARGER_GROWTH), s).level for s in (False, True)]
-        for i in range(len(setting.NODES))
+        for i in range(len(NODES))
     ]
     first = setting.system(0)
     plain = first._replace(feedthrough=np.zeros_like(first.feedthrough))
     return Readings(
-        hg.h_infinity.horizon_design(first, initial=setting.INITIAL * np.eye(4)).level,
+        hg.h_infinity.horizon_design(first, initial=setting.initial * np.eye(4)).level,
         np.array(larger),
         hg.h_infinity.horizon_design(setting.system(0, hop=setting.lossless)).level,
         (hg.h_infinity.horizon_design(plain).level, without_gain(plain).level),
@@ -113,20 +113,32 @@ class TrueGrowth:
     certified: bool
 
 
-def true_growth(findings: list[hg.h_infinity.GrowthFinding]) -> TrueGrowth:
+def true_growth(setting: Setting, findings: list[hg.h_infinity.GrowthFinding]) -> TrueGrowth:
     """Design with the slopes found in the boxes of the steps, and certify with the findings."""
     allowed = [f._replace(constant=f.slope * (1 + 1e-6)) for f in findings]  # rounding of the largest ratio
     slopes = np.array([f.constant for f in allowed])
     largest = float(slopes.max())
-    nominal = np.full(len(slopes), setting.GROWTH)
-    given: list[setting.Constant | tuple[setting.Constant, setting.Constant]]
-    given = [largest, (setting.GROWTH, largest), (hg.model.OverTime(nominal), hg.model.OverTime(slopes))]
-    levels, certified = np.zeros((3, len(setting.NODES), 2)), True
+    nominal = np.full(len(slopes), setting.growth)
+    given: list[Constant | tuple[Constant, Constant]]
+    given = [largest, (setting.growth, largest), (hg.model.OverTime(nominal), hg.model.OverTime(slopes))]
+    levels, certified = np.zeros((3, len(NODES), 2)), True
     for i, growth in enumerate(given):
-        for node in range(len(setting.NODES)):
+        for node in range(len(NODES)):
             system = setting.system(node, growth)
             for separate in (False, True):
                 design = hg.h_infinity.horizon_design(system, separate)
                 certified &= certify(system, design, allowed).certified
                 levels[i, node, int(separate)] = design.level
     return TrueGrowth(levels[0], levels[1], levels[2], certified)
+
+
+def published_fused_level(levels: Sequence[float], weights: Sequence[float] | np.ndarray) -> float:
+    """sqrt(2 N sum c_i^2 gamma_i^2) for N filters; it exceeds every local level where those are alike.
+
+    `hg.fusion.level_weights` are its minimum on the simplex. A strict matrix inequality has that minimum as its infimum
+    only, so solvers approach it without reaching it.
+
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equation (33).
+    """
+    c, gamma = np.asarray(weights), np.asarray(levels)
+    return float(np.sqrt(2 * len(gamma) * np.sum((c * gamma) ** 2)))

@@ -2,22 +2,22 @@
 
 import numpy as np
 
-from heliograph_studies.h_infinity_fusion import setting
-from heliograph_studies.h_infinity_fusion.compute import Reproduction
+from heliograph_studies.h_infinity_fusion.compute import Outcome
 from heliograph_studies.h_infinity_fusion.discriminating import NODE
 from heliograph_studies.h_infinity_fusion.errata import errata
-from heliograph_studies.h_infinity_fusion.example import RECURSIVE
+from heliograph_studies.h_infinity_fusion.example import RECURSIVE, arrivals
 from heliograph_studies.h_infinity_fusion.indices import ZERO
-from heliograph_studies.h_infinity_fusion.losses import arrivals
+from heliograph_studies.h_infinity_fusion.parts import Parts
 from heliograph_studies.statement import Sampled, Statement, holds, if_met, vacuous
 
 OURS = "not in the paper"
 LITTLE = 1e-4  # relative: what bisection and the solver leave open
 
 
-def statements(result: Reproduction) -> list[Statement]:
+def statements(outcome: Outcome) -> dict[str, list[Statement]]:
     """All of them: the example, its figures, errata, and what the second example tells."""
-    return [*_designs(result), *_indices(result), *_figures(result), *errata(result), *_second(result)]
+    parts = _designs, _indices, _figures, errata, _second
+    return {"paper": [statement for part in parts for statement in part(outcome.parts)]}
 
 
 def listed(values: object, digits: int = 4) -> str:
@@ -25,23 +25,24 @@ def listed(values: object, digits: int = 4) -> str:
     return ", ".join(f"{v:.{digits}g}" for v in np.ravel(np.asarray(values)))
 
 
-def _designs(result: Reproduction) -> list[Statement]:
+def _designs(result: Parts) -> list[Statement]:
     nodes = result.nodes
     steps = [n.certificate.steps_certified for n in nodes]
     zero = [n.without_measurements for n in nodes]
     smallest, horizon = [n.smallest["trace"] for n in nodes], [n.horizon.level for n in nodes]
-    ratio = [g / h for g, h in zip(setting.LEVELS, horizon, strict=True)]
+    ratio = [g / h for g, h in zip(result.setting.levels, horizon, strict=True)]
     return [
         Statement("the inequalities can be solved at the paper's levels", "Section IV", "gamma = 1.8, 1.7, 1.8, 1.9",
-            f"with the smallest trace of L at each step: {listed(steps)} of {setting.STEPS} steps certified, for the "
-            "growth constants as printed", {"fewest_steps_certified": min(steps)},
-            lambda fewest_steps_certified: holds(fewest_steps_certified == setting.STEPS)),
+            f"with the smallest trace of L at each step: {listed(steps)} of {result.setting.steps} steps certified, "
+            "for the growth constants as printed",
+            {"fewest_steps_certified": min(steps), "steps": result.setting.steps},
+            lambda fewest_steps_certified, steps: holds(fewest_steps_certified == steps)),
         Statement("the levels measure how well the filters reject disturbances", "Section IV", "1.7 to 1.9",
             f"K = 0, which hears nothing, has {zero[0]:.6f} at every node; the smallest levels over the horizon are "
             f"{listed(horizon)}, {min(ratio):.0f} to {max(ratio):.0f} times below the paper's (recursive: "
             f"{listed(smallest)}; with P_0 = 10 I, {result.readings.fixed_start:.5f} for all, by (19) alone)",
-            {"level_of_hearing_nothing": max(zero)},
-            lambda level_of_hearing_nothing: if_met(level_of_hearing_nothing > min(setting.LEVELS))),
+            {"level_of_hearing_nothing": max(zero), "least_level": min(result.setting.levels)},
+            lambda level_of_hearing_nothing, least_level: if_met(level_of_hearing_nothing > least_level)),
         Statement("the smallest level needs the measurements", OURS, "implied",
             f"largest gain over K = 0 {100 * (1 - min(horizon) / zero[0]):.1f} %, all of it through D: with D = 0, "
             f"{result.readings.without_feedthrough[0]:.6f} with the best gains of node 1 and "
@@ -57,7 +58,7 @@ def _designs(result: Reproduction) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _indices(result: Reproduction) -> list[Statement]:
+def _indices(result: Parts) -> list[Statement]:
     local, fused = result.indices.local, result.indices.fused
     others = ("zero_gain", ZERO)
     blind = max(float(np.max(local[name])) for name in others), max(float(fused[name]) for name in others)
@@ -75,8 +76,8 @@ def _indices(result: Reproduction) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _figures(result: Reproduction) -> list[Statement]:
-    outcome = result.outcome
+def _figures(result: Parts) -> list[Statement]:
+    outcome = result.runs
     error = {name: outcome.mean_error(name, "none") for name in outcome.filters}
     own, none = error[RECURSIVE][0], error["zero_gain"][0]
     dynamic = outcome.mean_error(RECURSIVE, "dynamic")
@@ -84,8 +85,8 @@ def _figures(result: Reproduction) -> list[Statement]:
     seen = arrivals(outcome)
     shares = np.nanmean(seen, axis=(0, 1, 2))
     count = np.sum(np.isfinite(seen), axis=(0, 1, 2))
-    off = np.abs(shares - setting.ARRIVAL) / np.sqrt(
-        np.array(setting.ARRIVAL) * (1 - np.array(setting.ARRIVAL)) / count
+    off = np.abs(shares - result.setting.arrival) / np.sqrt(
+        np.array(result.setting.arrival) * (1 - np.array(result.setting.arrival)) / count
     )
     gap, gap_error, better = result.difference("dynamic", "static")
     odd, odd_error, _ = result.difference("dynamic", "static_p41")
@@ -111,14 +112,14 @@ def _figures(result: Reproduction) -> list[Statement]:
             f"worse at s = {worse}", {"difference": Sampled(gap, gap_error)},
             lambda difference: holds(difference.below(0))),
         Statement("it does so because the amplitude adapts", "Remark 3", "flexibility",
-            f"mostly not: p = 40 is even, so zero is no level and the static quantizer cannot say that x is small; "
+            "mostly not: p = 40 is even, so zero is no level and the static quantizer cannot say that x is small; "
             f"with p = 41 it has {second:.4f} in place of {even:.4f}, and the gap shrinks to {odd:.5f} ± "
             f"{odd_error:.5f}", {"even": Sampled(gap, gap_error), "odd": Sampled(odd, odd_error)},
             lambda even, odd: holds(abs(odd.value) > abs(even.value) / 2)),
     ]  # fmt: skip
 
 
-def _second(result: Reproduction) -> list[Statement]:
+def _second(result: Parts) -> list[Statement]:
     second = result.discriminating
     guaranteed, worst = second.designs["horizon"][NODE].level, second.worst
     kalman = {name: Sampled(worst[f"ekf_{name}"].level, worst[f"ekf_{name}"].standard_error)
@@ -144,8 +145,8 @@ def _second(result: Reproduction) -> list[Statement]:
             lambda difference: holds(difference.below(0))),
         Statement("it errs less under white noise", OURS, "",
             f"{_pair(white['horizon'])} against {_pair(white['ekf_statistics'])}; the recursive design "
-            f"{_pair(white['recursive'])}. Node {NODE} alone: {_pair(alone['horizon'])}, Kalman "
-            f"filter {_pair(alone['ekf_statistics'])}, nothing heard {_pair(alone['zero_gain'])}",
+            f"{_pair(white['recursive'])}. Node {NODE} alone: {_pair(alone['horizon'])}, Kalman filter "
+            f"{_pair(alone['ekf_statistics'])}, nothing heard {_pair(alone['zero_gain'])}",
             {"difference": _difference(white["horizon"], white["ekf_statistics"])},
             lambda difference: holds(difference.below(0))),
         Statement("it errs less under a constant bias", OURS, "",

@@ -135,7 +135,7 @@ def _meeting(result: Outcome) -> list[Statement]:
             {"between": shrinking, "below": growing},
             lambda between, below: holds(between < SHRINKS and below > 1)),
         Statement("The lower condition is the truth for every plant", "taken for granted at times", "1 - 1/ρ²",
-            f"turned by 90 degrees a step and heard in one coordinate, 1.3 times larger each time: arrival "
+            "turned by 90 degrees a step and heard in one coordinate, 1.3 times larger each time: arrival "
             f"{sum(result.critical['turning'][:2]) / 2:.3f} lies above it, and the increments of E tr P over two steps "
             f"grow by {turning:.3f}", {"turning": turning}, lambda turning: holds(turning < SHRINKS)),
     ]  # fmt: skip
@@ -206,7 +206,7 @@ def _errata(result: Outcome) -> list[Statement]:
             {"impossible": float(sum(each.verdict == "impossible" for each in result.untold.values()))},
             lambda impossible: holds(impossible == 0)),
         Statement("Where E P diverges, so does P", "refuted by Shi, Epstein and Murray (2010)", "diverges",
-            f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is "
-            f"{result.typical:.3f} after 100 steps; the mean is infinite for its rare long losses",
+            f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is {result.typical:.3f} "
+            "after 100 steps; the mean is infinite for its rare long losses",
             {"median": result.typical}, lambda median: holds(median > DIVERGED)),
     ]  # fmt: skip

@@ -97,8 +97,8 @@ def misprints(result: Outcome) -> list[Statement]:
             f"W: nothing on the example, where V = W; with W = 4 V {_effect(more, -1)}; with V = 4 W "
             f"{_effect(less, -1)}", *_judged(more)),
         Statement("Ξᵢ in the term with γ₃ of the gain", "(30), proof of Theorem 1; perhaps the scan", "Ξᵢ",
-            f"Ξᵢⱼ, as in (29); with Ξᵢ: tr P {_percent(gain.true[10])} at k = 10, {_percent(gain.true[100])} at "
-            f"100, {_percent(gain.true[-1])} steady; tr Ξ₂ {_percent(gain.relay_2[3])} at k = 3",
+            f"Ξᵢⱼ, as in (29); with Ξᵢ: tr P {_percent(gain.true[10])} at k = 10, {_percent(gain.true[100])} at 100, "
+            f"{_percent(gain.true[-1])} steady; tr Ξ₂ {_percent(gain.relay_2[3])} at k = 3",
             *_judged(gain)),
         Statement("variance squared before Pᵢ + Pᵢ′", "Lemma 7, (58), (39); perhaps the scan", "variance squared",
             f"mean squared, as (28); as printed at k = 10: {_effect(seventh, 10)}; steady: {_effect(seventh, -1)}",
@@ -138,8 +138,8 @@ def circuit(result: Outcome) -> list[Statement]:
     remote = float(result.trace["remote"][10])
     return [
         Statement("L = 0.5 H gives the printed Γ", "Section IV", "0.5 H",
-            f"largest difference {gap[0.5]:.3f}; 5 H gives it to {gap[5.0]:.1g} (four printed decimals). With 0.5 H "
-            f"tr P₁₀ is {other:.3g}, not {remote:.3g}",
+            f"largest difference {gap[0.5]:.3f}; 5 H gives it to {gap[5.0]:.1g} (four printed decimals). With 0.5 H tr "
+            f"P₁₀ is {other:.3g}, not {remote:.3g}",
             {"largest_difference": gap[0.5]}, lambda largest_difference: holds(largest_difference <= DIGITS)),
         Statement("second capacitor's equation with + i_L", "Section IV", "+ i_L",
             f"the matrix A has - i_L; with + the plant has spectral radius {radius:.3f}",

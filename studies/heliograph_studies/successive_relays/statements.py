@@ -71,10 +71,9 @@ def _designs(result: Outcome) -> list[Statement]:
         Statement("the filters of relays and receiver are designed together and are optimal", "abstract, Remark 3",
             "concurrently designed optimal recursive filters",
             "each relay's gain is the best for its own next estimate, not for the receiver's: with gains chosen for "
-            f"the receiver the mean over k = 1 .. {mean - 1} of tr Pₖ / tr Pₖ(paper) is {ratio:.4f}, and "
-            f"{quiet:.4f} at no step with more power than the paper's; the steady sum "
-            f"falls from {total['paper']:.5g} to {total['joint']:.6g}, and to {total['lmmse_tuned']:.5g} with the best "
-            "linear receiver",
+            f"the receiver the mean over k = 1 .. {mean - 1} of tr Pₖ / tr Pₖ(paper) is {ratio:.4f}, and {quiet:.4f} "
+            f"at no step with more power than the paper's; the steady sum falls from {total['paper']:.5g} to "
+            f"{total['joint']:.6g}, and to {total['lmmse_tuned']:.5g} with the best linear receiver",
             {"mean_ratio_when_tuned": ratio, "steady_ratio_when_tuned": total["joint"] / total["paper"]},
             lambda mean_ratio_when_tuned, steady_ratio_when_tuned: holds(
                 min(mean_ratio_when_tuned, steady_ratio_when_tuned) >= 1 - ROUNDING)),
@@ -84,7 +83,7 @@ def _designs(result: Outcome) -> list[Statement]:
             f"freedom); relays included: {worst:.2f}", {"largest_z": worst, "limit": limit},
             lambda largest_z, limit: holds(largest_z < limit)),
         Statement("inter-relay interference is eliminated in the mean", "Remark 2", "E (γ₃ − mean) ŷⱼ = 0",
-            f"the estimates are unbiased; but the relay subtracts its own signal for the other's, and fading is what "
+            "the estimates are unbiased; but the relay subtracts its own signal for the other's, and fading is what "
             f"costs: the remote error is {trace[10]:.4g} at k = 10, of which the gains' variances make all but 0.3 %"
             if _without_fading(result) / trace[10] < 0.004 else "unbiased",
             {"largest_bias": bias}, lambda largest_bias: holds(largest_bias <= ROUNDING)),
@@ -153,8 +152,8 @@ def _bounds(result: Outcome) -> list[Statement]:
     assert upper.values is not None and alpha.values is not None and state.values is not None
     return [
         Statement("Ξᵢ ≤ m̄ₖ I and Pₖ ≤ m̄ₖ I", "Theorems 3 and 4, upper", "bounded",
-            f"obeyed, but m̄₁₀₀ = {upper.values[-1]:.3g} where tr P₁₀₀ = {truth:.3g}: it grows without limit, "
-            f"since the largest eigenvalue of Γ Γ′ is {certificate.constants['tau_upper']:.4f}",
+            f"obeyed, but m̄₁₀₀ = {upper.values[-1]:.3g} where tr P₁₀₀ = {truth:.3g}: it grows without limit, since "
+            f"the largest eigenvalue of Γ Γ′ is {certificate.constants['tau_upper']:.4f}",
             {"growth": certificate.constants["tau_upper"],
              "obeyed": int(bool(upper.holds and bounds["Theorem 4, upper"].holds))},
             lambda growth, obeyed: vacuous(obeyed, growth >= 1)),
@@ -169,9 +168,8 @@ def _bounds(result: Outcome) -> list[Statement]:
             {"assumptions_missed": len(bounds["Lemma 8, upper"].failing)},
             lambda assumptions_missed: holds(assumptions_missed == 0)),
         Statement("errors are bounded for all time", "abstract", "from Lemmas 8 and 9",
-            f"true for another reason: Ξᵢ, Pₖ ≤ cov xₖ for gains that are optimal for one step, and the "
-            f"spectral radius of Γ is {state.assumptions[1].found}; largest eigenvalue of cov xₖ "
-            f"{np.max(state.values):.3g}",
+            "true for another reason: Ξᵢ, Pₖ ≤ cov xₖ for gains that are optimal for one step, and the spectral "
+            f"radius of Γ is {state.assumptions[1].found}; largest eigenvalue of cov xₖ {np.max(state.values):.3g}",
             {"assumptions_missed": len(state.failing), "least_slack": least["paper"]},
             lambda assumptions_missed, least_slack: holds(assumptions_missed == 0 and least_slack >= -ROUNDING)),
         Statement("Pₖ ≤ cov xₖ also for jointly tuned gains", "not in the paper", "not said",
@@ -193,12 +191,10 @@ def _scalar_bounds(result: Outcome) -> list[Statement]:
             f"10 at k = 0: fails there; max(p₀, w / (1 - τ)) = {tops:.4g} is obeyed",
             {"bound": printed["upper"], "error": 10.0}, lambda bound, error: holds(bound >= error)),
         Statement("p = α p₀ + w / (1 - α) ≤ Pₖ", "Lemma 9, lower, and (51)", f"{printed['receiver']:.4g}",
-            f"P₆₀ = {remote:.4g} on the same system; min(p₀, w / (1 - α)) is "
-            f"{_kept(scalar['Lemma 9, lower'])}",
+            f"P₆₀ = {remote:.4g} on the same system; min(p₀, w / (1 - α)) is {_kept(scalar['Lemma 9, lower'])}",
             {"bound": printed["receiver"], "error": remote}, lambda bound, error: holds(bound <= error)),
         Statement("m = ρ p₀ + w̃ / (1 - ρ) ≤ Ξᵢ", "Lemma 8, lower", f"{printed['relay']:.4g}",
-            f"Ξ₁ = {relay:.4g} at k = 60 on the same system; the corrected bound is "
-            f"{_kept(scalar['Lemma 8, lower'])}",
+            f"Ξ₁ = {relay:.4g} at k = 60 on the same system; the corrected bound is {_kept(scalar['Lemma 8, lower'])}",
             {"bound": printed["relay"], "error": relay}, lambda bound, error: holds(bound <= error)),
     ]  # fmt: skip
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph_studies.cubature_fusion import compute, one_step, run
+from heliograph_studies import cubature_fusion
+from heliograph_studies.cubature_fusion import compute, one_step
 from heliograph_studies.cubature_fusion.setting import (
     NODES,
     PRINTED,
@@ -149,7 +150,7 @@ def made_up(s, names, fused, steps, runs=64):
     by_node = {node: {name: statistics() for name in names} for node in NODES}
     shown = {node: {"cubature_printed_fixed": estimate()} for node in NODES} | {"fused": {"ci_printed": estimate()}}
     record = hg.Record(np.arange(1.0, steps + 1), STATES, rng.normal(size=(1, steps, 5)), {}, shown)
-    return compute.Outcome(s, by_node | {"fused": {name: statistics() for name in fused}}, record)
+    return compute.Runs(s, by_node | {"fused": {name: statistics() for name in fused}}, record)
 
 
 @pytest.fixture(scope="module")
@@ -157,12 +158,12 @@ def result():
     names = [*filters(PRINTED, 0), *variants(PRINTED, 0)]
     fused = list(compute.network(PRINTED).fused)
     early = made_up(STRONG, ["cubature_zero_mean"], list(compute.zero_mean_fusion(STRONG)), 3)
-    return compute.Reproduction(made_up(PRINTED, names, fused, 40), made_up(STRONG, names, fused, 100), early, 64, 0)
+    chosen = cubature_fusion.Setting(runs=64)
+    return compute.outcome(chosen, made_up(PRINTED, names, fused, 40), made_up(STRONG, names, fused, 100), early)
 
 
-def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch, fits):
-    monkeypatch.setattr(run, "reproduction", lambda runs, seed, tell: result)
-    run.reproduce(tmp_path, 64)
+def test_every_promised_number_is_in_the_summary(result, tmp_path, fits):
+    replace(cubature_fusion.publication, compute=lambda *_: result).run(cubature_fusion.Setting(runs=64), tmp_path)
     folder = tmp_path / "cubature-fusion"
     found = json.loads((folder / "summary.json").read_text())
     for name in ("printed", "strong"):
@@ -185,7 +186,7 @@ def test_every_promised_number_is_in_the_summary(result, tmp_path, monkeypatch, 
 
 def test_the_record_is_labelled_and_agrees_with_the_statistics(result, tmp_path):
     xarray = pytest.importorskip("xarray")
-    run.write_record(result, tmp_path / "record.nc")
+    compute.write_record(result, tmp_path)
     with xarray.open_dataset(tmp_path / "record.nc", engine="h5netcdf") as record:
         assert record.rmse.dims == ("scenario", "filter", "node", "time")
         one = record.sel(scenario="printed", filter="cubature_tight", node="3")
@@ -198,14 +199,18 @@ def test_the_record_is_labelled_and_agrees_with_the_statistics(result, tmp_path)
         )
 
 
+def all_statements(result):
+    return [statement for part in statements(result).values() for statement in part]
+
+
 def test_claims_follow_the_numbers(result):
-    by_text = {c.text: c.verdict for c in statements(result)}
+    by_text = {c.text: c.verdict for c in all_statements(result)}
     text = "The polytope bound is one"
     assert by_text[text] == "holds"  # made up from their own claims
     polytope = {node: by_name | {"cubature_polytope": overstated(by_name["cubature_polytope"])}
                 for node, by_name in result.strong.statistics.items() if node != "fused"}  # fmt: skip
     strong = replace(result.strong, statistics=result.strong.statistics | polytope)
-    assert {c.text: c.verdict for c in statements(replace(result, strong=strong))}[text] == "fails"
+    assert {c.text: c.verdict for c in all_statements(replace(result, strong=strong))}[text] == "fails"
 
 
 BOUND = both("actual_over_claimed", Sampled(1.02, 0.01), Sampled(1.05, 0.01))
@@ -257,7 +262,7 @@ def test_verdicts_follow_from_evidence(result):
     judged = [
         s._replace(evidence={**s.evidence, "mean_root": 4.0}) if s.text.startswith("RMSE and trace") else
         s._replace(evidence={**s.evidence, "papers": Sampled(1.0, 0.1)}) if "papers" in s.evidence else s
-        for s in statements(result)
+        for s in all_statements(result)
     ]  # fmt: skip
     check_verdicts(judged, VERDICTS)
 
@@ -267,10 +272,9 @@ def overstated(statistics):
 
 
 @pytest.mark.parametrize("runs", [0, 9, 64.5])
-def test_too_few_runs_are_refused(tmp_path, runs):
+def test_too_few_runs_are_refused(runs):
     with pytest.raises(ValueError, match="runs: expected a whole number of at least 10"):
-        run.reproduce(tmp_path, runs)
-    assert not list(tmp_path.iterdir())
+        cubature_fusion.Setting(runs=runs)
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
@@ -278,5 +282,5 @@ def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     folder.mkdir()
     (folder / "thesis.txt").write_text("mine")
     with pytest.raises(ValueError, match="to replace, got other files"):
-        run.reproduce(tmp_path, 64)
+        cubature_fusion.run(cubature_fusion.Setting(runs=64), tmp_path)
     assert (folder / "thesis.txt").read_text() == "mine"

@@ -7,37 +7,37 @@ import pytest
 
 import heliograph as hg
 from heliograph.h_infinity import slope_bound
+from heliograph_studies import h_infinity_fusion
 from heliograph_studies.h_infinity_fusion import (
     discriminating,
     example,
     levels,
     one_step,
-    published_level,
-    run,
-    setting,
     structured,
     worst_disturbance,
 )
+from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
 
 pytest.importorskip("cvxpy")
+SETTING = Setting()
 
 
 def test_with_the_papers_start_only_the_start_counts():
-    level = hg.h_infinity.horizon_design(setting.system(0), initial=10 * np.eye(4)).level
+    level = hg.h_infinity.horizon_design(SETTING.system(0), initial=10 * np.eye(4)).level
     assert level == pytest.approx(np.sqrt(10 / 15), rel=2e-6)  # (19), with the solver's margin
 
 
 def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(monkeypatch):
-    assert all(one_step.enumeration_gap(i) < 1e-14 for i in range(4))  # rounding
+    assert all(one_step.enumeration_gap(SETTING, i) < 1e-14 for i in range(4))  # rounding
     honest = one_step.theorem_matrix
-    off = setting.system(1, hop=lambda uplink, noise: setting.lossy(uplink, noise if uplink else 1.01 * noise))
+    off = SETTING.system(1, hop=lambda uplink, noise: SETTING.lossy(uplink, noise if uplink else 1.01 * noise))
     monkeypatch.setattr(one_step, "theorem_matrix", lambda system, *rest: honest(off, *rest))
-    assert one_step.enumeration_gap(1) > 1e-6  # one noise's variance 1 % too large
+    assert one_step.enumeration_gap(SETTING, 1) > 1e-6  # one noise's variance 1 % too large
 
 
 def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeypatch):
     monkeypatch.setattr(slope_bound, "LIMIT", 256)  # boxes: of a slope above 15 no number proves 0.7
-    f, side = setting.dynamics(15), np.full(2, 2.0)
+    f, side = dynamics(15), np.full(2, 2.0)
     found = hg.h_infinity.check_growth(f, 0.7, -side, side)
     assert found.refuted and 15 < found.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
     x, y = found.pair
@@ -48,9 +48,9 @@ def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeyp
 
 
 def test_fused_levels():
-    weights = hg.fusion.level_weights(setting.LEVELS)
+    weights = hg.fusion.level_weights(SETTING.levels)
     np.testing.assert_allclose(weights, [0.248842, 0.278979, 0.248842, 0.223337], atol=5.1e-7)  # printed digits
-    assert published_level.published_fused_level(setting.LEVELS, weights) == pytest.approx(2.539682, abs=5.1e-7)
+    assert levels.published_fused_level(SETTING.levels, weights) == pytest.approx(2.539682, abs=5.1e-7)
 
 
 def test_the_search_finds_the_norm_of_a_linear_system():
@@ -106,14 +106,13 @@ def kalman(node):
 
 
 @pytest.mark.parametrize("runs", [0, 99, 100.5])
-def test_too_few_runs_are_refused(tmp_path, runs):
+def test_too_few_runs_are_refused(runs):
     with pytest.raises(ValueError, match="runs: expected a whole number of at least 100"):
-        run.reproduce(tmp_path, runs)
-    assert not list(tmp_path.iterdir())
+        Setting(runs=runs)
 
 
 def test_a_folder_of_somebody_else_is_left_alone(tmp_path):
     (tmp_path / "h-infinity-fusion").mkdir()
     (tmp_path / "h-infinity-fusion" / "thesis.tex").write_text("mine")
     with pytest.raises(ValueError, match="other files"):
-        run.reproduce(tmp_path, 100)
+        h_infinity_fusion.run(Setting(runs=100), tmp_path)

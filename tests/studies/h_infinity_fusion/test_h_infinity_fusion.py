@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph_studies import h_infinity_fusion
 from heliograph_studies.h_infinity_fusion import (
     compute,
     discriminating,
@@ -18,19 +19,19 @@ from heliograph_studies.h_infinity_fusion import (
     growth,
     indices,
     levels,
-    losses,
-    run,
-    setting,
+    numbers,
     structured,
-    violation,
     worst_disturbance,
 )
+from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.setting import NODES, Setting, dynamics
 from heliograph_studies.h_infinity_fusion.statements import statements
 from tests.studies.h_infinity_fusion.verdicts import VERDICTS
 from tests.studies.readme import said_of
 from tests.studies.verdicts import check_verdicts
 
 RECURSIVE = example.RECURSIVE
+SETTING = Setting(runs=128, seed=1)
 pytest.importorskip("cvxpy")
 
 
@@ -82,12 +83,12 @@ def nodes():
     """The designs of all nodes; of the recursions' smallest levels, that of the trace."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(levels, "OBJECTIVES", ("trace",))
-        return [levels.node_designs(i) for i in range(4)]
+        return [levels.node_designs(SETTING, i) for i in range(4)]
 
 
 def test_every_certificate_passes_theorem_1_as_printed(nodes):
     for i, node in enumerate(nodes):
-        entries = run.certificate(node)
+        entries = numbers.certificate(node)
         assert len(entries) == 16 and node.certificate.steps_certified == 16
         np.testing.assert_array_equal(entries[0]["P"], 10 * np.eye(4))
         assert np.linalg.eigvalsh(entries[0]["gamma"] ** 2 * 15 * np.eye(4) - entries[0]["P"])[0] > 0  # (19)
@@ -118,7 +119,7 @@ def test_smallest_levels(nodes):
     assert all(node.failed["none"] is not None for node in nodes)  # which step depends on the solver's version
     published, here = said_of("h-infinity-fusion")
     smallest = [node.horizon.level for node in nodes]
-    assert published == f"{min(setting.LEVELS):.1f} to {max(setting.LEVELS):.1f}"
+    assert published == f"{min(SETTING.levels):.1f} to {max(SETTING.levels):.1f}"
     assert here.startswith(f"{min(smallest):.4f} to {max(smallest):.4f} with the published growth constant")
     assert here.endswith(f"Without any measurement: {nodes[0].without_measurements:.4f}")
 
@@ -135,24 +136,24 @@ def outcome(nodes):
     designs = {RECURSIVE: [n.paper for n in nodes], "zero_gain": [n.zero_gain for n in nodes]}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(example, "filters", example.h_infinity_filters)
-        return example.simulate(designs, 128, 1)
+        return example.simulate(SETTING, designs)
 
 
 def test_the_estimates_are_the_papers_predictions(outcome, nodes):
     """xhat_s+1 = f(xhat_s) + K (received - expected) with xhat_0 as given, on what the run received."""
     record, worst = outcome.record, 0.0
-    v, s = setting.DISTURBANCES, np.arange(16)
-    x = setting.START
+    v, s = SETTING.disturbances, np.arange(16)
+    x = np.array(SETTING.start)
     for k in range(15):
         np.testing.assert_allclose(outcome.truth[k], x, atol=1e-13)
         x = 0.7 * np.array([x[0] * np.cos(0.1 * x[1]), x[1] * np.sin(s[k] * x[0])]) + np.array([-0.15, 0.15]) * v[k]
     expected = np.array([[0.6], [np.sqrt(2) * 0.7]])
-    for i, node in enumerate(setting.NODES):
-        xhat = setting.GUESSES[i]
+    for i, node in enumerate(NODES):
+        xhat = np.array(SETTING.guesses[i])
         for k in range(15):
             found = np.asarray(record.estimates[node][RECURSIVE].mean)[0, k]
             worst = max(worst, np.abs(found - xhat).max())
-            innovation = record.measurements[node][0, k] - expected @ [setting.SENSING[i] * xhat.sum()]
+            innovation = record.measurements[node][0, k] - expected @ [SETTING.sensing[i] * xhat.sum()]
             moved = 0.7 * np.array([xhat[0] * np.cos(0.1 * xhat[1]), xhat[1] * np.sin(k * xhat[0])])
             xhat = moved + nodes[i].paper.gains[k] @ innovation
     assert worst < 1e-13  # rounding; f contracts
@@ -177,26 +178,26 @@ def test_errors_saturation_and_indices(outcome):
 
 
 def test_losses_are_read_off_what_was_received(outcome):
-    seen = losses.arrivals(outcome)
+    seen = example.arrivals(outcome)
     assert set(np.unique(seen[..., 1:])) == {0.0, 1.0}
     np.testing.assert_array_equal(np.isnan(seen[..., 0]), seen[..., 1] == 0)
-    z = np.stack([outcome.record.measurements[n] for n in setting.NODES], axis=1)
-    y = np.array(setting.SENSING)[:, None] * outcome.truth.sum(1) + np.outer(setting.FEEDTHROUGH, setting.DISTURBANCES)
-    n = np.array(setting.NOISE_GAIN) * setting.CHANNEL_NOISES
+    z = np.stack([outcome.record.measurements[n] for n in NODES], axis=1)
+    y = np.array(SETTING.sensing)[:, None] * outcome.truth.sum(1) + np.outer(SETTING.feedthrough, SETTING.disturbances)
+    n = np.array(SETTING.noise_gain) * SETTING.channel_noises
     relayed = seen[..., 1] * (np.nan_to_num(seen[..., 0]) * y + n[:, 0]) + n[:, 1]
     np.testing.assert_allclose(z[..., 0], relayed, atol=1e-14)
     np.testing.assert_allclose(z[..., 1], np.sqrt(2) * seen[..., 2] * y + n[:, 2], atol=1e-14)
 
 
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
-    found = violation.violation(0, nodes[0].horizon)
+    found = growth.violation(SETTING, 0, nodes[0].horizon)
     assert found.level - 4 * found.standard_error > nodes[0].horizon.level
 
 
 @pytest.fixture(scope="module")
 def result(nodes, outcome):
     """Everything, with made-up numbers where the real ones take minutes."""
-    finding = hg.h_infinity.check_growth(setting.dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
+    finding = hg.h_infinity.check_growth(dynamics(15), 0.7, [-0.1, -0.1], [0.1, 0.1])
     size = finding._replace(ratio=0.69, differences=False)
     filters = ["horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told"]
     errors = {s: {n: (2.0 + i, 0.01) for i, n in enumerate(filters)} for s in structured.SCENARIOS}
@@ -215,51 +216,50 @@ def result(nodes, outcome):
     estimates = outcome.record.estimates | {"fused": shown | told | also}
     whole = replace(outcome, record=replace(outcome.record, estimates=estimates), filters=(*outcome.filters, "horizon"))
     replayed = indices.replay(outcome)
-    return compute.Reproduction(
+    parts = Parts(
+        SETTING,
         nodes,
         levels.Readings(0.8165, np.ones((4, 2)), 0.0259, (0.029, 0.029)),
         1e-16,
         worst_disturbance.Worst(0.0272, 1e-6, None),
         whole,
-        example.Outcome(whole.record, ("ekf_told",)),
+        example.Runs(SETTING, whole.record, ("ekf_told",)),
         replayed,
         indices.indices(outcome, replayed),
         growth.Growth([finding] * 16, finding, size, np.full(16, 0.71)),
         levels.TrueGrowth(*np.full((3, 4, 2), 0.04), True),
         second,
-        1,
     )
+    return compute.Outcome(numbers.numbers(parts), parts)
 
 
 @pytest.fixture(scope="module")
 def folder(result, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(run, "reproduction", lambda runs, seed, advance: result)
-        run.reproduce(out, 128, 1)
+    replace(h_infinity_fusion.publication, compute=lambda *_: result).run(SETTING, out)
     return out / "h-infinity-fusion"
 
 
 def test_the_summary_has_every_key(folder):
-    numbers = json.loads((folder / "summary.json").read_text())
-    assert len(numbers["nodes"]) == 4
-    for node in numbers["nodes"]:
+    found = json.loads((folder / "summary.json").read_text())
+    assert len(found["nodes"]) == 4
+    for node in found["nodes"]:
         assert {"gamma_paper", "steps_certified", "max_eig", "gamma_min", "certificate"} <= node.keys()
         assert {"recursive_trace", "horizon", "horizon_split"} <= node["gamma_min"].keys()
         shapes = {key: np.shape(value) for key, value in node["certificate"][0].items()}
         assert shapes == {"P": (4, 4), "K": (2, 2), "L_next": (4, 4), "lambda1": (), "lambda2": (), "gamma": ()}
         assert node["max_eig"] < 0
-    assert {"weights", "gamma", "gamma_of_paper_weights", "minkowski"} <= numbers["fusion"].keys()
-    assert numbers["fusion"]["gamma_of_paper_weights"] == pytest.approx(2.54188, abs=5.1e-6)
-    assert numbers["fusion"]["minkowski"]["gamma"] == pytest.approx(1.794, abs=5.1e-4)
+    assert {"weights", "gamma", "gamma_of_paper_weights", "minkowski"} <= found["fusion"].keys()
+    assert found["fusion"]["gamma_of_paper_weights"] == pytest.approx(2.54188, abs=5.1e-6)
+    assert found["fusion"]["minkowski"]["gamma"] == pytest.approx(1.794, abs=5.1e-4)
     wanted = {"none", "dynamic", "static", "dynamic_decodable"}
-    assert wanted | {f"{name}_se" for name in wanted} <= numbers["mean_fused_error"].keys()
-    assert numbers["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
-    assert numbers["saturation"]["dynamic_decodable"] == 0
-    assert numbers["saturated_fraction"] == numbers["saturation"]["dynamic"]
-    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= numbers["contexts"]["ekf_told"].keys()
-    assert len(numbers["index"]["J1"][RECURSIVE]) == 4
-    assert {"growth", "discriminating", "claims", "saturated_fraction"} <= numbers.keys()
+    assert wanted | {f"{name}_se" for name in wanted} <= found["mean_fused_error"].keys()
+    assert found["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
+    assert found["saturation"]["dynamic_decodable"] == 0
+    assert found["saturated_fraction"] == found["saturation"]["dynamic"]
+    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= found["contexts"]["ekf_told"].keys()
+    assert len(found["index"]["J1"][RECURSIVE]) == 4
+    assert {"growth", "discriminating", "claims", "saturated_fraction"} <= found.keys()
 
 
 def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
@@ -278,8 +278,13 @@ def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
     fits(folder / "report.html")
 
 
+def changed(result, **parts):
+    """The statements that would be made of other parts."""
+    return statements(replace(result, parts=replace(result.parts, **parts)))["paper"]
+
+
 def test_claims_follow_the_numbers(result):
-    judged = statements(result)
+    judged = statements(result)["paper"]
     assert len({c.text for c in judged}) == len(judged)
     assert all(c.text and c.source and c.ours for c in judged)
     verdict = {c.text: c.verdict for c in judged}
@@ -287,13 +292,11 @@ def test_claims_follow_the_numbers(result):
     assert verdict["the printed weights are optimal"] == verdict["|mu| <= u d / p"] == "fails"
     assert verdict["dynamic quantization beats static"] == "holds"
     assert verdict["(18) is E V(next) - V plus the terms of growth and level"] == "holds"
-    doubted = {c.text: c.verdict for c in statements(replace(result, enumeration=1e-3))}
+    doubted = {c.text: c.verdict for c in changed(result, enumeration=1e-3)}
     assert doubted["(18) is E V(next) - V plus the terms of growth and level"] == "fails"
-    positive = replace(result.indices, local=result.indices.local | {RECURSIVE: np.ones(4)})
-    assert {c.text: c.verdict for c in statements(replace(result, indices=positive))}[
-        "J_1 < 0 at every node"
-    ] == "fails"
+    positive = replace(result.parts.indices, local=result.parts.indices.local | {RECURSIVE: np.ones(4)})
+    assert {c.text: c.verdict for c in changed(result, indices=positive)}["J_1 < 0 at every node"] == "fails"
 
 
 def test_verdicts_follow_from_evidence(result):
-    check_verdicts(statements(result), VERDICTS)
+    check_verdicts(statements(result)["paper"], VERDICTS)

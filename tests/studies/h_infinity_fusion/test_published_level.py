@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph_studies.h_infinity_fusion.published_level import published_fused_level
+from heliograph_studies.h_infinity_fusion.levels import published_fused_level
 
 PRINTED_LEVELS = (1.8, 1.7, 1.8, 1.9)
 PRINTED_WEIGHTS = np.array([0.2635, 0.2634, 0.2493, 0.2237])  # they sum to .9999

@@ -21,7 +21,7 @@ RUNS = 600
 @pytest.fixture(scope="module")
 def found(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduction")
-    # Sweeps: of a design that is drawn, and in no number tested here. Steady: 0.98^1200 = 3e-11 of a covariance is left.
+    # Sweeps: of a design that is drawn, and in no number tested here. Steady: 0.98^1200 = 3e-11 of a covariance.
     chosen = successive_relays.Setting(runs=RUNS, seed=2, sweeps=1, steady=600)
     return successive_relays.run(chosen, out), out / "successive-relays"
 

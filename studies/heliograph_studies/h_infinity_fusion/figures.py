@@ -1,4 +1,4 @@
-"""The figures of the reproduction: the paper's Figs 2 to 11 and ours."""
+"""The figures of the reproduction: the paper's Figs 2 to 11 and ours; and what its page says beside the numbers."""
 
 from collections.abc import Sequence
 
@@ -20,13 +20,20 @@ from heliograph.report.figures import (
     WIDTH,
     Curve,
 )
-from heliograph_studies.h_infinity_fusion import setting, structured
-from heliograph_studies.h_infinity_fusion.compute import Reproduction
+from heliograph_studies.h_infinity_fusion import structured
+from heliograph_studies.h_infinity_fusion.compute import Outcome
 from heliograph_studies.h_infinity_fusion.discriminating import NODE
-from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Outcome, fused_name
-from heliograph_studies.h_infinity_fusion.losses import arrivals
+from heliograph_studies.h_infinity_fusion.example import (
+    MORE_QUANTIZERS,
+    QUANTIZERS,
+    RECURSIVE,
+    Runs,
+    arrivals,
+    fused_name,
+)
+from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
 
-TIME = np.arange(setting.STEPS)
 NODE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
 LINKS = ("sensor to relay", "relay to filter", "sensor to filter")
 COLOURS = {
@@ -40,40 +47,44 @@ LABELS = {
 }  # fmt: skip
 
 
-def drawings(result: Reproduction) -> dict[str, Figure]:
+def figures(found: Outcome) -> dict[str, Figure]:
     """All figures by file name."""
-    outcome = result.outcome
-    figures = {f"fig{2 + i:02d}_node{node}": _node(outcome, i) for i, node in enumerate(setting.NODES)}
-    figures["fig06_fusion"] = _fusion(outcome)
+    result, outcome = found.parts, found.parts.runs
+    drawn = {f"fig{2 + i:02d}_node{node}": _node(outcome, i) for i, node in enumerate(NODES)}
+    drawn["fig06_fusion"] = _fusion(outcome)
     seen = arrivals(outcome)[0]
     for i in range(3):
-        figures[f"fig{7 + i:02d}_losses"] = _losses(seen[..., i], LINKS[i])
-    figures["fig10_dynamic"] = _fused_error(outcome, "dynamic", VERMILION)
-    figures["fig11_static"] = _fused_error(outcome, "static", BLUE)
-    figures["levels"] = _levels(result)
-    figures["growth"] = _growth(result)
-    figures["quantizer"] = _quantizer(result)
-    figures["second_errors"] = _second_errors(result)
-    figures["second_levels"] = _second_levels(result)
-    return figures
+        drawn[f"fig{7 + i:02d}_losses"] = _losses(seen[..., i], LINKS[i])
+    drawn["fig10_dynamic"] = _fused_error(outcome, "dynamic", VERMILION)
+    drawn["fig11_static"] = _fused_error(outcome, "static", BLUE)
+    drawn["levels"] = _levels(result)
+    drawn["growth"] = _growth(result)
+    drawn["quantizer"] = _quantizer(result)
+    drawn["second_errors"] = _second_errors(result)
+    drawn["second_levels"] = _second_levels(result)
+    return drawn
 
 
-def _node(outcome: Outcome, i: int) -> Figure:
+def _over_steps(panels: list[Panel]) -> Figure:
+    return curves_over_time(np.arange(len(panels[0].curves[0].values)), panels, "s")
+
+
+def _node(outcome: Runs, i: int) -> Figure:
     estimate = outcome.estimates(RECURSIVE)[0, i]
-    return _against_truth(outcome, estimate, f"node {setting.NODES[i]}", NODE_COLOURS[i])
+    return _against_truth(outcome, estimate, f"node {NODES[i]}", NODE_COLOURS[i])
 
 
-def _fusion(outcome: Outcome) -> Figure:
+def _fusion(outcome: Runs) -> Figure:
     fused = np.asarray(outcome.record.estimates["fused"][fused_name(RECURSIVE, "dynamic")].mean)[0]
     return _against_truth(outcome, fused, "fused", AMBER)
 
 
-def _against_truth(outcome: Outcome, estimate: np.ndarray, name: str, colour: str) -> Figure:
+def _against_truth(outcome: Runs, estimate: np.ndarray, name: str, colour: str) -> Figure:
     panels = [
         Panel(state, [Curve("true", INK, outcome.truth[:, j]), Curve(name, colour, estimate[:, j])])
-        for j, state in enumerate(setting.STATES)
+        for j, state in enumerate(STATES)
     ]
-    return curves_over_time(TIME, panels, "s")
+    return _over_steps(panels)
 
 
 @matplotlib.rc_context(STYLE)
@@ -82,27 +93,27 @@ def _losses(seen: np.ndarray, title: str) -> Figure:
     figure = Figure(figsize=(WIDTH, 2.0), layout="constrained")
     axes = figure.subplots()
     for i, row in enumerate(seen):
-        axes.plot(TIME[row == 1], np.full(np.sum(row == 1), i), "o", color=NODE_COLOURS[i], markersize=6)
-        axes.plot(TIME[row == 0], np.full(np.sum(row == 0), i), "o", color=NODE_COLOURS[i], markersize=6, mfc="white")
-    axes.set(yticks=range(4), yticklabels=[f"node {n}" for n in setting.NODES], ylim=(3.5, -0.5), xlabel="s")
+        axes.plot(np.flatnonzero(row == 1), np.full(np.sum(row == 1), i), "o", color=NODE_COLOURS[i])
+        axes.plot(np.flatnonzero(row == 0), np.full(np.sum(row == 0), i), "o", color=NODE_COLOURS[i], mfc="white")
+    axes.set(yticks=range(4), yticklabels=[f"node {n}" for n in NODES], ylim=(3.5, -0.5), xlabel="s")
     axes.set_title(f"{title}: arrived (full), lost (empty)")
     axes.grid(False)
     return figure
 
 
-def _fused_error(outcome: Outcome, quantizer: str, colour: str) -> Figure:
+def _fused_error(outcome: Runs, quantizer: str, colour: str) -> Figure:
     errors = outcome.errors(RECURSIVE, quantizer)
     curves = [Curve("one run", MUTED, errors[0]), Curve("mean", colour, errors.mean(axis=0))]
-    return curves_over_time(TIME, [Panel(f"norm of fused error, {quantizer}", curves)], "s")
+    return _over_steps([Panel(f"norm of fused error, {quantizer}", curves)])
 
 
 @matplotlib.rc_context(STYLE)
-def _levels(result: Reproduction) -> Figure:
+def _levels(result: Parts) -> Figure:
     figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
     axes, true = figure.subplots(), result.true_growth
     fixed = result.readings.fixed_start
     rows: list[tuple[str, Sequence[float], str, str]] = [
-        ("the paper's", setting.LEVELS, VERMILION, "o"),
+        ("the paper's", result.setting.levels, VERMILION, "o"),
         ("smallest with its P₀", (fixed,) * 4, AMBER, "s"),
         ("one growth constant that is not refuted", true.one[:, 0].tolist(), PURPLE, "D"),
         ("recursive, a = 0.7", [n.smallest["trace"] for n in result.nodes], GREEN, "^"),
@@ -116,32 +127,32 @@ def _levels(result: Reproduction) -> Figure:
     return figure
 
 
-def _growth(result: Reproduction) -> Figure:
+def _growth(result: Parts) -> Figure:
     found = result.growth
     curves = [
         Curve("largest slope nearby", VERMILION, found.slopes),
         Curve("largest ratio that happened", BLUE, found.secant),
-        Curve("a, as printed", INK, np.full(setting.STEPS, setting.GROWTH)),
+        Curve("a, as printed", INK, np.full(len(found.secant), result.setting.growth)),
     ]
-    return curves_over_time(TIME, [Panel("growth of f", curves)], "s")
+    return _over_steps([Panel("growth of f", curves)])
 
 
-def _quantizer(result: Reproduction) -> Figure:
+def _quantizer(result: Parts) -> Figure:
     d = result.replayed.amplitude.mean(axis=(0, 1))
-    x = np.abs(result.outcome.estimates(RECURSIVE)).mean(axis=(0, 1))
-    uplink = result.outcome.record.uplinks[fused_name(RECURSIVE, "dynamic")]
+    x = np.abs(result.runs.estimates(RECURSIVE)).mean(axis=(0, 1))
+    uplink = result.runs.record.uplinks[fused_name(RECURSIVE, "dynamic")]
     share = 100 * uplink.saturated.mean(axis=(0, 2))
-    states = list(zip(setting.STATES, (BLUE, VERMILION), (0, 1), strict=True))
+    states = list(zip(STATES, (BLUE, VERMILION), (0, 1), strict=True))
     panels = [
         Panel("log₁₀ of size",
               [Curve(f"d, {s}", colour, np.log10(d[:, j])) for s, colour, j in states]
               + [Curve(f"|{s}|", PALE if j else MUTED, np.log10(x[:, j])) for s, colour, j in states]),
         Panel("saturated (%)", [Curve(s, colour, share[:, j]) for s, colour, j in states]),
     ]  # fmt: skip
-    return curves_over_time(TIME, panels, "s")
+    return _over_steps(panels)
 
 
-def _second_errors(result: Reproduction) -> Figure:
+def _second_errors(result: Parts) -> Figure:
     names, second = ("horizon", "recursive", "ekf_statistics", "ekf_told", "open_loop"), result.discriminating
     panels = [
         Panel(f"error, {scenario}", [Curve(LABELS[n], COLOURS[n], second.over_time[scenario][n]) for n in names])
@@ -151,7 +162,7 @@ def _second_errors(result: Reproduction) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _second_levels(result: Reproduction) -> Figure:
+def _second_levels(result: Parts) -> Figure:
     second = result.discriminating
     names = list(second.worst)
     figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
@@ -166,3 +177,27 @@ def _second_levels(result: Reproduction) -> Figure:
     axes.set_xticks(ticks, labels=[str(t) for t in ticks])
     axes.set_xticks([], minor=True)
     return figure
+
+
+def words(outcome: Outcome) -> dict[str, object]:
+    """Labels and colours, and the rows of the tables."""
+    result, second = outcome.parts, outcome.parts.discriminating
+    names = ("horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told")
+    behind = {q: result.runs.mean_error(RECURSIVE, q) for q in (*QUANTIZERS, *MORE_QUANTIZERS)}
+    runs = {name: result.runs for name in result.runs.filters} | {"ekf_told": result.told}
+    return {
+        "p": result,
+        "second": second,
+        "node": NODE,
+        "nodes": NODES,
+        "links": LINKS,
+        "scenarios": structured.SCENARIOS,
+        "colours": COLOURS,
+        "labels": LABELS,
+        "key_colours": (BLUE, VERMILION, GREEN),
+        "behind": behind,
+        "errors": {LABELS[name]: [r.mean_error(name, q) for q in QUANTIZERS] for name, r in runs.items()},
+        "recursive": LABELS[RECURSIVE],
+        "second_names": names,
+        "power": float(np.mean(result.setting.disturbances**2)),
+    }

@@ -1,4 +1,4 @@
-"""Figs 1 to 12 and the strong scenario, as curves over time."""
+"""Figs 1 to 12 and the strong scenario, as curves over time, and what the page says beside the numbers."""
 
 import matplotlib
 import numpy as np
@@ -18,32 +18,37 @@ from heliograph.report.figures import (
     Curve,
     label_right,
 )
-from heliograph_studies.cubature_fusion.compute import Outcome, Reproduction
-from heliograph_studies.cubature_fusion.setting import NODES, STATES
+from heliograph_studies.cubature_fusion.compute import Outcome, Runs
+from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
+from heliograph_studies.cubature_fusion.statements import BETTER, METHOD, TWIN
 
-METHOD, TWIN = "cubature_printed_fixed", "extended_printed_fixed"
 COLOURS = {
     "open_loop": MUTED, "mean_gain": AMBER, "cubature_printed_fixed": VERMILION, "cubature_printed": PURPLE,
     "cubature_tight": INK, "cubature_polytope": BLUE, "cubature_zero_mean": GREEN, "ci_equal": BLUE,
     "ci_optimal": PURPLE, "central": INK,
 }  # fmt: skip
 LABELS = {"cubature_printed_fixed": "printed, fixed β", "ci_equal": "equal weights", "ci_optimal": "optimal weights"}
+NAMES = {
+    "open_loop": "no measurements", "ci_optimal": "fused, optimal weights", "ci_equal": "fused, equal weights",
+    "ci_printed": "fused, the paper's filters", "ci_open_loop": "fused, no measurements",
+}  # fmt: skip
+LITERAL = ("step_four_gain", "mixed_cross", "central_moment", "raw_moment")
 NODE_COLOURS = (BLUE, AMBER, GREEN, PURPLE)
 
 
-def drawings(result: Reproduction) -> dict[str, Figure]:
+def figures(result: Outcome) -> dict[str, Figure]:
     """All figures by file name."""
-    printed, figures = result.printed, {}
+    printed, drawn = result.printed, {}
     for i, state in enumerate(STATES):
-        figures[f"fig{i + 1:02d}_{state}"] = _states(printed, i)
-    figures["fig06_trace"] = _traces(printed)
-    figures["fig07_rmse_and_bound"] = _below_bound(printed)
+        drawn[f"fig{i + 1:02d}_{state}"] = _states(printed, i)
+    drawn["fig06_trace"] = _traces(printed)
+    drawn["fig07_rmse_and_bound"] = _below_bound(printed)
     for i, node in enumerate(NODES):
-        figures[f"fig{i + 8:02d}_node{node}"] = _against_extended(printed, i)
-    figures["fig12_fusion"] = _fusion(printed)
-    figures["strong_filters"] = _strong_filters(result.strong)
-    figures["strong_fusion"] = _strong_fusion(result.strong)
-    return figures
+        drawn[f"fig{i + 8:02d}_node{node}"] = _against_extended(printed, i)
+    drawn["fig12_fusion"] = _fusion(printed)
+    drawn["strong_filters"] = _strong_filters(result.strong)
+    drawn["strong_fusion"] = _strong_fusion(result.strong)
+    return drawn
 
 
 def label(name: str) -> str:
@@ -51,7 +56,7 @@ def label(name: str) -> str:
     return LABELS.get(name, name.removeprefix("cubature_").replace("_", " "))
 
 
-def _states(o: Outcome, i: int) -> Figure:
+def _states(o: Runs, i: int) -> Figure:
     assert o.shown.truth is not None
     truth = o.shown.truth[0, :, i]
     local = [np.asarray(o.shown.estimates[n][METHOD].mean)[0, :, i] for n in NODES]
@@ -62,11 +67,11 @@ def _states(o: Outcome, i: int) -> Figure:
     return curves_over_time(o.shown.time, panels)
 
 
-def _trace(o: Outcome, name: str) -> np.ndarray:
+def _trace(o: Runs, name: str) -> np.ndarray:
     return np.asarray(np.trace(o.pooled(name).claimed(), axis1=-2, axis2=-1))
 
 
-def _traces(o: Outcome) -> Figure:
+def _traces(o: Runs) -> Figure:
     local, fused = o.claimed_trace(METHOD), _trace(o, "ci_printed")
     nodes = [Curve("nodes", MUTED, v) for v in local]
     gain = Curve("fused", VERMILION, 100 * (1 - fused / local.min(axis=0)))
@@ -74,7 +79,7 @@ def _traces(o: Outcome) -> Figure:
     return curves_over_time(o.shown.time, [traces, Panel("below best node (%)", [gain])])
 
 
-def _below_bound(o: Outcome) -> Figure:
+def _below_bound(o: Runs) -> Figure:
     bound = Curve("√trace, fused", BLUE, np.sqrt(_trace(o, "ci_printed")))
     error = Curve("RMSE, fused", VERMILION, o.pooled("ci_printed").rmse_over_time())
     local = [Curve("√trace, nodes", MUTED, np.sqrt(v)) for v in o.claimed_trace(METHOD)]
@@ -82,13 +87,13 @@ def _below_bound(o: Outcome) -> Figure:
     return curves_over_time(o.shown.time, [Panel("root of squared error", [*local, *errors, bound, error])])
 
 
-def _against_extended(o: Outcome, i: int) -> Figure:
+def _against_extended(o: Runs, i: int) -> Figure:
     pairs = ((TWIN, "extended", BLUE), (METHOD, "cubature", VERMILION))
     curves = [Curve(text, colour, o.rmse(name)[i]) for name, text, colour in pairs]
     return curves_over_time(o.shown.time, [Panel(f"RMSE, node {NODES[i]}", curves)])
 
 
-def _fusion(o: Outcome) -> Figure:
+def _fusion(o: Runs) -> Figure:
     panels = []
     for name, fused, text in ((METHOD, "ci_printed", "RMSE"), ("open_loop", "ci_open_loop", "RMSE, no measurements")):
         curves = [Curve(f"node {n}", c, v) for n, c, v in zip(NODES, NODE_COLOURS, o.rmse(name), strict=True)]
@@ -96,26 +101,26 @@ def _fusion(o: Outcome) -> Figure:
     return curves_over_time(o.shown.time, panels)
 
 
-def _over_nodes(o: Outcome, name: str) -> np.ndarray:
+def _over_nodes(o: Runs, name: str) -> np.ndarray:
     """Root of the mean squared error over the nodes, (time,)."""
     return np.asarray(np.sqrt(np.mean(o.rmse(name) ** 2, axis=0)))
 
 
-def _strong_filters(o: Outcome) -> Figure:
+def _strong_filters(o: Runs) -> Figure:
     names = ("mean_gain", "open_loop", "cubature_printed_fixed", "cubature_printed", "cubature_tight",
              "cubature_polytope", "cubature_zero_mean")  # fmt: skip
     curves = [Curve(label(n), COLOURS[n], _over_nodes(o, n)) for n in names]
     return _from_zero(o, "RMSE over the nodes", curves)
 
 
-def _strong_fusion(o: Outcome) -> Figure:
+def _strong_fusion(o: Runs) -> Figure:
     single = Curve("one node", GREEN, _over_nodes(o, "cubature_zero_mean"))
     curves = [Curve(label(n), COLOURS[n], o.pooled(n).rmse_over_time()) for n in ("ci_optimal", "ci_equal", "central")]
     return _from_zero(o, "RMSE", [single, *curves])
 
 
 @matplotlib.rc_context(STYLE)
-def _from_zero(o: Outcome, text: str, curves: list[Curve]) -> Figure:
+def _from_zero(o: Runs, text: str, curves: list[Curve]) -> Figure:
     """Curves on an axis that starts at zero, so that what is low has room for its name."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
@@ -124,3 +129,29 @@ def _from_zero(o: Outcome, text: str, curves: list[Curve]) -> Figure:
     axes.set(xlim=(o.shown.time[0], o.shown.time[-1]), ylim=(0.0, None), xlabel="step", ylabel=text)
     label_right(axes, {c.name: (float(c.values[-1]), c.colour) for c in curves}, 0.055)
     return figure
+
+
+def words(result: Outcome) -> dict[str, object]:
+    """Labels and colours, and the numbers of the tables: of a filter RMSE, its error, trace, and worst direction."""
+    strong = result.strong
+    return {
+        "label": label,
+        "named": {name: NAMES.get(name, name.replace("_", " ")) for o in result.both for name in _names(o)},
+        "colours": COLOURS,
+        "rmse": {name: strong.pooled(name).rmse() for name in (*BETTER, METHOD, "mean_gain")},
+        "method": METHOD,
+        "better": BETTER,
+        "tables": {"strong scenario": _table(strong), "printed example": _table(result.printed)},
+        "nodes": NODES,
+        "states": STATES,
+        "zero_mean_scalar": FIXED_ZERO_MEAN_SCALAR,
+    }
+
+
+def _names(o: Runs) -> list[str]:
+    return [*(n for n in o.statistics[NODES[0]] if n not in LITERAL), *o.statistics["fused"]]
+
+
+def _table(o: Runs) -> dict[str, object]:
+    rows = {name: (*s.rmse(), s.mean_trace(), s.worst_direction()) for name, s in ((n, o.pooled(n)) for n in _names(o))}
+    return {"runs": o.runs, "steps": o.steps, "rows": rows}

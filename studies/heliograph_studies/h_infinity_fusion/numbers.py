@@ -1,65 +1,28 @@
-"""`reproduce`: Section IV's example and one that tells filters apart, as summary, record, figures and report."""
+"""What the summary lists, and the record of the runs."""
 
-from functools import partial
-from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import heliograph as hg
-from heliograph.numerics.check import check_count, check_seed
-from heliograph.report.results import Json, Results, write_results
-from heliograph_studies.h_infinity_fusion import setting
-from heliograph_studies.h_infinity_fusion.compute import RUNS, STAGES, Reproduction, reproduction
 from heliograph_studies.h_infinity_fusion.discriminating import NODE, Discriminating
-from heliograph_studies.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZERS, RECURSIVE, Outcome, fused_name
+from heliograph_studies.h_infinity_fusion.example import MORE_QUANTIZERS, QUANTIZERS, RECURSIVE, Runs, fused_name
 from heliograph_studies.h_infinity_fusion.levels import NodeDesigns
-from heliograph_studies.h_infinity_fusion.statements import statements
+from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
 from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst
-from heliograph_studies.statement import Statement
+
+if TYPE_CHECKING:
+    import xarray
 
 
-def reproduce(out: Path, runs: int | None = None, seed: int = 0) -> None:
-    """Reproduce the paper's example and write summary, record, figures and report to `out`/h-infinity-fusion.
-
-    `runs` Monte Carlo runs (4,000 unless given) of every filter and quantizer.
-
-    Raises:
-        ValueError: fewer than 100 runs (standard errors mean little), a folder that cannot be written or that holds
-            something else.
-        ModuleNotFoundError: an extra of `lmi`, `report`, `sweep` is not installed.
-    """
-    seed = check_seed("seed", seed)
-    count = check_count("runs", RUNS if runs is None else runs, 100)
-    work = partial(reproduction, count, seed)
-    needs = ("clarabel", "cvxpy", "xarray", "h5netcdf")
-    write_results(Path(out) / "h-infinity-fusion", STAGES, work, results, needs)
-
-
-def results(found: Reproduction) -> Results:
-    """Everything that the folder holds."""
-    from heliograph_studies.h_infinity_fusion.page import page
-    from heliograph_studies.h_infinity_fusion.pictures import drawings
-
-    judged = statements(found)
-    return Results(
-        drawings(found),
-        partial(page, found, judged),
-        summary(found, judged),
-        lambda folder: write_record(found, folder / "record.nc"),
-    )
-
-
-def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Json]:
+def numbers(result: Parts) -> dict[str, Any]:
     """All numbers."""
-    outcome = result.outcome
+    outcome = result.runs
     decodable = outcome.record.uplinks[fused_name(RECURSIVE, "dynamic_decodable")]
     return {
-        "paper": "Distributed fusion filtering for nonlinear time-varying systems over amplify-and-forward relay "
-        "networks: an H-infinity quantized framework",
-        "seed": result.seed,
-        "runs": outcome.runs,
         "nodes": [
-            node_numbers(node, level, result) for node, level in zip(result.nodes, setting.LEVELS, strict=True)
+            node_numbers(node, level, result) for node, level in zip(result.nodes, result.setting.levels, strict=True)
         ],
         "fusion": fusion_numbers(result),
         "mean_fused_error_is": "mean over runs and s = 0 ... 15 of the norm of x - fused, of one-step predictions",
@@ -78,18 +41,17 @@ def summary(result: Reproduction, judged: list[Statement]) -> dict[str, Json]:
         },
         "growth": growth_numbers(result),
         "index": {
-            "J1": {name: values.tolist() for name, values in result.indices.local.items()},
-            "J2": {name: float(value) for name, value in result.indices.fused.items()},
+            "J1": {name: values for name, values in result.indices.local.items()},
+            "J2": {name: value for name, value in result.indices.fused.items()},
         },
         "broken_guarantee": {
-            "node": setting.NODES[0], "guaranteed": result.nodes[0].horizon.level, **found(result.broken)
+            "node": NODES[0], "guaranteed": result.nodes[0].horizon.level, **worst_level(result.broken)
         },
         "discriminating": second_numbers(result.discriminating),
-        "claims": [each.entry() for each in judged],
     }  # fmt: skip
 
 
-def node_numbers(node: NodeDesigns, level: float, result: Reproduction) -> dict[str, Json]:
+def node_numbers(node: NodeDesigns, level: float, result: Parts) -> dict[str, Any]:
     """Levels of a node, and the certificate of the recursive design at the paper's level."""
     smallest = {f"recursive_{name}": value for name, value in node.smallest.items()}
     return {
@@ -104,45 +66,45 @@ def node_numbers(node: NodeDesigns, level: float, result: Reproduction) -> dict[
     }
 
 
-def certificate(node: NodeDesigns) -> list[dict[str, Json]]:
+def certificate(node: NodeDesigns) -> list[dict[str, Any]]:
     """Everything that Theorem 1 needs at each step; states in the order (x, e)."""
     design = node.paper
     return [
         {
-            "P": design.weights[s].tolist(),
-            "K": design.gains[s].tolist(),
-            "L_next": np.linalg.inv(design.weights[s + 1]).tolist(),
+            "P": design.weights[s],
+            "K": design.gains[s],
+            "L_next": np.linalg.inv(design.weights[s + 1]),
             "lambda1": float(design.multipliers[s, 0]),
             "lambda2": float(design.multipliers[s, 1]),
             "gamma": design.level,
         }
-        for s in range(setting.STEPS)
+        for s in range(len(design.gains))
     ]
 
 
-def fusion_numbers(result: Reproduction) -> dict[str, Json]:
+def fusion_numbers(result: Parts) -> dict[str, Any]:
     """Weights and levels of the fused estimate."""
     return {
-        "weights": hg.fusion.level_weights(setting.LEVELS).tolist(),
+        "weights": hg.fusion.level_weights(result.setting.levels),
         "gamma": result.fused_level,
         "gamma_of_paper_weights": result.level_of_paper_weights(),
         "gamma_of_paper_weights_as_printed": result.level_of_paper_weights(normalised=False),
-        "minkowski": {"gamma": result.minkowski, "best_node": min(setting.LEVELS)},
+        "minkowski": {"gamma": result.minkowski, "best_node": min(result.setting.levels)},
     }
 
 
-def error_numbers(result: Reproduction) -> dict[str, Json]:
+def error_numbers(result: Parts) -> dict[str, Any]:
     """Mean fused errors of the paper's filters by quantizer, and their differences on the same runs."""
-    numbers: dict[str, Json] = {}
+    numbers: dict[str, Any] = {}
     for name in (*QUANTIZERS, *MORE_QUANTIZERS):
-        numbers[name], numbers[f"{name}_se"] = result.outcome.mean_error(RECURSIVE, name)
+        numbers[name], numbers[f"{name}_se"] = result.runs.mean_error(RECURSIVE, name)
     for other in ("static", "static_p41"):
         mean, error, better = result.difference("dynamic", other)
         numbers[f"dynamic_minus_{other}"] = {"mean": mean, "se": error, "share_of_runs_better": better}
     return numbers
 
 
-def context(outcome: Outcome, name: str) -> dict[str, Json]:
+def context(outcome: Runs, name: str) -> dict[str, Any]:
     """Mean fused errors of another filter."""
     (mean, error), dynamic, static = (outcome.mean_error(name, q) for q in QUANTIZERS)
     return {
@@ -153,33 +115,32 @@ def context(outcome: Outcome, name: str) -> dict[str, Json]:
     }  # fmt: skip
 
 
-def growth_numbers(result: Reproduction) -> dict[str, Json]:
+def growth_numbers(result: Parts) -> dict[str, Any]:
     """What was found about a = 0.7, and levels with constants that were not refuted."""
-    found, true = result.growth, result.true_growth
+    constants, true = result.growth, result.true_growth
     return {
-        "visited": [finding_numbers(f) for f in found.visited],
-        "whole_range": finding_numbers(found.whole),
-        "size": finding_numbers(found.size),
-        "secant": found.secant.tolist(),
-        "levels": {name: getattr(true, name).tolist() for name in ("one", "differences", "each_step")},
+        "visited": [finding_numbers(f) for f in constants.visited],
+        "whole_range": finding_numbers(constants.whole),
+        "size": finding_numbers(constants.size),
+        "secant": constants.secant,
+        "levels": {name: getattr(true, name) for name in ("one", "differences", "each_step")},
         "levels_are": "by node; one multiplier for f and f~, then separate ones",
         "certified": true.certified,
-        "larger_growth": result.readings.larger_growth.tolist(),
+        "larger_growth": result.readings.larger_growth,
     }
 
 
-def finding_numbers(finding: hg.h_infinity.GrowthFinding) -> dict[str, Json]:
+def finding_numbers(finding: hg.h_infinity.GrowthFinding) -> dict[str, Any]:
     """A finding as numbers."""
-    values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in finding._asdict().items()}
-    return {**values, "pair": [p.tolist() for p in finding.pair], "refuted": bool(finding.refuted)}
+    return {**finding._asdict(), "refuted": bool(finding.refuted)}
 
 
-def found(worst: Worst) -> dict[str, float]:
+def worst_level(worst: Worst) -> dict[str, float]:
     """A level found by search."""
     return {"found": worst.level, "found_se": worst.standard_error}
 
 
-def second_numbers(second: Discriminating) -> dict[str, Json]:
+def second_numbers(second: Discriminating) -> dict[str, Any]:
     """The second example: by filter, levels of each node and errors; by node, certificates."""
     return {
         "runs": second.runs,
@@ -188,7 +149,7 @@ def second_numbers(second: Discriminating) -> dict[str, Json]:
         "without_structure": second.without_structure,
         "without_structure_or_gain": {NODE: second.without_structure_or_gain},
         "growth": finding_numbers(second.finding),
-        "worst": {"node": NODE, **{name: found(worst) for name, worst in second.worst.items()}},
+        "worst": {"node": NODE, **{name: worst_level(worst) for name, worst in second.worst.items()}},
         **{
             key: {
                 scenario: {name: {"mean": mean, "se": error} for name, (mean, error) in each.items()}
@@ -202,11 +163,11 @@ def second_numbers(second: Discriminating) -> dict[str, Json]:
     }
 
 
-def write_record(result: Reproduction, path: Path) -> None:
+def record(result: Parts) -> "xarray.Dataset":
     """Truth, one run, means over the runs and the gains as NetCDF."""
     import xarray
 
-    outcome, second = result.outcome, result.discriminating
+    outcome, second = result.runs, result.discriminating
     quantizers = [*QUANTIZERS, *MORE_QUANTIZERS]
     errors = {q: outcome.errors(RECURSIVE, q) for q in quantizers}
     filters = list(second.over_time["white"])
@@ -222,8 +183,8 @@ def write_record(result: Reproduction, path: Path) -> None:
             np.array([[each[name] for name in filters] for each in second.over_time.values()]),
         ),
     }
-    coordinates = {"s": np.arange(setting.STEPS), "state": list(setting.STATES), "node": list(setting.NODES),
+    coordinates = {"s": np.arange(result.setting.steps), "state": list(STATES), "node": list(NODES),
                    "quantizer": quantizers, "received": ["relay", "direct"], "scenario": list(second.over_time),
                    "filter": filters}  # fmt: skip
-    about = {"seed": result.seed, "runs": outcome.runs}
-    xarray.Dataset(data, coordinates, about).to_netcdf(path, engine="h5netcdf")
+    about = {"seed": result.setting.seed, "runs": outcome.runs}
+    return xarray.Dataset(data, coordinates, about)
