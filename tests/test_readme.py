@@ -146,7 +146,7 @@ def run(words: list[str]) -> int:
     return 1
 
 
-class BegunError(Exception):
+class BegunError(BaseException):
     """The work would begin now: all that it needs is there."""
 
 

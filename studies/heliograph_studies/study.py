@@ -3,7 +3,6 @@
 import hashlib
 import inspect
 import re
-import shutil
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -35,6 +34,10 @@ REPEATED = ("runs", "seed")  # what tells two runs of one study apart, not two s
 def no_statements(_: object) -> Judged:
     """Of an example, which nobody stated anything about."""
     return {}
+
+
+def no_progress(what: str, done: int = 0, total: int = 0) -> None:
+    """Of work that has not begun."""
 
 
 def no_data(_: object, __: Path) -> None:
@@ -83,18 +86,22 @@ class Study(Generic[Setting, Outcome]):
             ModuleNotFoundError: an extra is not installed.
         """
         chosen = self.setting() if setting is None else setting
+        for name in self.needs:
+            import_module(name)
         if out is None:
-            for name in self.needs:
-                import_module(name)
             with progress(self.stages) as advance:
-                return self.compute(chosen, Stages(self.name, advance))
+                stages = Stages(self.name, advance)
+                with stages.failing_in_a_line():
+                    return self.compute(chosen, stages)
         target, lines = Path(out) / self.name, list[str]()
-        folder = target.with_name(f"{self.name}.stages")
+        stages = Stages(self.name, no_progress, target.with_name(f"{self.name}.stages"), self._key(chosen))
 
         def work(advance: Advance) -> Outcome:
-            return self.compute(chosen, Stages(self.name, advance, folder, self._key(chosen)))
+            stages.advance = advance
+            return self.compute(chosen, stages)
 
         def tell(outcome: Outcome) -> Results:
+            stages.stage = "drawing and writing"
             statements = self.statements(outcome)
 
             def page(pictures: Mapping[str, bytes]) -> Page:
@@ -105,8 +112,9 @@ class Study(Generic[Setting, Outcome]):
             numbers = self.summary(chosen, outcome, statements)
             return Results(self.figures(outcome), page, numbers, partial(self.data, outcome))
 
-        outcome = write_results(target, self.stages, work, tell, self.needs)
-        shutil.rmtree(folder, ignore_errors=True)
+        with stages.failing_in_a_line():
+            outcome = write_results(target, self.stages, work, tell, self.needs)
+        stages.clear()
         print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome
 

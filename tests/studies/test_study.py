@@ -1,7 +1,7 @@
 """A study: other numbers, what is kept of one that fails, what is written, and what is printed."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -218,6 +218,14 @@ def test_a_study_that_fails_keeps_its_stages(study, tmp_path):
     assert calls == ["first", "second", "second"]  # what was done is not done again
     study.run(Setting(), out)  # another setting's stages are not its own
     assert calls[3:] == ["first", "second"] and (out / "number" / "summary.json").is_file()
+
+
+def test_what_cannot_be_drawn_fails_in_a_line_and_keeps_everything(study, tmp_path):
+    unseen = replace(study, figures=lambda outcome: {"a": 1 / 0})
+    with pytest.raises(ValueError, match=r"number, drawing and writing: .*ZeroDivisionError.*kept in .*number\.stages"):
+        unseen.run(Setting(), tmp_path)
+    study.run(Setting(), tmp_path)
+    assert calls == ["first", "second"]
 
 
 @pytest.mark.parametrize("change", ["code", "file"])
