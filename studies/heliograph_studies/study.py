@@ -102,21 +102,25 @@ class Study(Generic[Setting, Outcome]):
 
         def tell(outcome: Outcome) -> Results:
             stages.stage = "drawing and writing"
-            statements = self.statements(outcome)
-
-            def page(pictures: Mapping[str, bytes]) -> Page:
-                made = self.make_page(chosen, outcome, statements, pictures)
-                lines.extend(findings(made, statements))
-                return made
-
-            numbers = self.summary(chosen, outcome, statements)
-            return Results(self.figures(outcome), page, numbers, partial(self.data, outcome))
+            return self._results(chosen, outcome, lines)
 
         with stages.failing_in_a_line():
             outcome = write_results(target, self.stages, work, tell, self.needs)
         stages.clear()
         print("\n".join([*lines, f"Report: {target / 'report.html'}"]), flush=True)
         return outcome
+
+    def _results(self, setting: Setting, outcome: Outcome, lines: list[str]) -> Results:
+        """What the folder holds; its findings go to `lines`."""
+        statements = self.statements(outcome)
+
+        def page(pictures: Mapping[str, bytes]) -> Page:
+            made = self.make_page(setting, outcome, statements, pictures)
+            lines.extend(findings(made, statements))
+            return made
+
+        numbers = self.summary(setting, outcome, statements)
+        return Results(self.figures(outcome), page, numbers, partial(self.data, outcome))
 
     def summary(self, setting: Setting, outcome: Outcome, statements: Judged) -> dict[str, Any]:
         """All numbers: the outcome's fields, which setting they are of, and the statements with their evidence."""
