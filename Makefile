@@ -21,7 +21,7 @@ demo: .venv/.demo  ## Run the demonstration and write its report to out/
 test: .venv/.test  ## Lint, check types and run the tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy --strict src
+	$(BIN)/mypy --strict src studies
 	$(BIN)/pytest -n 2 --dist loadfile
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
@@ -39,7 +39,7 @@ soak: .venv/.test  ## Kill a service fifty times; try ten thousand random networ
 
 clean:  ## Remove the environment and everything made by the other targets
 	rm -rf .venv out docs/_made build dist .hypothesis .mypy_cache .pytest_cache .ruff_cache
-	find src tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
+	find src studies tests benchmarks -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 $(CREATED):
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.papers.cubature_fusion.compute import network
-from heliograph.papers.cubature_fusion.setting import PRINTED
+from heliograph_studies.cubature_fusion.compute import network
+from heliograph_studies.cubature_fusion.setting import PRINTED
 
 RUNS, REPEATS, LIMIT = 50, 3, 0.25
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import heliograph as hg
-from heliograph.papers.cubature_fusion.compute import network
-from heliograph.papers.cubature_fusion.setting import STRONG
 from heliograph.report.progress import Countdown
+from heliograph_studies.cubature_fusion.compute import network
+from heliograph_studies.cubature_fusion.setting import STRONG
 
 RUNS = 1_000_000
 FILTER, FUSED = "cubature_zero_mean", "ci_equal"

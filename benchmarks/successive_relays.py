@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.papers.successive_relays import setting
 from heliograph.relays.design import start_moments
 from heliograph.relays.own_error import _propagate_own
+from heliograph_studies.successive_relays.setting import Setting
 
 STEPS = 100
 LIMIT = 0.020  # seconds, warm, one core
@@ -35,7 +35,7 @@ def of_dimension(n: int) -> hg.model.RelayNetwork:
     rng = np.random.default_rng(n)
     plant = hg.LinearPlant(rng.normal(size=(n, n)) * 0.5 / np.sqrt(n), np.eye(n), np.zeros(n), np.eye(n))
     return hg.model.RelayNetwork(plant, hg.LinearSensor(rng.normal(size=(1, n)), [[1.0]]), ("relay_1", "relay_2"),
-                           setting.network().slots)  # fmt: skip
+                           Setting().network().slots)  # fmt: skip
 
 
 def dense(d: int) -> float:
@@ -48,7 +48,7 @@ def dense(d: int) -> float:
 
 def measure() -> dict[str, Any]:
     """Milliseconds to design STEPS steps of the example."""
-    network = setting.network()
+    network = Setting().network()
     start = time.perf_counter()
     hg.relays.own_error_design(network, STEPS)
     first = time.perf_counter() - start

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph import campaign, cli, examples, filters, fusion, linear, model, random_affine, relays, simulation
+from heliograph import campaign, cli, filters, fusion, linear, model, random_affine, relays, simulation
 from tests.junk import COIN, ESCAPE, EYE, HOP, KALMAN, NODE, PLANT, SCALAR, SENSOR, check, name_of
 
 KNOWN = hg.model.Estimate(np.zeros(2), EYE, "exact")
@@ -136,7 +136,19 @@ def test_it_works_or_says_what_is_wrong(call, arguments, data):
 
 WORDS = [
     *("run", "demo", "example", "reproduce", "sweep", "all", "cubature-fusion", "net.py", "net.py:network", "data.csv"),
-    *("campaign.toml", "--out", "o", "o.csv", "--seed", "--runs", "--workers", "--setting", "--chunk"),
+    *(
+        "campaign.toml",
+        "--out",
+        "o",
+        "o.csv",
+        "--seed",
+        "--runs",
+        "--set",
+        "seed=2",
+        "--workers",
+        "--setting",
+        "--chunk",
+    ),
     *("--measurements", "--", "-1", "0", "3", "1" * 23, "150.7", "1_000", "nan", "", "\x1b[31m", "\0", "é", "--help"),
 ]
 
@@ -145,9 +157,8 @@ WORDS = [
 @given(words=st.lists(st.sampled_from(WORDS), max_size=7))
 def test_any_command_line_ends_with_a_code_and_at_most_a_line(words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    stub = SimpleNamespace(reproduce=lambda *_: None)
-    monkeypatch.setattr("heliograph.cli.reproduce.import_module", lambda name: stub)  # what takes minutes is not run
-    monkeypatch.setattr(examples, "load_example", lambda name: lambda *_: None)
+    stub = SimpleNamespace(settings=lambda values: values, run=lambda *_: None)
+    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: stub)  # what takes minutes is not run
     capsys.readouterr()
     code = cli.main(words)
     said = capsys.readouterr()

@@ -43,7 +43,6 @@ ORDER = [
     ["report"],
     ["campaign"],
     ["serving"],
-    ["examples", "papers"],
     ["cli"],
     ["__main__"],
 ]
@@ -141,10 +140,9 @@ def test_no_public_function_is_without_a_docstring():
                     assert not public or ast.get_docstring(member), f"{path.name}: {node.name}.{member.name}"
 
 
-def test_nothing_outside_papers_knows_a_paper():
-    for path in FILES:
-        if "papers" not in path.parts and "cli" not in path.parts:
-            assert not any(name.startswith("papers") for name in imports(path)), path.name
+def test_the_library_knows_no_study():
+    for path in SOURCE.rglob("*.py"):
+        assert "heliograph_studies" not in path.read_text(), path.name
 
 
 def test_eigenvalues_of_a_batch_are_taken_one_after_another():

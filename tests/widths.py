@@ -1,4 +1,7 @@
-"""Pages in a browser: what is wider than its window at 1200 and at 420 pixels, or complained of, or fetched."""
+"""Pages in a browser: what is wider than its window at 1200 and at 420 pixels, or complained of, or fetched.
+
+A table alone may be wider than its box, in which it is moved sideways.
+"""
 
 import json
 import subprocess
@@ -10,7 +13,7 @@ from chromium import Browser, program
 
 WIDTHS = (1200, 420)
 INSIDE = """[...document.querySelectorAll('body *')].filter(part => part.scrollWidth > part.clientWidth + 1
-    && /auto|scroll|hidden/.test(getComputedStyle(part).overflowX)).map(part =>
+    && !part.matches('.scroll') && /auto|scroll|hidden/.test(getComputedStyle(part).overflowX)).map(part =>
     `${part.tagName} ${part.scrollWidth} > ${part.clientWidth}: ${part.textContent.trim().slice(0, 60)}`)"""
 
 

@@ -8,7 +8,7 @@ from problems import RELAY_GAINS, SENSOR_GAINS
 from timed import Arrays, Contender, serve
 
 import heliograph as hg
-from heliograph.papers.cubature_fusion.setting import STRONG, cubature
+from heliograph_studies.cubature_fusion.setting import STRONG, cubature
 
 
 def prepare(p: Arrays) -> Contender:

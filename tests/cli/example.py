@@ -1,7 +1,6 @@
 """A network, its data and how the command is called with them."""
 
-import sys
-from types import ModuleType
+from types import SimpleNamespace
 
 from heliograph import cli
 
@@ -53,7 +52,7 @@ def refused(folder, capsys, arguments, *fragments) -> None:
     assert contents(folder) == before
 
 
-def demo_module(monkeypatch, example) -> None:
-    module = ModuleType("heliograph.examples.demo")
-    module.example = example
-    monkeypatch.setitem(sys.modules, "heliograph.examples.demo", module)
+def stub_study(monkeypatch, run) -> None:
+    """Any study is one that calls `run` with its folder and its values."""
+    study = SimpleNamespace(settings=dict, run=lambda values, out: run(out, values))
+    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: study)

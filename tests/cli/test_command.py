@@ -8,7 +8,7 @@ import pytest
 import heliograph as h
 from heliograph import cli
 from heliograph.numerics.check import InputError
-from tests.cli.example import contents, demo_module, refused, run_arguments
+from tests.cli.example import contents, refused, run_arguments, stub_study
 
 
 @pytest.mark.parametrize(
@@ -28,18 +28,18 @@ def test_a_command_line_that_is_none(folder, capsys, arguments, fragments):
 
 def test_demo_takes_folder_and_seed(folder, monkeypatch):
     calls = []
-    demo_module(monkeypatch, lambda out, seed, drive="plaza2": calls.append((str(out), seed, drive)))
+    stub_study(monkeypatch, lambda out, values: calls.append((str(out), values)))
     assert cli.main(["demo", "--out", "results", "--seed", "3"]) == 0
     assert cli.main(["demo", "--out", "results", "--recording", "plaza1"]) == 0
     assert cli.main(["example", "demo", "--out", "results", "--seed", "4"]) == 0
-    assert calls == [("results", 3, "plaza2"), ("results", 0, "plaza1"), ("results", 4, "plaza2")]
+    assert calls == [("results", {"seed": "3"}), ("results", {"recording": "plaza1"}), ("results", {"seed": "4"})]
 
 
 def test_a_missing_extra_is_named(folder, capsys, monkeypatch):
     def lacking(*_):
         raise ModuleNotFoundError("No module named 'matplotlib'", name="matplotlib.pyplot")
 
-    demo_module(monkeypatch, lacking)
+    stub_study(monkeypatch, lacking)
     refused(folder, capsys, ["demo", "--out", "results"], "matplotlib", sys.executable, '[report]"')
     for name in ("pyarrow", "pyarrow.parquet"):
         monkeypatch.setitem(sys.modules, name, None)
@@ -51,7 +51,7 @@ def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     def wrong(*_):
         raise InputError("thing: expected\n  one, got\n  two")
 
-    demo_module(monkeypatch, wrong)
+    stub_study(monkeypatch, wrong)
     refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")
 
 
@@ -77,7 +77,7 @@ def test_a_bug_keeps_its_traceback(folder, monkeypatch, bug):
     def broken(*_):
         raise bug
 
-    demo_module(monkeypatch, broken)
+    stub_study(monkeypatch, broken)
     with pytest.raises(type(bug), match="bug"):
         cli.main(["demo", "--out", "results"])
 
@@ -122,8 +122,10 @@ def test_lists_do_not_load_jax():
             "smoothing",
         )
     ]
-    assert all(len(line.split()) > 5 for line in lines)
-    assert "cubature-fusion" in without_jax(["reproduce"]).splitlines()
+    methods = without_jax(["reproduce"]).splitlines()
+    assert [line.split()[0] for line in methods] == sorted(line.split()[0] for line in methods)
+    assert methods[0].startswith("cubature-fusion ") and len(methods) == 5
+    assert all(len(line.split()) > 5 for line in lines + methods)
 
 
 def test_a_refusal_in_a_process_of_its_own(folder):

@@ -3,13 +3,13 @@
 import re
 import shutil
 import subprocess
+from types import SimpleNamespace
 
 import numpy as np
 import pandas
 import pytest
 
 from heliograph import cli
-from heliograph.examples import load_example
 from heliograph.files.table import read_table
 
 
@@ -59,11 +59,9 @@ def test_bash_completes_a_word(capsys):
 @pytest.mark.parametrize(("out", "expected"), [("out", "out"), ("out/fusion", "out"), ("fusion", ".")])
 def test_results_are_not_put_one_folder_deeper_than_said(monkeypatch, out, expected):
     calls = []
-    load_example("fusion")
-    monkeypatch.setattr("heliograph.examples.fusion.example", lambda place, seed: calls.append(str(place)))
+    study = SimpleNamespace(settings=lambda values: values, run=lambda setting, place: calls.append(str(place)))
+    monkeypatch.setattr("heliograph.cli.studies.load", lambda entry: study)
     assert cli.main(["example", "fusion", "--out", out]) == 0 and calls == [expected]
-    module = type("Paper", (), {"reproduce": staticmethod(lambda place, runs, seed: calls.append(str(place)))})
-    monkeypatch.setattr("heliograph.cli.reproduce.import_module", lambda name: module)
     assert cli.main(["reproduce", "quadratic-bias", "--out", out.replace("fusion", "quadratic-bias")]) == 0
     assert calls[1] == expected
     assert cli.main(["reproduce", "all", "--out", "out/all"]) == 0 and set(calls[2:]) == {"out/all"}

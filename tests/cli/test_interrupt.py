@@ -10,7 +10,7 @@ import pytest
 
 from heliograph import cli
 from heliograph.files.table import read_table
-from tests.cli.example import NETWORK, contents, demo_module, run_arguments
+from tests.cli.example import NETWORK, contents, run_arguments, stub_study
 
 START = "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); sys.argv[0] = 'heliograph'; "
 
@@ -65,7 +65,7 @@ def kept_quiet():
 
 @pytest.mark.parametrize("interrupt", [in_a_callback, told_as_something_else, kept_quiet])
 def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
-    demo_module(monkeypatch, lambda out, seed, recording: interrupt())
+    stub_study(monkeypatch, lambda *_: interrupt())
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert cli.main(["demo", "--out", "results"]) == cli.INTERRUPTED

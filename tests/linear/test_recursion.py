@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.linear.recursion import solve_innovation
-from heliograph.papers.quadratic_bias import printed
+from heliograph_studies.quadratic_bias import printed
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors
 

@@ -13,8 +13,8 @@ from heliograph.linear.told_losses import (
     spectral_radius,
     steady,
 )
-from heliograph.papers.intermittent_observations import setting
-from heliograph.papers.intermittent_observations.mean_error import mean_error
+from heliograph_studies.intermittent_observations import setting
+from heliograph_studies.intermittent_observations.mean_error import mean_error
 from tests.riccati import riccati
 
 SCALAR = ([[-1.25]], [[1.0]], [[1.0]], [[2.5]])  # A, C, Q, R

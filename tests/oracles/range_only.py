@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from heliograph.examples.demo import robot
-from heliograph.examples.demo.recording import PlazaRecording
+from heliograph_studies.demo import robot
+from heliograph_studies.demo.recording import PlazaRecording
 
 PLAZA2 = robot.DRIVES["plaza2"]
 

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.papers.quadratic_bias.setting import TABLE_1
 from heliograph.random_affine.moment_noise import MOMENT_ERROR
 from heliograph.testing import check_random_affine
+from heliograph_studies.quadratic_bias.setting import TABLE_1
 
 SKEWED = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 

@@ -13,11 +13,11 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.examples.live.server import Server
 from heliograph.serving.nats import Nats
 from heliograph.serving.partition import Part, word
 from heliograph.serving.transport import Transport
 from heliograph.serving.url import Address, address
+from heliograph_studies.live.server import Server
 
 
 def running(folder: Path) -> Iterator[Server]:

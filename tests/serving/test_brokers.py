@@ -13,13 +13,13 @@ pytest.importorskip("paho")
 import nats
 import nats.js.errors
 
-from heliograph.examples.live.server import Server
 from heliograph.serving.mqtt import Mqtt
 from heliograph.serving.nats import Nats
 from heliograph.serving.output import Output
 from heliograph.serving.partition import Part, part_of, word
 from heliograph.serving.transport import TakenOverError, Transport
 from heliograph.serving.url import Address, address
+from heliograph_studies.live.server import Server
 from tests.serving.brokers import at, made, numbered, published, received, running, sent, silent
 
 

@@ -13,13 +13,13 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.examples.live.server import Server
 from heliograph.serving.contract import check_transport
 from heliograph.serving.mqtt import Mqtt
 from heliograph.serving.nats import Nats
 from heliograph.serving.output import Output
 from heliograph.serving.transport import Transport
 from heliograph.serving.url import Address
+from heliograph_studies.live.server import Server
 from tests.serving.brokers import at, published, running, sent, silent
 
 

@@ -19,13 +19,13 @@ import nats
 from sqlalchemy import Engine, update
 
 import heliograph
-from heliograph.examples.live.server import Server
 from heliograph.serving import leases
 from heliograph.serving.database import engine_at
 from heliograph.serving.leases import Leases
 from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.partition import word
 from heliograph.serving.service import Service
+from heliograph_studies.live.server import Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 
 ROOT = Path(heliograph.__file__).parents[2]

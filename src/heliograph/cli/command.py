@@ -9,15 +9,14 @@ from cyclopts import CycloptsError
 from heliograph.cli.app import app
 from heliograph.cli.completion import completion
 from heliograph.cli.design import design
-from heliograph.cli.example import demo, example
 from heliograph.cli.explore import explore
 from heliograph.cli.fit import fit
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
-from heliograph.cli.reproduce import reproduce
 from heliograph.cli.run import run
 from heliograph.cli.serve import serve
 from heliograph.cli.stopping import INTERRUPTED, stoppable
+from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
 from heliograph.simulation.compilation_cache import keep_compilations

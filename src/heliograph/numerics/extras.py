@@ -9,6 +9,7 @@ EXTRAS = {  # the extra that brings a package which the core does without
     "pyarrow": "tables",
     "matplotlib": "report",
     "jinja2": "report",
+    "markdown_it": "report",
     "gtsam": "recordings",
     "cvxpy": "lmi",
     "clarabel": "lmi",

@@ -221,11 +221,7 @@
     at("rows").textContent = (rows.length > ROWS ? `The first ${ROWS} of ` : "") + `${rows.length} rows, of ${size} altogether. A header sorts.`;
     at("cells").replaceChildren(...rows.slice(0, ROWS).map(i => {
       const line = make("tr");
-      line.append(...names.map(name => {
-        const cell = make("td", show(columns[name][i]));
-        cell.dataset.header = parted(name);
-        return cell;
-      }));
+      line.append(...names.map(name => make("td", show(columns[name][i]))));
       return line;
     }));
   }

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-PHONE, GAP = 46, 3  # characters that a row has room for in a window of 420 px; those that space between cells takes
 VERDICTS = {"fails": "fails", "holds_vacuously": "true but empty", "holds": "holds"}
 
 
@@ -51,7 +50,7 @@ class Table:
     """Rows of cells under headers; the first column names the row, with a dot in its colour if `colours` are given.
 
     Cells are numbers, set to the right, unless `wordy`: then they are set to the left and broken into lines. On a phone
-    each row becomes a block, unless the table is `narrow`.
+    a table that is too wide is moved sideways under its first column, which stays.
     """
 
     headers: Sequence[str]
@@ -60,24 +59,6 @@ class Table:
     colours: Sequence[str] | None = None
     wordy: bool = False
     kind: str = "table"
-
-    @property
-    def narrow(self) -> bool:
-        """Whether its columns fit beside each other in the window of a phone."""
-        longest = [
-            max(cell, *map(len, header.split()), 0) for cell, header in zip(self._cells, self.headers, strict=True)
-        ]
-        return not self.wordy and sum(longest) + GAP * len(longest) <= PHONE
-
-    @property
-    def room(self) -> int:
-        """Characters that a cell has room for where a row is a block."""
-        return PHONE if self.wordy else max([9, *self._cells[1:]])
-
-    @property
-    def _cells(self) -> list[int]:
-        """Length of the longest cell of each column."""
-        return [max((len(row[i]) for row in self.rows if i < len(row)), default=0) for i in range(len(self.headers))]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,166 @@
+"""`heliograph reproduce`, `heliograph example` and `heliograph demo`: studies, also those of other packages.
+
+A package offers a study as an entry point of the group `heliograph.studies`: its name, and where it is. That is an
+object `publication` for `reproduce`, or an object `example` for `example`.
+"""
+
+import ast
+from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint, entry_points
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any, Protocol
+
+from cyclopts import Parameter
+
+from heliograph.cli.app import folder, number, place
+
+GROUP = "heliograph.studies"
+Changes = Annotated[
+    list[str], Parameter(name="--set", negative="", help="Another number, as name=value; may be given several times.")
+]
+
+
+class Study(Protocol):
+    """What an entry point leads to."""
+
+    def settings(self, values: Mapping[str, str]) -> Any:
+        """The study's own settings with other values, by name."""
+
+    def run(self, setting: Any, out: Path) -> Any:
+        """Compute, and write the results to the study's own folder in `out`."""
+
+
+def demo(
+    *,
+    out: Annotated[Path, place("Folder for the estimates, figures, report and summary; made if missing.")],
+    seed: Annotated[int | None, number("Seed of the simulated relays; 0 unless given.")] = None,
+    recording: Annotated[str | None, Parameter(help="Which drive: plaza1, or plaza2 unless given.")] = None,
+    changes: Changes | None = None,
+) -> None:
+    """Filter a recorded radio-ranging drive whose ranges arrive through simulated relays, and report."""
+    run(["demo"], out, changed(changes, seed=seed, recording=recording), "example")
+
+
+def example(
+    name: Annotated[str | None, Parameter(help="Which example; without it, the list of them.")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, place("Folder for the example's own, with report and summary.")] = None,
+    seed: Annotated[int | None, number("Seed of what is simulated; 0 unless given.")] = None,
+    trace: Annotated[Path | None, place("Log of a radio network, for an example that takes one.")] = None,
+    changes: Changes | None = None,
+) -> None:
+    """Run an example and report, or list them."""
+    if name is None:
+        return print_list("example")
+    run([name], out, changed(changes, seed=seed, trace=trace), "example")
+
+
+def reproduce(
+    method: Annotated[str | None, Parameter(help="Which publication, or all; without it, the list of them.")] = None,
+    /,
+    *,
+    out: Annotated[Path | None, place("Folder for figures, report, record and summary.")] = None,
+    runs: Annotated[int | None, number("Monte Carlo runs; each publication has its own default.")] = None,
+    seed: Annotated[int | None, number("Seed of the simulations; 0 unless given.")] = None,
+    changes: Changes | None = None,
+) -> None:
+    """Run a published method as printed and as improved, and judge each of its statements by this very run."""
+    if method is None:
+        return print_list("publication")
+    from heliograph.numerics.check import fail
+
+    if method == "all" and changes:
+        raise fail("--set", "one publication, whose settings these are", "all")
+    names = list(studies_of("publication")) if method == "all" else [method]
+    run(names, out, changed(changes, runs=runs, seed=seed), "publication", "" if method == "all" else method)
+
+
+def run(
+    names: Sequence[str], out: Path | None, values: Mapping[str, str], kind: str, within: str | None = None
+) -> None:
+    """Run studies of a kind one after another, each into its folder in `out`, which may end in `within` itself.
+
+    Raises:
+        ValueError: an unknown study or setting, a value of the wrong kind, a folder that cannot be written.
+    """
+    from heliograph.numerics.check import fail
+
+    known = studies_of(kind)
+    for name in names:
+        if name not in known:
+            expected = ", ".join(known) + (" or all" if kind == "publication" else "")
+            raise fail("method" if kind == "publication" else kind, f"one of {expected}", repr(name))
+    target = folder("reproduce" if kind == "publication" else kind, out, names[0] if within is None else within)
+    studies = {name: load(known[name]) for name in names}
+    settings = {name: study.settings(values) for name, study in studies.items()}  # all are checked before any work
+    import jax
+
+    for name, study in studies.items():
+        study.run(settings[name], target)
+        # One study's programs are no other's: kept, those of all are gigabytes.
+        jax.clear_caches()  # type: ignore[no-untyped-call]
+
+
+def changed(changes: Sequence[str] | None, **options: object) -> dict[str, str]:
+    """Values by name: those of options that are given, and of each `name=value`.
+
+    Raises:
+        ValueError: a change without a name or `=`, a seed or count that is none, a name given twice.
+    """
+    from heliograph.numerics.check import check_count, check_seed, fail
+
+    values = {}
+    for name, value in options.items():
+        if value is not None:
+            values[name] = str(value)
+            if name in ("seed", "runs"):
+                (check_seed if name == "seed" else check_count)(f"--{name}", value)
+    for text in changes or ():
+        name, equals, value = text.partition("=")
+        if not name or not equals:
+            raise fail("--set", "name=value, such as seed=1", repr(text))
+        if name in values:
+            raise fail("--set", f"{name} once", "twice")
+        values[name] = value
+    return values
+
+
+def studies_of(kind: str) -> dict[str, EntryPoint]:
+    """The studies of a kind, "publication" or "example", that installed packages offer; none of them is imported.
+
+    Raises:
+        ValueError: two packages that offer a study of one name.
+    """
+    offered: dict[str, EntryPoint] = {}
+    for entry in sorted(entry_points(group=GROUP), key=lambda entry: entry.name):
+        other = offered.setdefault(entry.name, entry).value
+        if entry.value != other:
+            from heliograph.numerics.check import fail
+
+            raise fail(f"study {entry.name}", "one package that offers it", f"{other}, {entry.value}")
+    return {name: entry for name, entry in offered.items() if entry.attr == kind}
+
+
+def load(entry: EntryPoint) -> Study:
+    """The study that an entry point leads to."""
+    study: Study = entry.load()
+    return study
+
+
+def print_list(kind: str) -> None:
+    """Print the studies of a kind, with the first line of what each says of itself."""
+    known = studies_of(kind)
+    width = max(map(len, known), default=0)
+    for name, entry in known.items():
+        print(f"{name:{width}}  {first_line(entry.module)}")
+
+
+def first_line(module: str) -> str:
+    """The first line of a module's text; the module is not run."""
+    spec = find_spec(module)
+    if spec is None or spec.origin is None:
+        return ""
+    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0]

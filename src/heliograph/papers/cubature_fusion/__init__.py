@@ -1,1 +1,0 @@
-"""Cubature Kalman fusion filtering under amplify-and-forward relays, reproduced and repaired; see README.md."""

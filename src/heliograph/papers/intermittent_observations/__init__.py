@@ -1,1 +1,0 @@
-"""Kalman filtering with intermittent observations and its successors, reproduced and judged; see README.md."""

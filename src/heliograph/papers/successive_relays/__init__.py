@@ -1,1 +1,0 @@
-"""Recursive filtering with filter-and-forward successive relays, reproduced and repaired; see README.md."""

@@ -1,0 +1,231 @@
+"""The Monte Carlo runs behind every number of the reproduction."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import heliograph as hg
+from heliograph.filters.update import AbstractUpdate
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
+
+if TYPE_CHECKING:
+    import xarray
+from heliograph_studies.cubature_fusion.setting import (
+    NODES,
+    STATES,
+    Scenario,
+    Setting,
+    channel,
+    cubature,
+    filters,
+    plant,
+    sensor,
+)
+from heliograph_studies.cubature_fusion.variants import variants
+
+Statistics = dict[str, dict[str, hg.simulation.ErrorStatistics]]
+
+
+@dataclass(frozen=True)
+class Runs:
+    """One scenario: error statistics by node ("fused" last) and filter, and one run in full."""
+
+    scenario: Scenario
+    statistics: Statistics
+    shown: hg.Record
+
+    @property
+    def steps(self) -> int:
+        """Number of steps."""
+        return len(self.shown.time)
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return next(iter(self.statistics[NODES[0]].values())).runs
+
+    def pooled(self, name: str) -> hg.simulation.ErrorStatistics:
+        """A filter's statistics over all nodes, steps of node 1 first; a fused one's as they are."""
+        if name in self.statistics["fused"]:
+            return self.statistics["fused"][name]
+        return hg.simulation.pool([self.statistics[node][name] for node in NODES])
+
+    def rmse(self, name: str) -> np.ndarray:
+        """Root mean squared error over time, (node, time)."""
+        return np.array([self.statistics[node][name].rmse_over_time() for node in NODES])
+
+    def claimed_trace(self, name: str) -> np.ndarray:
+        """Mean claimed trace over time, (node, time)."""
+        claimed = np.array([self.statistics[node][name].claimed() for node in NODES])
+        return np.asarray(np.trace(claimed, axis1=-2, axis2=-1))
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Numbers by scenario and filter, of the nodes together; early: the first steps of the strong scenario."""
+
+    rmse_is: str
+    scenarios: dict[str, dict[str, Any]]
+    strong_first_steps: dict[str, Any]
+    seed: int
+    runs: int
+    printed: Unlisted[Runs]
+    strong: Unlisted[Runs]
+    early: Unlisted[Runs]
+
+    @property
+    def both(self) -> tuple[Runs, Runs]:
+        """Both scenarios, in order."""
+        return self.printed, self.strong
+
+
+def network(s: Scenario) -> hg.Network:
+    """Four nodes with all filters, and what is made of them together."""
+    optimal = hg.CovarianceIntersection()
+    fused: dict[str, hg.Fusion | hg.filters.AbstractFilter] = {
+        "ci_printed": hg.Fusion("cubature_printed_fixed", optimal),
+        "ci_open_loop": hg.Fusion("open_loop", optimal),
+        "central_polytope": central(s, hg.filters.Polytope()),
+    }
+    return _assemble(s, [filters(s, i) for i in range(len(NODES))], {**zero_mean_fusion(s), **fused})
+
+
+def early_network(s: Scenario) -> hg.Network:
+    """The zero-mean filter alone, and what is made of it."""
+    return _assemble(s, _only(s, "cubature_zero_mean"), zero_mean_fusion(s))
+
+
+def shown_network(s: Scenario) -> hg.Network:
+    """The paper's filter and its fusion."""
+    fused = {"ci_printed": hg.Fusion("cubature_printed_fixed", hg.CovarianceIntersection())}
+    return _assemble(s, _only(s, "cubature_printed_fixed"), fused)
+
+
+def literal_network(s: Scenario) -> hg.Network:
+    """The same nodes, which hear the same, with the literal readings of Algorithm 1."""
+    return _assemble(s, [variants(s, i) for i in range(len(NODES))], {})
+
+
+def zero_mean_fusion(s: Scenario) -> dict[str, hg.Fusion | hg.filters.AbstractFilter]:
+    """What is made of the zero-mean filter's estimates, and the central filter with its update."""
+    return {
+        "ci_optimal": hg.Fusion("cubature_zero_mean", hg.CovarianceIntersection()),
+        "ci_equal": hg.Fusion("cubature_zero_mean", hg.fusion.EqualIntersection()),
+        "central": central(s, hg.filters.ZeroMean()),
+    }
+
+
+def central(s: Scenario, update: AbstractUpdate) -> hg.filters.AbstractFilter:
+    """All nodes' measurements in turn, each used as that node's filter would."""
+    return hg.filters.sequential_filter([cubature(s, i, update) for i in range(len(NODES))])
+
+
+def _only(s: Scenario, name: str) -> list[dict[str, hg.filters.AbstractFilter]]:
+    return [{name: filters(s, i)[name]} for i in range(len(NODES))]
+
+
+def _assemble(
+    s: Scenario,
+    parts: list[dict[str, hg.filters.AbstractFilter]],
+    fused: Mapping[str, hg.Fusion | hg.filters.AbstractFilter],
+) -> hg.Network:
+    nodes = {name: hg.Node(sensor(s, i), channel(s), parts[i]) for i, name in enumerate(NODES)}
+    return hg.Network(plant(s), nodes, fused)
+
+
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Run everything, all networks of a scenario on the same data."""
+
+    def runs(s: Scenario, networks: dict[str, hg.Network], horizon: int, count: int) -> Runs:
+        statistics: Statistics = {}
+        for what, network in networks.items():
+            work = partial(simulate, network, horizon, count, setting.seed, stages)
+            for node, by_name in stages(f"{s.name}: {what}", work).items():
+                statistics.setdefault(node, {}).update(by_name)
+        return Runs(s, statistics, hg.monte_carlo(shown_network(s), horizon, 1, setting.seed))
+
+    printed, strong = (
+        runs(s, {"filters": network(s), "literal readings": literal_network(s)}, s.horizon, setting.runs)
+        for s in (setting.printed, setting.strong)
+    )
+    first = {"first steps": early_network(setting.strong)}
+    early = runs(setting.strong, first, setting.early, setting.early_factor * setting.runs)
+    return outcome(setting, printed, strong, early)
+
+
+def simulate(network: hg.Network, horizon: int, runs: int, seed: int, stages: Stages) -> Statistics:
+    """Error statistics of a network by node and filter."""
+    sums = hg.monte_carlo(network, horizon, runs, seed, hg.Statistics(), progress=stages.progress)
+    return {node: dict(by_name) for node, by_name in sums.items()}
+
+
+def outcome(setting: Setting, printed: Runs, strong: Runs, early: Runs) -> Outcome:
+    """The numbers of what was run."""
+    return Outcome(
+        rmse_is="root of the mean over runs, nodes and steps 1..T of the squared error summed over the state",
+        scenarios={o.scenario.name: numbers(o) for o in (printed, strong)},
+        strong_first_steps={"runs": early.runs, "steps": early.steps, **numbers(early)},
+        seed=setting.seed, runs=setting.runs, printed=printed, strong=strong, early=early,
+    )  # fmt: skip
+
+
+def numbers(o: Runs) -> dict[str, Any]:
+    """Of every filter and of every fused estimate: RMSE, claimed trace, and where the claim is exceeded most."""
+
+    def of(name: str) -> dict[str, Any]:
+        pooled = o.pooled(name)
+        worst = pooled.worst_direction()
+        node = "fused" if name in o.statistics["fused"] else NODES[worst.step // o.steps]
+        direction = {"ratio": worst.ratio, "standard_error": worst.standard_error, "z": worst.z,
+                     "step": worst.step % o.steps + 1, "node": node}  # fmt: skip
+        rmse, error = pooled.rmse()
+        return {"rmse": rmse, "rmse_se": error, "mean_trace": pooled.mean_trace(), "worst_direction": direction}
+
+    kinds = {"filters": NODES[0], "fused": "fused"}
+    return {kind: {name: of(name) for name in o.statistics[node]} for kind, node in kinds.items()}
+
+
+def write_record(result: Outcome, folder: Path) -> None:
+    """RMSE, claimed trace and ratio of both scenarios over time as NetCDF; NaN after a scenario's last step."""
+    import xarray
+
+    length = max(o.steps for o in result.both)
+    parts = [_scenario_record(o, length) for o in result.both]
+    about = {"seed": result.seed, "runs": result.runs, "largest_ratio": "searched at each step, so biased upwards"}
+    joined = xarray.concat(parts, "scenario")
+    joined = joined.assign_coords(scenario=[o.scenario.name for o in result.both])
+    joined.assign_attrs(about).to_netcdf(folder / "record.nc", engine="h5netcdf")
+
+
+def _scenario_record(o: Runs, length: int) -> "xarray.Dataset":
+    import xarray
+
+    local = {name: [o.statistics[node][name] for node in NODES] for name in o.statistics[NODES[0]]}
+    fused = {name: [item] for name, item in o.statistics["fused"].items()}
+    data = {}
+    for prefix, items, axes in (("", local, ("filter", "node")), ("fused_", fused, ("fused",))):
+        for name, values in _over_time([s for group in items.values() for s in group]).items():
+            shaped = values.reshape(len(items), *([len(NODES)] if not prefix else []), *values.shape[1:])
+            data[prefix + name] = ((*axes, "time", *(("state",) if values.ndim == 3 else ())), shaped)
+    coordinates = {"filter": list(local), "node": list(NODES), "fused": list(fused), "state": list(STATES),
+                   "time": o.shown.time.astype(int)}  # fmt: skip
+    return xarray.Dataset(data, coordinates).reindex(time=np.arange(1, length + 1))
+
+
+def _over_time(statistics: list[hg.simulation.ErrorStatistics]) -> dict[str, np.ndarray]:
+    """Quantities by name, (item, time) or (item, time, state)."""
+    actual = np.array([s.actual() for s in statistics])
+    claimed = np.array([s.claimed() for s in statistics])
+    factor = np.linalg.inv(np.linalg.cholesky(claimed))
+    return {
+        "rmse": np.sqrt(np.trace(actual, axis1=-2, axis2=-1)),
+        "claimed_trace": np.trace(claimed, axis1=-2, axis2=-1),
+        "largest_ratio": np.linalg.eigvalsh(factor @ actual @ np.swapaxes(factor, -1, -2))[..., -1],
+        "mean_squared_error": np.diagonal(actual, axis1=-2, axis2=-1),
+        "claimed_variance": np.diagonal(claimed, axis1=-2, axis2=-1),
+    }

@@ -1,0 +1,157 @@
+"""Figs 1 to 12 and the strong scenario, as curves over time, and what the page says beside the numbers."""
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.report.curves import Panel, curves_over_time
+from heliograph.report.figures import (
+    AMBER,
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    PURPLE,
+    STYLE,
+    VERMILION,
+    WIDTH,
+    Curve,
+    label_right,
+)
+from heliograph_studies.cubature_fusion.compute import Outcome, Runs
+from heliograph_studies.cubature_fusion.setting import FIXED_ZERO_MEAN_SCALAR, NODES, STATES
+from heliograph_studies.cubature_fusion.statements import BETTER, METHOD, TWIN
+
+COLOURS = {
+    "open_loop": MUTED, "mean_gain": AMBER, "cubature_printed_fixed": VERMILION, "cubature_printed": PURPLE,
+    "cubature_tight": INK, "cubature_polytope": BLUE, "cubature_zero_mean": GREEN, "ci_equal": BLUE,
+    "ci_optimal": PURPLE, "central": INK,
+}  # fmt: skip
+LABELS = {"cubature_printed_fixed": "printed, fixed β", "ci_equal": "equal weights", "ci_optimal": "optimal weights"}
+NAMES = {
+    "open_loop": "no measurements", "ci_optimal": "fused, optimal weights", "ci_equal": "fused, equal weights",
+    "ci_printed": "fused, the paper's filters", "ci_open_loop": "fused, no measurements",
+}  # fmt: skip
+LITERAL = ("step_four_gain", "mixed_cross", "central_moment", "raw_moment")
+NODE_COLOURS = (BLUE, AMBER, GREEN, PURPLE)
+
+
+def figures(result: Outcome) -> dict[str, Figure]:
+    """All figures by file name."""
+    printed, drawn = result.printed, {}
+    for i, state in enumerate(STATES):
+        drawn[f"fig{i + 1:02d}_{state}"] = _states(printed, i)
+    drawn["fig06_trace"] = _traces(printed)
+    drawn["fig07_rmse_and_bound"] = _below_bound(printed)
+    for i, node in enumerate(NODES):
+        drawn[f"fig{i + 8:02d}_node{node}"] = _against_extended(printed, i)
+    drawn["fig12_fusion"] = _fusion(printed)
+    drawn["strong_filters"] = _strong_filters(result.strong)
+    drawn["strong_fusion"] = _strong_fusion(result.strong)
+    return drawn
+
+
+def label(name: str) -> str:
+    """A filter's name for reading."""
+    return LABELS.get(name, name.removeprefix("cubature_").replace("_", " "))
+
+
+def _states(o: Runs, i: int) -> Figure:
+    assert o.shown.truth is not None
+    truth = o.shown.truth[0, :, i]
+    local = [np.asarray(o.shown.estimates[n][METHOD].mean)[0, :, i] for n in NODES]
+    fused = np.asarray(o.shown.estimates["fused"]["ci_printed"].mean)[0, :, i]
+    estimates = [*(Curve("nodes", MUTED, v) for v in local), Curve("fused", VERMILION, fused)]
+    errors = [Curve(c.name, c.colour, c.values - truth) for c in estimates]
+    panels = [Panel(STATES[i], [*estimates, Curve("true", INK, truth)]), Panel("error", errors)]
+    return curves_over_time(o.shown.time, panels)
+
+
+def _trace(o: Runs, name: str) -> np.ndarray:
+    return np.asarray(np.trace(o.pooled(name).claimed(), axis1=-2, axis2=-1))
+
+
+def _traces(o: Runs) -> Figure:
+    local, fused = o.claimed_trace(METHOD), _trace(o, "ci_printed")
+    nodes = [Curve("nodes", MUTED, v) for v in local]
+    gain = Curve("fused", VERMILION, 100 * (1 - fused / local.min(axis=0)))
+    traces = Panel("trace of the bound", [*nodes, Curve("fused", VERMILION, fused)])
+    return curves_over_time(o.shown.time, [traces, Panel("below best node (%)", [gain])])
+
+
+def _below_bound(o: Runs) -> Figure:
+    bound = Curve("√trace, fused", BLUE, np.sqrt(_trace(o, "ci_printed")))
+    error = Curve("RMSE, fused", VERMILION, o.pooled("ci_printed").rmse_over_time())
+    local = [Curve("√trace, nodes", MUTED, np.sqrt(v)) for v in o.claimed_trace(METHOD)]
+    errors = [Curve("RMSE, nodes", AMBER, v) for v in o.rmse(METHOD)]
+    return curves_over_time(o.shown.time, [Panel("root of squared error", [*local, *errors, bound, error])])
+
+
+def _against_extended(o: Runs, i: int) -> Figure:
+    pairs = ((TWIN, "extended", BLUE), (METHOD, "cubature", VERMILION))
+    curves = [Curve(text, colour, o.rmse(name)[i]) for name, text, colour in pairs]
+    return curves_over_time(o.shown.time, [Panel(f"RMSE, node {NODES[i]}", curves)])
+
+
+def _fusion(o: Runs) -> Figure:
+    panels = []
+    for name, fused, text in ((METHOD, "ci_printed", "RMSE"), ("open_loop", "ci_open_loop", "RMSE, no measurements")):
+        curves = [Curve(f"node {n}", c, v) for n, c, v in zip(NODES, NODE_COLOURS, o.rmse(name), strict=True)]
+        panels.append(Panel(text, [*curves, Curve("fused", VERMILION, o.pooled(fused).rmse_over_time())]))
+    return curves_over_time(o.shown.time, panels)
+
+
+def _over_nodes(o: Runs, name: str) -> np.ndarray:
+    """Root of the mean squared error over the nodes, (time,)."""
+    return np.asarray(np.sqrt(np.mean(o.rmse(name) ** 2, axis=0)))
+
+
+def _strong_filters(o: Runs) -> Figure:
+    names = ("mean_gain", "open_loop", "cubature_printed_fixed", "cubature_printed", "cubature_tight",
+             "cubature_polytope", "cubature_zero_mean")  # fmt: skip
+    curves = [Curve(label(n), COLOURS[n], _over_nodes(o, n)) for n in names]
+    return _from_zero(o, "RMSE over the nodes", curves)
+
+
+def _strong_fusion(o: Runs) -> Figure:
+    single = Curve("one node", GREEN, _over_nodes(o, "cubature_zero_mean"))
+    curves = [Curve(label(n), COLOURS[n], o.pooled(n).rmse_over_time()) for n in ("ci_optimal", "ci_equal", "central")]
+    return _from_zero(o, "RMSE", [single, *curves])
+
+
+@matplotlib.rc_context(STYLE)
+def _from_zero(o: Runs, text: str, curves: list[Curve]) -> Figure:
+    """Curves on an axis that starts at zero, so that what is low has room for its name."""
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    axes = figure.subplots()
+    for curve in curves:
+        axes.plot(o.shown.time, curve.values, color=curve.colour, linewidth=1.4)
+    axes.set(xlim=(o.shown.time[0], o.shown.time[-1]), ylim=(0.0, None), xlabel="step", ylabel=text)
+    label_right(axes, {c.name: (float(c.values[-1]), c.colour) for c in curves}, 0.055)
+    return figure
+
+
+def words(result: Outcome) -> dict[str, object]:
+    """Labels and colours, and the numbers of the tables: of a filter RMSE, its error, trace, and worst direction."""
+    strong = result.strong
+    return {
+        "label": label,
+        "named": {name: NAMES.get(name, name.replace("_", " ")) for o in result.both for name in _names(o)},
+        "colours": COLOURS,
+        "rmse": {name: strong.pooled(name).rmse() for name in (*BETTER, METHOD, "mean_gain")},
+        "method": METHOD,
+        "better": BETTER,
+        "tables": {"strong scenario": _table(strong), "printed example": _table(result.printed)},
+        "nodes": NODES,
+        "states": STATES,
+        "zero_mean_scalar": FIXED_ZERO_MEAN_SCALAR,
+    }
+
+
+def _names(o: Runs) -> list[str]:
+    return [*(n for n in o.statistics[NODES[0]] if n not in LITERAL), *o.statistics["fused"]]
+
+
+def _table(o: Runs) -> dict[str, object]:
+    rows = {name: (*s.rmse(), s.mean_trace(), s.worst_direction()) for name, s in ((n, o.pooled(n)) for n in _names(o))}
+    return {"runs": o.runs, "steps": o.steps, "rows": rows}

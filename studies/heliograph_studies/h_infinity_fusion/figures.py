@@ -1,0 +1,203 @@
+"""The figures of the reproduction: the paper's Figs 2 to 11 and ours; and what its page says beside the numbers."""
+
+from collections.abc import Sequence
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from heliograph.report.curves import Panel, curves_over_time
+from heliograph.report.figures import (
+    AMBER,
+    BLUE,
+    GREEN,
+    INK,
+    MUTED,
+    PALE,
+    PURPLE,
+    STYLE,
+    VERMILION,
+    WIDTH,
+    Curve,
+)
+from heliograph_studies.h_infinity_fusion import structured
+from heliograph_studies.h_infinity_fusion.compute import Outcome
+from heliograph_studies.h_infinity_fusion.discriminating import NODE
+from heliograph_studies.h_infinity_fusion.example import (
+    MORE_QUANTIZERS,
+    QUANTIZERS,
+    RECURSIVE,
+    Runs,
+    arrivals,
+    fused_name,
+)
+from heliograph_studies.h_infinity_fusion.parts import Parts
+from heliograph_studies.h_infinity_fusion.setting import NODES, STATES
+
+NODE_COLOURS = (BLUE, VERMILION, GREEN, PURPLE)
+LINKS = ("sensor to relay", "relay to filter", "sensor to filter")
+COLOURS = {
+    "horizon": BLUE, "recursive": GREEN, "ekf_statistics": VERMILION, "ekf_ignoring": AMBER, "ekf_told": PURPLE,
+    "zero_gain": MUTED, "open_loop": MUTED,
+}  # fmt: skip
+LABELS = {
+    RECURSIVE: "the paper's, recursive", "horizon": "H∞, horizon", "recursive": "H∞, recursive",
+    "ekf_statistics": "EKF, statistics", "ekf_ignoring": "EKF, ignoring", "ekf_told": "EKF, told",
+    "zero_gain": "zero gain", "open_loop": "open loop",
+}  # fmt: skip
+
+
+def figures(found: Outcome) -> dict[str, Figure]:
+    """All figures by file name."""
+    result, outcome = found.parts, found.parts.runs
+    drawn = {f"fig{2 + i:02d}_node{node}": _node(outcome, i) for i, node in enumerate(NODES)}
+    drawn["fig06_fusion"] = _fusion(outcome)
+    seen = arrivals(outcome)[0]
+    for i in range(3):
+        drawn[f"fig{7 + i:02d}_losses"] = _losses(seen[..., i], LINKS[i])
+    drawn["fig10_dynamic"] = _fused_error(outcome, "dynamic", VERMILION)
+    drawn["fig11_static"] = _fused_error(outcome, "static", BLUE)
+    drawn["levels"] = _levels(result)
+    drawn["growth"] = _growth(result)
+    drawn["quantizer"] = _quantizer(result)
+    drawn["second_errors"] = _second_errors(result)
+    drawn["second_levels"] = _second_levels(result)
+    return drawn
+
+
+def _over_steps(panels: list[Panel]) -> Figure:
+    return curves_over_time(np.arange(len(panels[0].curves[0].values)), panels, "s")
+
+
+def _node(outcome: Runs, i: int) -> Figure:
+    estimate = outcome.estimates(RECURSIVE)[0, i]
+    return _against_truth(outcome, estimate, f"node {NODES[i]}", NODE_COLOURS[i])
+
+
+def _fusion(outcome: Runs) -> Figure:
+    fused = np.asarray(outcome.record.estimates["fused"][fused_name(RECURSIVE, "dynamic")].mean)[0]
+    return _against_truth(outcome, fused, "fused", AMBER)
+
+
+def _against_truth(outcome: Runs, estimate: np.ndarray, name: str, colour: str) -> Figure:
+    panels = [
+        Panel(state, [Curve("true", INK, outcome.truth[:, j]), Curve(name, colour, estimate[:, j])])
+        for j, state in enumerate(STATES)
+    ]
+    return _over_steps(panels)
+
+
+@matplotlib.rc_context(STYLE)
+def _losses(seen: np.ndarray, title: str) -> Figure:
+    """One row for each node: a full mark for what arrived, an empty one for a loss, none where nobody can tell."""
+    figure = Figure(figsize=(WIDTH, 2.0), layout="constrained")
+    axes = figure.subplots()
+    for i, row in enumerate(seen):
+        axes.plot(np.flatnonzero(row == 1), np.full(np.sum(row == 1), i), "o", color=NODE_COLOURS[i])
+        axes.plot(np.flatnonzero(row == 0), np.full(np.sum(row == 0), i), "o", color=NODE_COLOURS[i], mfc="white")
+    axes.set(yticks=range(4), yticklabels=[f"node {n}" for n in NODES], ylim=(3.5, -0.5), xlabel="s")
+    axes.set_title(f"{title}: arrived (full), lost (empty)")
+    axes.grid(False)
+    return figure
+
+
+def _fused_error(outcome: Runs, quantizer: str, colour: str) -> Figure:
+    errors = outcome.errors(RECURSIVE, quantizer)
+    curves = [Curve("one run", MUTED, errors[0]), Curve("mean", colour, errors.mean(axis=0))]
+    return _over_steps([Panel(f"norm of fused error, {quantizer}", curves)])
+
+
+@matplotlib.rc_context(STYLE)
+def _levels(result: Parts) -> Figure:
+    figure = Figure(figsize=(WIDTH, 3.6), layout="constrained")
+    axes, true = figure.subplots(), result.true_growth
+    fixed = result.readings.fixed_start
+    rows: list[tuple[str, Sequence[float], str, str]] = [
+        ("the paper's", result.setting.levels, VERMILION, "o"),
+        ("smallest with its P₀", (fixed,) * 4, AMBER, "s"),
+        ("one growth constant that is not refuted", true.one[:, 0].tolist(), PURPLE, "D"),
+        ("recursive, a = 0.7", [n.smallest["trace"] for n in result.nodes], GREEN, "^"),
+        ("horizon, a = 0.7", [n.horizon.level for n in result.nodes], BLUE, "v"),
+        ("K = 0, a = 0.7", [n.without_measurements for n in result.nodes], INK, "_"),
+    ]
+    for name, values, colour, mark in rows:
+        axes.plot(range(1, 5), values, mark, color=colour, label=name, markersize=8)
+    axes.set(yscale="log", ylabel="level γ", xlabel="node", xticks=range(1, 5), xlim=(0.7, 4.3))
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
+    return figure
+
+
+def _growth(result: Parts) -> Figure:
+    found = result.growth
+    curves = [
+        Curve("largest slope nearby", VERMILION, found.slopes),
+        Curve("largest ratio that happened", BLUE, found.secant),
+        Curve("a, as printed", INK, np.full(len(found.secant), result.setting.growth)),
+    ]
+    return _over_steps([Panel("growth of f", curves)])
+
+
+def _quantizer(result: Parts) -> Figure:
+    d = result.replayed.amplitude.mean(axis=(0, 1))
+    x = np.abs(result.runs.estimates(RECURSIVE)).mean(axis=(0, 1))
+    uplink = result.runs.record.uplinks[fused_name(RECURSIVE, "dynamic")]
+    share = 100 * uplink.saturated.mean(axis=(0, 2))
+    states = list(zip(STATES, (BLUE, VERMILION), (0, 1), strict=True))
+    panels = [
+        Panel("log₁₀ of size",
+              [Curve(f"d, {s}", colour, np.log10(d[:, j])) for s, colour, j in states]
+              + [Curve(f"|{s}|", PALE if j else MUTED, np.log10(x[:, j])) for s, colour, j in states]),
+        Panel("saturated (%)", [Curve(s, colour, share[:, j]) for s, colour, j in states]),
+    ]  # fmt: skip
+    return _over_steps(panels)
+
+
+def _second_errors(result: Parts) -> Figure:
+    names, second = ("horizon", "recursive", "ekf_statistics", "ekf_told", "open_loop"), result.discriminating
+    panels = [
+        Panel(f"error, {scenario}", [Curve(LABELS[n], COLOURS[n], second.over_time[scenario][n]) for n in names])
+        for scenario in structured.SCENARIOS
+    ]
+    return curves_over_time(np.arange(structured.STEPS), panels, "step")
+
+
+@matplotlib.rc_context(STYLE)
+def _second_levels(result: Parts) -> Figure:
+    second = result.discriminating
+    names = list(second.worst)
+    figure = Figure(figsize=(WIDTH, 3.0), layout="constrained")
+    axes = figure.subplots()
+    for i, name in enumerate(names):
+        axes.plot(second.worst[name].level, i, "o", color=COLOURS[name], markersize=8)
+        if name in second.designs:
+            axes.plot(second.designs[name][NODE].level, i, "|", color=COLOURS[name], markersize=16, mew=2)
+    axes.set(yticks=range(len(names)), yticklabels=[LABELS[n] for n in names], ylim=(len(names) - 0.5, -0.5))
+    axes.set(xscale="log", xlabel="level: found by search (dot), guaranteed (bar)")
+    ticks = (5, 7, 10, 15, 20, 30)
+    axes.set_xticks(ticks, labels=[str(t) for t in ticks])
+    axes.set_xticks([], minor=True)
+    return figure
+
+
+def words(outcome: Outcome) -> dict[str, object]:
+    """Labels and colours, and the rows of the tables."""
+    result, second = outcome.parts, outcome.parts.discriminating
+    names = ("horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told")
+    behind = {q: result.runs.mean_error(RECURSIVE, q) for q in (*QUANTIZERS, *MORE_QUANTIZERS)}
+    runs = {name: result.runs for name in result.runs.filters} | {"ekf_told": result.told}
+    return {
+        "p": result,
+        "second": second,
+        "node": NODE,
+        "nodes": NODES,
+        "links": LINKS,
+        "scenarios": structured.SCENARIOS,
+        "colours": COLOURS,
+        "labels": LABELS,
+        "key_colours": (BLUE, VERMILION, GREEN),
+        "behind": behind,
+        "errors": {LABELS[name]: [r.mean_error(name, q) for q in QUANTIZERS] for name, r in runs.items()},
+        "recursive": LABELS[RECURSIVE],
+        "second_names": names,
+        "power": float(np.mean(result.setting.disturbances**2)),
+    }

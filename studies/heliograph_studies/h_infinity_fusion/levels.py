@@ -1,0 +1,144 @@
+"""The designs of each node, what they certify, and the smallest levels under several readings."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+import heliograph as hg
+from heliograph.h_infinity.solver import Objective
+from heliograph.numerics.check import fail
+from heliograph_studies.h_infinity_fusion.setting import NODES, Constant, Setting
+
+OBJECTIVES: tuple[Objective, ...] = ("trace", "log_determinant", "largest_eigenvalue")
+LARGER_GROWTH = 1.1
+
+
+@dataclass(frozen=True)
+class NodeDesigns:
+    """One node: the recursive design at the paper's level with its certificate, and what else can be had.
+
+    failed: the step at which each objective finds no gain at the paper's level (None: it finds all). smallest: the
+    smallest level of the recursion by objective, with P_0 free.
+    """
+
+    paper: hg.h_infinity.HInfinityDesign
+    certificate: hg.h_infinity.HInfinityCertificate
+    failed: dict[Objective, int | None]
+    smallest: dict[Objective, float]
+    horizon: hg.h_infinity.HInfinityDesign
+    horizon_certificate: hg.h_infinity.HInfinityCertificate
+    separate: hg.h_infinity.HInfinityDesign
+    zero_gain: hg.h_infinity.HInfinityDesign
+    without_measurements: float
+
+
+@dataclass(frozen=True)
+class Readings:
+    """Smallest levels over the horizon of readings of the example, common to all nodes or of node 1.
+
+    fixed_start: with P_0 = 10 I. larger_growth: with a = 1.1, (node, 2) for one and separate multipliers. lossless: of
+    node 1 with every arrival certain. without_feedthrough: of node 1 with D = 0, best gains and K = 0.
+    """
+
+    fixed_start: float
+    larger_growth: np.ndarray
+    lossless: float
+    without_feedthrough: tuple[float, float]
+
+
+def node_designs(setting: Setting, node: int) -> NodeDesigns:
+    """All of one node."""
+    system, level = setting.system(node), setting.levels[node]
+    start = setting.initial * np.eye(4)
+    tried = {o: hg.h_infinity.recursive_design(system, level, start, o, search=False) for o in (*OBJECTIVES, "none")}
+    paper, horizon = tried["trace"], hg.h_infinity.horizon_design(system)
+    if not paper.feasible:
+        raise fail(f"design of node {node + 1}", "one that is feasible at the paper's level", paper.status)
+    return NodeDesigns(
+        paper,
+        certify(system, paper),
+        {o: design.failed_step for o, design in tried.items()},
+        {o: hg.h_infinity.smallest_recursive_level(system, o).level for o in OBJECTIVES},
+        horizon,
+        certify(system, horizon),
+        hg.h_infinity.horizon_design(system, separate=True),
+        without_gain(system),
+        hg.h_infinity.level_without_measurements(system),
+    )
+
+
+def certify(
+    system: hg.h_infinity.GrowthSystem,
+    design: hg.h_infinity.HInfinityDesign,
+    growth: Sequence[hg.h_infinity.GrowthFinding] = (),
+) -> hg.h_infinity.HInfinityCertificate:
+    """Check a design by Theorem 1."""
+    return hg.h_infinity.certify_level(system, design.gains, design.weights, design.multipliers, design.level, growth)
+
+
+def without_gain(system: hg.h_infinity.GrowthSystem, separate: bool = False) -> hg.h_infinity.HInfinityDesign:
+    """The smallest level that can be proven for K = 0."""
+    nothing = np.zeros((system.steps, system.states, system.received))
+    return hg.h_infinity.horizon_design(system, separate, gains=nothing)
+
+
+def readings(setting: Setting) -> Readings:
+    """Levels of the example read in other ways."""
+    larger = [
+        [hg.h_infinity.horizon_design(setting.system(i, LARGER_GROWTH), s).level for s in (False, True)]
+        for i in range(len(NODES))
+    ]
+    first = setting.system(0)
+    plain = first._replace(feedthrough=np.zeros_like(first.feedthrough))
+    return Readings(
+        hg.h_infinity.horizon_design(first, initial=setting.initial * np.eye(4)).level,
+        np.array(larger),
+        hg.h_infinity.horizon_design(setting.system(0, hop=setting.lossless)).level,
+        (hg.h_infinity.horizon_design(plain).level, without_gain(plain).level),
+    )
+
+
+@dataclass(frozen=True)
+class TrueGrowth:
+    """Levels (node, 2), for one and separate multipliers, with growth constants that the search did not refute.
+
+    one: the largest slope for f and f~; differences: 0.7 for f and the largest slope for f~; each_step: 0.7 for f and
+    each step's slope for f~. certified: whether every one of them is.
+    """
+
+    one: np.ndarray
+    differences: np.ndarray
+    each_step: np.ndarray
+    certified: bool
+
+
+def true_growth(setting: Setting, findings: list[hg.h_infinity.GrowthFinding]) -> TrueGrowth:
+    """Design with the slopes found in the boxes of the steps, and certify with the findings."""
+    allowed = [f._replace(constant=f.slope * (1 + 1e-6)) for f in findings]  # rounding of the largest ratio
+    slopes = np.array([f.constant for f in allowed])
+    largest = float(slopes.max())
+    nominal = np.full(len(slopes), setting.growth)
+    given: list[Constant | tuple[Constant, Constant]]
+    given = [largest, (setting.growth, largest), (hg.model.OverTime(nominal), hg.model.OverTime(slopes))]
+    levels, certified = np.zeros((3, len(NODES), 2)), True
+    for i, growth in enumerate(given):
+        for node in range(len(NODES)):
+            system = setting.system(node, growth)
+            for separate in (False, True):
+                design = hg.h_infinity.horizon_design(system, separate)
+                certified &= certify(system, design, allowed).certified
+                levels[i, node, int(separate)] = design.level
+    return TrueGrowth(levels[0], levels[1], levels[2], certified)
+
+
+def published_fused_level(levels: Sequence[float], weights: Sequence[float] | np.ndarray) -> float:
+    """sqrt(2 N sum c_i^2 gamma_i^2) for N filters; it exceeds every local level where those are alike.
+
+    `hg.fusion.level_weights` are its minimum on the simplex. A strict matrix inequality has that minimum as its infimum
+    only, so solvers approach it without reaching it.
+
+    Source: H-infinity quantized fusion over amplify-and-forward relays, equation (33).
+    """
+    c, gamma = np.asarray(weights), np.asarray(levels)
+    return float(np.sqrt(2 * len(gamma) * np.sum((c * gamma) ** 2)))

@@ -1,0 +1,53 @@
+"""The mower of the demonstration as a network to serve, and its drive as messages that come late or not at all."""
+
+import json
+from dataclasses import dataclass
+
+import numpy as np
+
+import heliograph as hg
+from heliograph.live.event import Event
+from heliograph_studies.demo.recording import PlazaRecording, read_recording
+from heliograph_studies.late_data import plaza
+from heliograph_studies.late_data.replay import arrival_of
+from heliograph_studies.late_data.synthetic import synthetic_packets
+
+PLANT = "mower"
+SERVED = f"{__name__}:network"
+RADIO = 3600.0  # seconds of a radio network's traffic, whose packets' fates the ranges have
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Messages in the order of their arrival, one line of JSON each; `unheard` ranges were lost on the way."""
+
+    recording: PlazaRecording
+    lines: list[bytes]
+    unheard: int
+
+    def truth(self, time: np.ndarray) -> np.ndarray:
+        """Where the mower was, (time, 2) in metres."""
+        recording = self.recording
+        known = np.concatenate([[0.0], recording.time - recording.start])
+        path = np.concatenate([recording.start_pose[None, :2], recording.truth[:, :2]])
+        return np.column_stack([np.interp(time, known, path[:, i]) for i in range(2)])
+
+
+def network() -> hg.Network:
+    """The robot's own filter; `heliograph serve heliograph_studies.live.mower:network` keeps it running."""
+    return plaza.network()
+
+
+def read_drive(seed: int) -> Drive:
+    """The recorded odometry at once, and each range with the delay or the loss of a packet of a radio network."""
+    recording = read_recording()
+    heard, unheard = plaza.ranges(recording, synthetic_packets(RADIO, seed))
+    coming = sorted([*plaza.odometry(recording), *heard], key=arrival_of)  # stable: else as they were heard
+    return Drive(recording, [line(event) for event in coming], unheard)
+
+
+def line(event: Event, plant: str = PLANT) -> bytes:
+    """An event as a message."""
+    values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(np.asarray(event.values))]
+    found = {"plant": plant, "node": event.node, "sequence": event.sequence, "time": event.time, "values": values}
+    return json.dumps(found | {"arrival": arrival_of(event)}).encode()

@@ -1,0 +1,118 @@
+"""How many steps a second: from lines in memory, and through real brokers with every commit on disk."""
+
+import asyncio
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from time import perf_counter
+
+import nats
+from paho.mqtt.client import Client
+from paho.mqtt.enums import CallbackAPIVersion
+
+from heliograph.serving.broker import connected
+from heliograph.serving.fleet import Fleet, Options
+from heliograph.serving.lanes import Lanes
+from heliograph.serving.loop import serve_until
+from heliograph.serving.nowhere import Nowhere
+from heliograph.serving.output import Output
+from heliograph.serving.service import Service
+from heliograph.serving.store import Store
+from heliograph.serving.url import Address, address
+from heliograph.serving.whose import identity
+from heliograph_studies.live.server import Server
+
+PLANTS = 100  # mowers on the same drive, each a little after the one before
+BATCH = 1000  # lines that are taken together from memory
+
+
+def many(lines: Sequence[bytes], count: int) -> list[bytes]:
+    """The first messages of one mower as those of many, `count` in all."""
+    found = [json.loads(line) for line in lines[: count // PLANTS]]
+    return [json.dumps(one | {"plant": f"mower {i}"}).encode() for one in found for i in range(PLANTS)]
+
+
+class Counted:
+    """A service that stops after so many messages, and how long they took from the first batch on."""
+
+    def __init__(self, service: Service, count: int, stop: asyncio.Event):
+        self.service, self.left, self.stop, self.loop = service, count, stop, asyncio.get_running_loop()
+        self.begun = self.ended = 0.0
+
+    def unpublished(self) -> list[Output]:
+        """As the service says."""
+        return self.service.unpublished()
+
+    def take(self, payloads: Sequence[bytes]) -> list[Output]:
+        """As the service does."""
+        self.begun = self.begun or perf_counter()
+        outputs = self.service.take(payloads)
+        self.left -= len(payloads)
+        self.ended = perf_counter()
+        return outputs
+
+    def published(self, outputs: Sequence[Output]) -> None:
+        """As the service does; the last batch is over when it was told."""
+        self.service.published(outputs)
+        self.ended = perf_counter()
+        if self.left <= 0:
+            self.loop.call_soon_threadsafe(self.stop.set)
+
+    def finish(self, ended: bool) -> list[Output]:
+        """As the service does."""
+        return self.service.finish(ended)
+
+
+def in_memory(lanes: Lanes, options: Options, lines: Sequence[bytes]) -> float:
+    """Steps a second of a service that keeps nothing."""
+    service = Service(Fleet(lanes, options), Nowhere())
+    begun = perf_counter()
+    for i in range(0, len(lines), BATCH):
+        service.take(lines[i : i + BATCH])
+    return len(lines) / (perf_counter() - begun)
+
+
+async def through(
+    kind: str, folder: Path, server: Server, lanes: Lanes, options: Options, lines: Sequence[bytes]
+) -> float:
+    """Steps a second through a broker that has the messages already, estimates told to it, commits on disk."""
+    where = address(f"{kind}://127.0.0.1:{getattr(server, kind)}/speed-{kind}", {})
+    await _subscribed(where)
+    await (_sent(where, lines) if kind == "nats" else asyncio.to_thread(_published, where, lines))
+    fleet, stop = Fleet(lanes, options), asyncio.Event()
+    store = Store(str(folder / f"{kind}.sqlite"), identity(fleet))
+    counted = Counted(Service(fleet, store), len(lines), stop)
+    try:
+        await asyncio.wait_for(serve_until(stop, counted, connected(where)), 300)
+    finally:
+        store.close()
+    return len(lines) / (counted.ended - counted.begun)
+
+
+async def _subscribed(where: Address) -> None:
+    """Have the broker keep what will be sent: a stream, or a session."""
+    transport = connected(where)
+    try:
+        await asyncio.wait_for(transport.receive(), 1.0)
+    except TimeoutError:
+        await transport.close()
+
+
+async def _sent(where: Address, lines: Sequence[bytes]) -> None:
+    client = await nats.connect(f"nats://{where.host}:{where.port}")
+    stream = client.jetstream(timeout=60)
+    for i in range(0, len(lines), BATCH):
+        subject = f"{where.topic}.in.mower"
+        await asyncio.gather(*[await stream.publish_async(subject, line) for line in lines[i : i + BATCH]])
+    await client.close()
+
+
+def _published(where: Address, lines: Sequence[bytes]) -> None:
+    client = Client(CallbackAPIVersion.VERSION2)
+    client.max_inflight_messages_set(BATCH)
+    client.connect(where.host, where.port)
+    client.loop_start()
+    for one in [client.publish(f"{where.topic}/in/mower", line, 1) for line in lines]:
+        one.wait_for_publish(60)
+    client.disconnect()
+    client.loop_stop()

@@ -1,0 +1,192 @@
+"""All numbers of the reproduction: designed covariances, Monte Carlo on the library's driver, bounds, one run."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import heliograph as hg
+from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
+from heliograph.filters.polynomial import MemoryFilter
+from heliograph.linear import lifted_system
+from heliograph.linear.comparison import skewness
+from heliograph.linear.memory import memory_system
+from heliograph.linear.recursion import lmmse
+from heliograph.linear.schedule import Schedule
+from heliograph.model.over_time import first
+from heliograph.simulation import ErrorStatistics
+from heliograph_studies.outcome import Inline, Unlisted
+from heliograph_studies.quadratic_bias.bounds import Boundedness, boundedness
+from heliograph_studies.quadratic_bias.printed import Printed, printed_quadratic
+from heliograph_studies.quadratic_bias.setting import Model, Setting
+from heliograph_studies.stages import Stages
+
+RESOLUTION = 0.01  # of z for the mixture filter, where a link that is off leaves z with a few exact values
+DEGREES = {"linear": 1, "quadratic": 2, "cubic": 3, "quartic": 4}
+NODE = "receiver"
+CLAIMED, TRUE = "quadratic_printed_claimed", "quadratic_printed_true"
+
+ByState = dict[str, float]
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """What is found of one model: variances designed and simulated by filter and state, and the first run.
+
+    covariance: error variances at t = 0 ... horizon; mean_covariance: their means over the steps that count.
+    gain_percent: 100 (1 - ratio of the means) against the linear filter; simulated where nothing is designed.
+    monte_carlo: mean squared errors, and their differences to the linear filter on the same runs, with standard errors.
+    designed: covariances (time + 1, n, n); errors: mean squared error at each step, (time, n).
+    """
+
+    covariance: dict[str, dict[str, np.ndarray]]
+    mean_covariance: dict[str, ByState]
+    gain_percent: dict[str, ByState]
+    monte_carlo: dict[str, dict[str, Any]]
+    skewness: float
+    model: Unlisted[Model]
+    designed: Unlisted[dict[str, np.ndarray]]
+    errors: Unlisted[dict[str, np.ndarray]]
+    run: Unlisted[hg.Record]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The publication's example, our scenario, and the example's bounds."""
+
+    seed: int
+    runs: int
+    averaged: str
+    gain_percent_is: str
+    outage: Numbers
+    example: Inline[Numbers]
+    bounds: Unlisted[Boundedness]
+
+
+class Designs(NamedTuple):
+    """Filters by name, and the covariances (time + 1, n, n) that are known before any run; entry 0 is the start."""
+
+    filters: dict[str, AbstractFilter]
+    covariance: dict[str, np.ndarray]
+    skewness: float
+
+
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Design, simulate, and evaluate the bounds."""
+    example, outage = setting.example(), setting.outage()
+    printed = stages("the example", lambda: numbers(example, 0.0, setting, stages))
+    ours = stages("outages", lambda: numbers(outage, RESOLUTION, setting, stages))
+    square = lifted_system(*example[:3], 2, example.horizon)
+    return Outcome(
+        seed=setting.seed,
+        runs=setting.runs,
+        averaged=f"t = {example.begin + 1} ... {example.horizon}",
+        gain_percent_is="100 (1 - ratio of the means of the error variances) against the linear filter",
+        outage=ours,
+        example=printed,
+        bounds=stages("bounds", lambda: boundedness(square)),
+    )
+
+
+def design(model: Model, resolution: float) -> Designs:
+    """All filters of a model; `resolution` is the mixture filter's."""
+    parts = model.plant, model.sensor, model.channel
+    systems = {name: lifted_system(*parts, degree, model.horizon) for name, degree in DEGREES.items()}
+    schedules = {name: lmmse(system) for name, system in systems.items()}
+    filters: dict[str, AbstractFilter] = {
+        name: PolynomialFilter(ScheduledFilter(schedule), DEGREES[name]) for name, schedule in schedules.items()
+    }
+    memory = lmmse(memory_system(*parts, schedules["linear"]))
+    linear = ScheduledFilter(schedules["linear"])
+    filters["memory"] = MemoryFilter(linear=linear, products=ScheduledFilter(memory), claim="exact")
+    printed = printed_quadratic(*parts, model.horizon)
+    filters[TRUE] = PolynomialFilter(ScheduledFilter(printed.schedule), 2)
+    filters["mixture"] = hg.mixture_filter(*parts, resolution)
+    covariance = _covariances(model, schedules | {"memory": memory}, printed)
+    return Designs(filters, covariance, skewness(systems["quadratic"], len(model.states), 1))
+
+
+def _covariances(model: Model, schedules: Mapping[str, Schedule], printed: Printed) -> dict[str, np.ndarray]:
+    start = first(model.plant).initial_covariance[None]
+    steps = {name: schedule.gains.covariance for name, schedule in schedules.items()}
+    steps |= {CLAIMED: printed.schedule.gains.covariance, TRUE: printed.true_covariance}
+    return {name: np.concatenate([start, value]) for name, value in steps.items()}
+
+
+def numbers(model: Model, resolution: float, setting: Setting, stages: Stages) -> Numbers:
+    """Design all filters of a model, and run each on the same data."""
+    designs = design(model, resolution)
+    network = hg.Network(model.plant, {NODE: hg.Node(model.sensor, model.channel, designs.filters)})
+    sums = hg.monte_carlo(network, model.horizon, setting.runs, setting.seed, hg.Statistics(), progress=stages.progress)
+    shown = hg.monte_carlo(network, model.horizon, 1, setting.seed)
+
+    def named(values: np.ndarray, suffix: str = "") -> dict[str, float]:
+        return {f"{state}{suffix}": value.tolist() for state, value in zip(model.states, values, strict=True)}
+
+    variances = {name: np.diagonal(value, axis1=1, axis2=2) for name, value in designs.covariance.items()}
+    means = {name: value[model.begin + 1 :].mean(axis=0) for name, value in variances.items()}
+    squares = {name: _mean_square(part, None, model.begin) for name, part in sums[NODE].items()}
+    simulated: dict[str, dict[str, Any]] = {}
+    for name, part in sums[NODE].items():
+        difference = _mean_square(part, sums[NODE]["linear"], model.begin)
+        minus_linear = {**named(difference[0]), **named(difference[1], "_se")}
+        simulated[name] = {**named(squares[name][0]), **named(squares[name][1], "_se"), "minus_linear": minus_linear}
+    gains = {name: 100 * (1 - mean / means["linear"]) for name, mean in means.items() if name != "linear"}
+    gains["mixture"] = 100 * (1 - squares["mixture"][0] / squares["linear"][0])
+    return Numbers(
+        covariance={name: dict(zip(model.states, value.T, strict=True)) for name, value in variances.items()},
+        mean_covariance={name: named(mean) for name, mean in means.items()},
+        gain_percent={name: named(gain) for name, gain in gains.items()},
+        monte_carlo=simulated,
+        skewness=designs.skewness,
+        model=model,
+        designed=designs.covariance,
+        errors={name: np.diagonal(part.actual(), axis1=1, axis2=2) for name, part in sums[NODE].items()},
+        run=shown,
+    )
+
+
+def _mean_square(part: ErrorStatistics, against: ErrorStatistics | None, begin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squared error averaged over runs and the steps that count, and its standard error from batches, (n,) each.
+
+    `against`: the difference to another filter on the same runs, whose common part cancels.
+    """
+
+    def squared(statistics: ErrorStatistics) -> np.ndarray:
+        return np.asarray(np.diagonal(statistics.outer[:, begin:], axis1=2, axis2=3).mean(axis=1))
+
+    values, count = squared(part), part.count
+    if against is not None:
+        values = values - squared(against)
+    mean = values.sum(axis=0) / count.sum()
+    used = count > 0
+    batches = int(np.count_nonzero(used))
+    scatter = np.sum((values[used] - mean * count[used, None]) ** 2, axis=0) * batches / max(batches - 1, 1)
+    return mean, np.sqrt(scatter) / count.sum()
+
+
+def write_record(outcome: Outcome, folder: Path) -> None:
+    """Covariances and mean squared errors over time of the example, and its run, as NetCDF."""
+    import xarray
+
+    example = outcome.example
+    truth, estimates = example.run.truth, example.run.estimates[NODE]
+    assert truth is not None
+    data = {
+        "covariance": (("design", "time", "state", "state_2"), np.array(list(example.designed.values()))),
+        "mean_squared_error": (("filter", "step", "state"), np.array(list(example.errors.values()))),
+        "truth": (("step", "state"), truth[0]),
+        "measurement": (("step",), example.run.measurements[NODE][0, :, 0]),
+        "estimate": (("filter", "step", "state"), np.array([e.mean[0] for e in estimates.values()])),
+    }
+    coordinates = {
+        "design": list(example.designed),
+        "filter": list(example.errors),
+        "state": list(example.model.states),
+        "time": np.arange(example.model.horizon + 1),
+        "step": np.arange(1, example.model.horizon + 1),
+    }
+    about = {"seed": outcome.seed, "runs": outcome.runs}
+    xarray.Dataset(data, coordinates, about).to_netcdf(folder / "record.nc", engine="h5netcdf")

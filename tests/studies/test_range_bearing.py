@@ -1,0 +1,40 @@
+"""The example of a range-bearing station, with fewer runs and filters."""
+
+import json
+
+import heliograph as hg
+from heliograph_studies.range_bearing import compute, example
+from heliograph_studies.range_bearing.setting import close_by, passing
+
+CHEAP = ("extended", "cubature", "four_points")
+
+
+def few(network: hg.Network) -> hg.Network:
+    """With the filters that cost little to compile."""
+    nodes = {
+        name: hg.Node(node.sensor, node.channel, {f: item for f, item in node.filters.items() if f in CHEAP})
+        for name, node in network.nodes.items()
+        if name != "bursts"
+    }
+    return hg.Network(network.plant, nodes)
+
+
+def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path, monkeypatch, fits):
+    for name, value in {"RUNS": 64, "FADING_RUNS": 192}.items():
+        monkeypatch.setattr(compute, name, value)
+    monkeypatch.setattr(compute, "passing", lambda *which, **how: few(passing(*which, **how)))
+    monkeypatch.setattr(compute, "close_by", lambda: few(close_by()))
+    example(tmp_path, 0)
+    found = json.loads((tmp_path / "range-bearing" / "summary.json").read_text())
+    for name in ("quiet_cubature", "quiet_extended"):
+        elsewhere, across, line = (found[case][name] for case in compute.CASES)
+        for one in (elsewhere, across):
+            assert abs(one["nees"] - 1) < 4 * one["nees_se"]
+        assert across["largest"] < 6 and line["rmse"] > across["rmse"]
+    assert found["on_a_line"]["quiet_extended"]["largest"] > 20
+    closest = {name: one["rmse_by_closest_pass"] for name, one in found["fading"].items()}
+    for farther in zip(*(part[1:] for part in closest.values()), strict=True):
+        assert max(farther) < 1.5 * min(farther)  # rules differ in the closest tenth alone
+    assert closest["extended"][0] > 2 * closest["four_points"][0]
+    assert {"across.svg", "closest.svg", "report.html"} <= {p.name for p in (tmp_path / "range-bearing").iterdir()}
+    fits(tmp_path / "range-bearing" / "report.html")
