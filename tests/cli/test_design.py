@@ -7,7 +7,7 @@ import pytest
 
 import heliograph as hg
 from heliograph import cli
-from heliograph.planning import Task, purchases_of
+from heliograph.planning import DesignProblem, worth_of_changes
 
 NETWORK = """
 import heliograph as hg
@@ -91,36 +91,35 @@ def test_what_more_buys_is_the_design_made_again(told, folder):
     network = hg.files.load_network(str(folder / "yard.py"))
     twice = hg.Network(network.plant, {**network.nodes, "again": network.nodes["far"]})
     saved = told["error"] - hg.design(twice, budget=2.0).error
-    assert told["purchases"]["one more far"]["saved"] == pytest.approx(saved, rel=1e-6)
+    assert told["changes"]["one more far"]["saved"] == pytest.approx(saved, rel=1e-6)
     alone = hg.Network(network.plant, {"near": network.nodes["near"]})
-    assert told["purchases"]["without far"]["value"] == pytest.approx(hg.design(alone, budget=2.0).error, rel=1e-9)
+    assert told["changes"]["without far"]["value"] == pytest.approx(hg.design(alone, budget=2.0).error, rel=1e-9)
     # halfway, of a power gain that falls with the square of the distance: two hops of twice the amplitude
     hops = [hg.hop(1.6, 0.2), hg.hop(1.6, 0.2)]
     relayed = hg.Node(network.nodes["near"].sensor, hg.amplify_and_forward(hops), {})
     halfway = hg.design(hg.Network(network.plant, {**network.nodes, "near": relayed}), budget=2.0).error
-    assert told["purchases"]["a relay halfway of near.hop1"]["value"] == pytest.approx(halfway, rel=1e-6)
+    assert told["changes"]["a relay halfway of near.hop1"]["value"] == pytest.approx(halfway, rel=1e-6)
 
 
-def test_purchases_of_a_wanted_error_are_powers(folder):
+def test_changes_of_a_target_error_are_worth_power(folder):
     network = hg.files.load_network(str(folder / "yard.py"))
-    task = Task(wanted=0.3, free=("near", "far"))
-    found = task.solve(network)
-    bought = {one.name: one for one in purchases_of(network, task, found)}
-    assert set(bought) == {"one more near", "one more far"}  # without one of them the error may be out of reach
-    assert 0 < bought["one more far"].saved < found.total
+    best = hg.design(DesignProblem(network, target_error=0.3, free=("near", "far")))
+    worth = {change.name: change for change in worth_of_changes(best)}
+    assert set(worth) == {"one more near", "one more far"}  # without one of them the error may be out of reach
+    assert 0 < worth["one more far"].saved < best.total
 
 
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("network = 3", "network: expected a Python file"),
-        ("network = 'no.py'\nbudget = 1.0", "expected a Python file beside it"),
-        ("network = 'yard.py'", "expected a budget of power or a wanted error, got neither"),
+        ("network = 'no.py'\nbudget = 1.0", "expected a Python file in its folder"),
+        ("network = 'yard.py'", "expected a budget of power or a target error, got neither"),
         ("network = 'yard.py'\nbugdet = 1.0", "closest: 'budget'"),
         ("network = 'yard.py'\nbudget = {totl = 1.0}", "closest: 'total'"),
         ("network = 'yard.py'\nbudget = 1.0\nfree = 'near'", "free: expected a list of names"),
         ("network = 'yard.py'\nbudget = 1.0\nfront = [-1.0]", "budgets of the front: expected positive numbers"),
-        ("network = 'yard.py'\nwanted = 0.001", "unlimited power leaves"),
+        ("network = 'yard.py'\ntarget_error = 0.001", "unlimited power leaves"),
         ("network =", "expected TOML"),
     ],
 )

@@ -58,9 +58,9 @@ def test_the_error_is_the_simulated_one() -> None:
     steady = feedback_limit(PLANT, SENSOR, [HOP, HOP], powers).filtered
     assert steady is not None and claimed == pytest.approx(steady[0, 0], rel=1e-3)  # after 20 steps
     # what arrives is the last hop's power with its gain and noise: E z^2 = E g^2 p + Var m
-    heard = record.measurements["node"][:, :, 0] ** 2
-    errors = heard.std(axis=0) / np.sqrt(runs)
-    assert np.max(np.abs(heard.mean(axis=0) - 1.02 * (3.0 + 0.2)) / errors) < 4
+    received = record.measurements["node"][:, :, 0] ** 2
+    errors = received.std(axis=0) / np.sqrt(runs)
+    assert np.max(np.abs(received.mean(axis=0) - 1.02 * (3.0 + 0.2)) / errors) < 4
 
 
 @settings(max_examples=25, deadline=None)
@@ -109,7 +109,7 @@ def test_every_transmitter_sends_its_power() -> None:
     np.testing.assert_allclose(sent["node.hop1"], 1.0, rtol=1e-9)
     np.testing.assert_allclose(sent["node.hop2"], 3.0, rtol=1e-9)
     same = hg.Node(SENSOR, HOP, {"fed": fed_back_filter(PLANT, SENSOR, HOP)})
-    with pytest.raises(ValueError, match="hears back: expected a horizon"):
+    with pytest.raises(ValueError, match="with feedback: expected a horizon"):
         hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": same}))
-    with pytest.raises(ValueError, match="got a sensor that hears back"):
+    with pytest.raises(ValueError, match="got a sensor with feedback"):
         hg.design(network, error=hg.planning.Error(horizon=12), budget=3.0)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.planning import Budget
-from heliograph.planning.criterion import Error
+from heliograph.planning import Budget, Error
 from heliograph.planning.free_numbers import as_numbers
-from heliograph.planning.numbers_problem import Problem
+from heliograph.planning.number_problem import NumberProblem
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
@@ -25,7 +24,7 @@ def shared(amplifications):
     return hg.Network(PLANT, {"node": hg.Node(BOTH, hg.amplify_and_forward(hops), {})})
 
 
-def told_losses(amplification, arrival):
+def observed_losses(amplification, arrival):
     lossy = hg.erasure(hg.hop(FADING, 0.3, amplification=amplification), arrival)
     nodes = {
         "a": hg.Node(hg.LinearSensor([[1.0, 0.0]], 0.2), lossy, {}),
@@ -34,7 +33,7 @@ def told_losses(amplification, arrival):
     return hg.Network(PLANT, nodes)
 
 
-def told_modes(amplification, stays):
+def observed_modes(amplification, stays):
     chain = hg.random_affine.MarkovChain(jnp.stack([jnp.stack([0.9, 0.1]), jnp.stack([1 - stays, stays])]))
     modes = hg.random_affine.Modes(chain, [hg.hop(g, 0.3, amplification=amplification) for g in (1.0, 0.3)])
     return hg.Network(PLANT, {"node": hg.Node(SUM, hg.model.with_flag(modes), {})})
@@ -52,23 +51,23 @@ def uncertain(amplification):
 
 CASES = {
     "shared gain": (shared, {"amplifications": ([0.7, 1.3], 0.1, 5.0)}),
-    "told losses": (told_losses, {"amplification": (1.2, 0.1, 5.0), "arrival": (0.6, 0.1, 0.9)}),
+    "observed losses": (observed_losses, {"amplification": (1.2, 0.1, 5.0), "arrival": (0.6, 0.1, 0.9)}),
     "uncertain": (uncertain, {"amplification": (1.2, 0.1, 5.0)}),
-    "told modes": (told_modes, {"amplification": (1.2, 0.1, 5.0), "stays": (0.6, 0.1, 0.9)}),
+    "observed modes": (observed_modes, {"amplification": (1.2, 0.1, 5.0), "stays": (0.6, 0.1, 0.9)}),
 }
 
 
-def check_gradients(one, relative=2e-3):
-    x = one.numbers.start
-    slopes = one.at(x).slopes
+def check_gradients(problem, relative=2e-3):
+    x = problem.numbers.start
+    slopes = problem.at(x).slopes
     for i in range(len(x)):
         h = relative * x[i]
-        ends = [one.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
-        for each, slope in (
+        ends = [problem.at(x + s * h * np.eye(len(x))[i]) for s in (-2, -1, 1, 2)]
+        for values, slope in (
             ([p.error for p in ends], slopes.error[i]),
             ([p.powers for p in ends], slopes.powers[..., i]),
         ):
-            low, near, far, high = each
+            low, near, far, high = values
             differences = (8 * (far - near) - (high - low)) / (12 * h)
             np.testing.assert_allclose(slope, differences, rtol=1e-8, atol=1e-9)  # fourth order: h^4 and rounding / h
 
@@ -76,7 +75,7 @@ def check_gradients(one, relative=2e-3):
 @cache
 def problem_of(name):
     build, free = CASES[name]
-    return Problem(build, as_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
+    return NumberProblem(build, as_numbers(free), Error({"x0": 1.0, "x1": 0.5}))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -93,17 +92,17 @@ def first_step(measured):
 
 
 def test_the_error_is_that_of_the_recursion(problem):
-    name, one = problem
-    found = one.at(one.numbers.start).covariances[0]
-    network = one.network(one.numbers.start)
+    name, item = problem
+    found = item.at(item.numbers.start).covariances[0]
+    network = item.network(item.numbers.start)
     if name == "shared gain":
         node = network.nodes["node"]
         best = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((200, 0)))
         np.testing.assert_allclose(found, best.covariances[-1], rtol=1e-10)
-        powers = one.at(one.numbers.start).powers
+        powers = item.at(item.numbers.start).powers
         np.testing.assert_allclose(powers[0], list(hg.power(network).mean.values()), rtol=1e-12)
         return
-    m = first_step(one.at(one.numbers.start).measured)
+    m = first_step(item.at(item.numbers.start).system)
     parts = m.law[:, None, None] * np.eye(2)
     for _ in range(400):  # the recursion of X_j, as it is written
         after = np.zeros_like(parts)
@@ -115,12 +114,12 @@ def test_the_error_is_that_of_the_recursion(problem):
     np.testing.assert_allclose(found, parts.sum(axis=0), rtol=1e-11)
 
 
-def test_told_losses_are_bounded_by_what_drawn_losses_leave():
-    problem = problem_of("told losses")
+def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
+    problem = problem_of("observed losses")
     found = problem.at(problem.numbers.start)
     p, q = np.diag(found.covariances[0])
     assert found.error == pytest.approx(p + 0.5 * q, rel=1e-12)
-    m, runs = first_step(found.measured), 200
+    m, runs = first_step(found.system), 200
     draws, covariance, total = np.random.default_rng(0), np.eye(2), []
     for _ in range(200):  # the filters that know which losses there were
         j = draws.choice(2, runs, p=m.law)
@@ -136,7 +135,7 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
     found = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
     node = found.network.nodes["node"]
-    k = problem_of("uncertain").at(np.append(1.2, found.numbers["young"])).settled.gains[0, 0]
+    k = problem_of("uncertain").at(np.append(1.2, found.numbers["young"])).solution.gains[0, 0]
     a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
     for p in (0.2, 0.3, 0.4):
         values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])
@@ -195,9 +194,9 @@ def test_powers_and_amplifications_agree():
     by_number = hg.design(chain, free=free, budget=3, starts=1)
     by_power = hg.design(chain(1.0, 1.0), budget=3)
     assert by_number.error == pytest.approx(by_power.error, rel=1e-9)
-    least = hg.design(chain, free=free, wanted=by_power.error, starts=1)
+    least = hg.design(chain, free=free, target_error=by_power.error, starts=1)
     assert least.total == pytest.approx(3, rel=1e-6)
-    capped = hg.design(chain, free=free, budget=Budget(3, each={"node.hop1": 0.5}), starts=1)
+    capped = hg.design(chain, free=free, budget=Budget(3, per_transmitter={"node.hop1": 0.5}), starts=1)
     assert capped.powers["node.hop1"][0] == pytest.approx(0.5, rel=1e-6) and capped.error > by_power.error
 
 

@@ -7,8 +7,8 @@ import pytest
 import heliograph as hg
 from heliograph.planning import Budget, Error
 from heliograph.planning.free_numbers import as_numbers
-from heliograph.planning.numbers_problem import Problem
-from tests.planning.test_free_numbers import CASES, FADING, PLANT, check_gradients, told_modes, uncertain
+from heliograph.planning.number_problem import NumberProblem
+from tests.planning.test_free_numbers import CASES, FADING, PLANT, check_gradients, observed_modes, uncertain
 
 SENSORS = {"p": hg.LinearSensor([[1.0, 0.0]], 0.2), "q": hg.LinearSensor([[0.0, 1.0]], 0.4)}
 NOISES = {"p": 0.3, "q": 0.6}
@@ -33,21 +33,27 @@ UNSTABLE = hg.LinearPlant([[1.2, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), [1.0, 2
 @pytest.mark.parametrize(
     ("build", "free", "error"),
     [
-        (told_modes, CASES["told modes"][1], Error(horizon=3, at_end=True)),
+        (observed_modes, CASES["observed modes"][1], Error(horizon=3, at_end=True)),
         (uncertain, CASES["uncertain"][1], Error(horizon=3)),
         (two, BY_STEP, Error(period=2, worst=True)),
     ],
 )
 def test_gradients_of_every_error_are_those_of_differences(build, free, error):
-    check_gradients(Problem(build, as_numbers(free), error))
+    check_gradients(NumberProblem(build, as_numbers(free), error))
 
 
 @pytest.mark.parametrize(
     ("free", "asked"),
     [
-        (CONSTANT, {"error": Error({"x1": 1.0}), "wanted": 0.27, "budget": Budget(each={"q.hop1": 2.8})}),
-        (BY_STEP, {"error": Error(horizon=2, at_end=True), "budget": Budget(1, each={"q.hop1": 0.4}, peak=0.9)}),
-        (BY_STEP, {"error": Error(period=2), "wanted": 0.6}),
+        (
+            CONSTANT,
+            {"error": Error({"x1": 1.0}), "target_error": 0.27, "budget": Budget(per_transmitter={"q.hop1": 2.8})},
+        ),
+        (
+            BY_STEP,
+            {"error": Error(horizon=2, at_end=True), "budget": Budget(1, per_transmitter={"q.hop1": 0.4}, peak=0.9)},
+        ),
+        (BY_STEP, {"error": Error(period=2), "target_error": 0.6}),
     ],
 )
 def test_designs_are_those_by_powers(free, asked):
@@ -84,8 +90,8 @@ def test_without_a_limit_of_power_a_watt_is_worth_nothing_and_the_inner_optimum_
         (
             two,
             CONSTANT,
-            {"wanted": 0.1},
-            r"wanted error: expected at least 0\.\d+, the least found from 1 starts, got 0",
+            {"target_error": 0.1},
+            r"target error: expected at least 0\.\d+, the least found from 1 starts, got 0",
         ),
         (
             two,

@@ -66,7 +66,7 @@ def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
     assert found["node.hop1"][2] == pytest.approx(y2, rel=1e-12)
     with jax.enable_x64(True):
 
-        def heard(key):
+        def received(key):
             begin, *keys = jax.random.split(key, 5)
             state = hops[0].init(begin)
             y = jnp.sqrt(y2)  # its sign and law do not matter: noise has mean zero
@@ -75,7 +75,7 @@ def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
             z = h[0, :1] * y + h[0, -1] if kind != "delay" else apply(h, jnp.tile(y, 3))
             return jnp.where(jnp.isnan(z[0]), 0.0, (1.5 * z[0]) ** 2)
 
-        drawn = np.asarray(jax.jit(jax.vmap(heard))(jax.random.split(jax.random.key(1), 40_000)))
+        drawn = np.asarray(jax.jit(jax.vmap(received))(jax.random.split(jax.random.key(1), 40_000)))
     assert abs(drawn.mean() - found["node.hop2"][2]) < 4 * drawn.std() / 200
 
 

@@ -1,4 +1,4 @@
-"""The free numbers of a network that is a function of them: starts, ends, and one vector of them all."""
+"""Free numbers of a network that is a function of them: starts, ends, and one vector of them all."""
 
 from collections.abc import Callable
 from functools import partial
@@ -26,8 +26,8 @@ class Number(NamedTuple):
     high: np.ndarray
 
 
-def scalars_of_young(steps: int) -> Number:
-    """One scalar for each step, or one of the steady bound."""
+def young_scalars(steps: int) -> Number:
+    """Scalar of Young's inequality for each step, or a single one of the steady bound."""
     shape = () if steps == 1 else (steps,)
     return Number(*(np.full(shape, value) for value in (0.1, 1e-6, 1e3)))
 
@@ -35,59 +35,60 @@ def scalars_of_young(steps: int) -> Number:
 class Numbers(NamedTuple):
     """All free numbers as one vector."""
 
-    each: dict[str, Number]
+    by_name: dict[str, Number]
 
     @property
     def start(self) -> Vector:
         """Where a search begins."""
-        return np.concatenate([one.start.ravel() for one in self.each.values()])
+        return np.concatenate([number.start.ravel() for number in self.by_name.values()])
 
     @property
-    def ends(self) -> tuple[Vector, Vector]:
-        """The least and the largest."""
-        low, high = (
-            [part.ravel() for part in parts]
-            for parts in zip(*((n.low, n.high) for n in self.each.values()), strict=True)
-        )
-        return np.concatenate(low), np.concatenate(high)
+    def low(self) -> Vector:
+        """Least values."""
+        return np.concatenate([number.low.ravel() for number in self.by_name.values()])
+
+    @property
+    def high(self) -> Vector:
+        """Largest values."""
+        return np.concatenate([number.high.ravel() for number in self.by_name.values()])
 
     def named(self, x: Array) -> dict[str, Any]:
-        """The numbers by name, each in its shape."""
+        """Numbers by name, each in its shape."""
         result, begin = {}, 0
-        for name, one in self.each.items():
-            result[name] = x[begin : begin + one.start.size].reshape(one.start.shape)
-            begin += one.start.size
+        for name, number in self.by_name.items():
+            result[name] = x[begin : begin + number.start.size].reshape(number.start.shape)
+            begin += number.start.size
         return result
 
     def drawn(self, draws: np.random.Generator) -> Vector:
         """Another start: anywhere between the ends, or where there are none by a factor about the first."""
-        low, high = self.ends
-        between = np.isfinite(low) & np.isfinite(high)
-        within = draws.uniform(np.where(between, low, 0.0), np.where(between, high, 1.0))
-        return np.where(between, within, np.clip(self.start * np.exp(draws.normal(size=len(low))), low, high))
+        between = np.isfinite(self.low) & np.isfinite(self.high)
+        within = draws.uniform(np.where(between, self.low, 0.0), np.where(between, self.high, 1.0))
+        factor = np.exp(draws.normal(size=len(self.low)))
+        return np.where(between, within, np.clip(self.start * factor, self.low, self.high))
 
 
 def as_numbers(free: object) -> Numbers:
-    """{name: (start, low, high)}; the start may be an array, and the ends numbers or arrays of its shape.
+    """Free numbers from {name: (start, low, high)}; the start may be an array, the ends numbers or of its shape.
 
     Raises:
         ValueError: nothing free, ends that do not enclose the start.
     """
-    found = {}
-    for name, given in table("free", free, "(start, low, high)").items():
-        parts = items(f"free number {name!r}", given, "(start, low, high)")
+    result = {}
+    for name, value in table("free", free, "(start, low, high)").items():
+        parts = items(f"free number {name!r}", value, "(start, low, high)")
         if len(parts) != 3:
             raise fail(f"free number {name!r}", "(start, low, high)", f"{len(parts)} numbers")
         start = array(f"start of {name!r}", parts[0], (None,) * np.ndim(parts[0]))
         low, high = (_end(name, end, start.shape) for end in parts[1:])
         if not np.all((low <= start) & (start <= high)):
             raise fail(f"free number {name!r}", "a start between its ends", f"{parts[0]} of {parts[1]} to {parts[2]}")
-        found[name] = Number(start, low, high)
-    if YOUNG in found:
+        result[name] = Number(start, low, high)
+    if YOUNG in result:
         raise fail("free", f"names other than {YOUNG!r}, which stands for a scalar of the bound", YOUNG)
-    if not found:
+    if not result:
         raise fail("free", "at least one number (name: (start, low, high))", "none: nothing is free")
-    return Numbers(found)
+    return Numbers(result)
 
 
 def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
@@ -101,25 +102,27 @@ def _end(name: str, end: object, shape: tuple[int, ...]) -> np.ndarray:
     return value
 
 
-def check_arguments(build: Build, free: object) -> None:
-    """Raise ValueError unless the function takes the free numbers by name, or without any no arguments."""
+def function_of_numbers(build: Build, free: object) -> tuple[Build, Numbers]:
+    """Function and its free numbers, from {name: (start, low, high)} or, without, from the marks `hg.free` in it.
+
+    Raises:
+        ValueError: arguments of the function that are not the free numbers, marks that are no intervals.
+    """
     names = list(table("free", free, "(start, low, high)")) if free is not None else []
     try:
         signature(build).bind(**dict.fromkeys(names))
     except TypeError as error:
         raise fail("free", "the arguments of the function, (start, low, high) by name", str(error)) from None
-
-
-def marked(build: Build) -> tuple[Build, Numbers]:
-    """A function without arguments as one of the numbers that `hg.free` marks in it, each anywhere it may be."""
+    if free is not None:
+        return build, as_numbers(free)
     description = describe(build)
-    found = {}
-    for one in description.parameters.every:
-        if one.domain.kind != "interval":
-            raise fail(f"free number {one.name!r}", "one between two limits", f"a {one.domain.kind}")
-        ends = (np.full(one.start.shape, end) for end in (one.domain.low, one.domain.high))
-        found[one.name] = Number(np.asarray(one.start), *ends)
-    return partial(_with_marks, description), Numbers(found)
+    marks = {}
+    for mark in description.parameters.every:
+        if mark.domain.kind != "interval":
+            raise fail(f"free number {mark.name!r}", "one between two limits", f"a {mark.domain.kind}")
+        ends = (np.full(mark.start.shape, end) for end in (mark.domain.low, mark.domain.high))
+        marks[mark.name] = Number(np.asarray(mark.start), *ends)
+    return partial(_with_marks, description), Numbers(marks)
 
 
 def _with_marks(description: Description, **values: object) -> Network:

@@ -1,7 +1,7 @@
-"""Who sends in a channel, and how its transmitters are called.
+"""Transmitters of a channel: how they are named, and how to change what they do.
 
 Every map z = g A y + n with a random gain or a noise is a hop, and its transmitter sends A y; what is known and without
-noise is a wire. Transmitters are called by their place: "hop1", "hop2" along a chain, "part1.", "part2." in a stack,
+noise is a wire. Transmitters are named by their place: "hop1", "hop2" along a chain, "part1.", "part2." in a stack,
 "choice1." where a mixture chooses among several.
 """
 
@@ -22,27 +22,25 @@ from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed
 
 Hop = GainAndNoise | Faded
-Act = Callable[[str, Hop], AbstractRandomAffine]
+HopChange = Callable[[str, Hop], AbstractRandomAffine]
 
 
-def transmits(atom: Hop) -> bool:
-    """Whether anything is sent over the air."""
-    if isinstance(atom, Faded):
-        return True
-    return not (_is_one(atom) and is_zero(atom.noise.covariance))
+def transmits(hop: Hop) -> bool:
+    """Whether anything is transmitted, rather than passed on by a wire."""
+    return isinstance(hop, Faded) or not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
 
 
-def _is_one(atom: GainAndNoise) -> bool:
-    return isinstance(atom.law, Constant) and not is_traced(atom.law.value) and float(atom.law.value) == 1.0
+def _gain_is_one(hop: GainAndNoise) -> bool:
+    return isinstance(hop.law, Constant) and not is_traced(hop.law.value) and float(hop.law.value) == 1.0
 
 
 def is_silent(channel: AbstractRandomAffine) -> bool:
-    """Whether nothing comes through but noise: what a loss, or a mode in which nothing is heard, is made of."""
-    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _is_one(channel)
+    """Whether nothing comes through but noise: what a loss, or a mode without reception, is made of."""
+    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _gain_is_one(channel)
 
 
 class Place(NamedTuple):
-    """Where in a channel: the prefix of names, and how many hops are before along the chain."""
+    """Place in a channel: the prefix of names, and the number of hops before along the chain."""
 
     prefix: str
     hops: int
@@ -51,8 +49,10 @@ class Place(NamedTuple):
 BEGINNING = Place("", 0)
 
 
-def walked(channel: AbstractRandomAffine, act: Act, place: Place = BEGINNING) -> tuple[AbstractRandomAffine, Place]:
-    """The channel with every hop replaced by act(name, hop), and the place behind it.
+def replace_hops(
+    channel: AbstractRandomAffine, change: HopChange, place: Place = BEGINNING
+) -> tuple[AbstractRandomAffine, Place]:
+    """Channel with every hop replaced by change(name, hop), and the place behind it.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
@@ -62,65 +62,67 @@ def walked(channel: AbstractRandomAffine, act: Act, place: Place = BEGINNING) ->
             if not transmits(channel):
                 return channel, place
             after = place._replace(hops=place.hops + 1)
-            return act(f"{place.prefix}hop{after.hops}", channel), after
+            return change(f"{place.prefix}hop{after.hops}", channel), after
         case Series():
             parts = []
             for part in channel.maps:
-                part, place = walked(part, act, place)
+                part, place = replace_hops(part, change, place)
                 parts.append(part)
         case Stack():
             places = [Place(f"{place.prefix}part{i}.", 0) for i in range(1, len(channel.maps) + 1)]
-            parts = [walked(part, act, own)[0] for part, own in zip(channel.maps, places, strict=True)]
+            parts = [replace_hops(part, change, at)[0] for part, at in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
-            parts, place = _chosen(channel, act, place)
+            parts, place = _replace_in_choices(channel, change, place)
         case Revealed():
             return channel, place
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
-            inner, place = walked(getattr(channel, name), act, place)
+            inner, place = replace_hops(getattr(channel, name), change, place)
             return eqx.tree_at(lambda c: getattr(c, name), channel, inner), place
         case _:
             raise unknown(channel)
     return eqx.tree_at(lambda c: c.maps, channel, tuple(parts)), place
 
 
-def _chosen(channel: Mixture | Modes, act: Act, place: Place) -> tuple[list[AbstractRandomAffine], Place]:
-    """The maps of which one is in force: modes of one link have the same transmitters, those of a mixture their own."""
-    own = [not is_silent(part) for part in channel.maps]
-    several = isinstance(channel, Mixture) and sum(own) > 1
-    places = [Place(f"{place.prefix}choice{i}.", 0) if several else place for i in range(1, len(own) + 1)]
-    pairs = [walked(part, act, at) for part, at in zip(channel.maps, places, strict=True)]
+def _replace_in_choices(
+    channel: Mixture | Modes, change: HopChange, place: Place
+) -> tuple[list[AbstractRandomAffine], Place]:
+    """Maps of which one is in force: modes of one link have the same transmitters, those of a mixture each theirs."""
+    sending = [not is_silent(part) for part in channel.maps]
+    several = isinstance(channel, Mixture) and sum(sending) > 1
+    places = [Place(f"{place.prefix}choice{i}.", 0) if several else place for i in range(1, len(sending) + 1)]
+    pairs = [replace_hops(part, change, at) for part, at in zip(channel.maps, places, strict=True)]
     return [part for part, _ in pairs], place if several else max((at for _, at in pairs), key=lambda at: at.hops)
 
 
-def names_of(channel: AbstractRandomAffine) -> list[str]:
+def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Names of the transmitters, in order of appearance."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
 
     def note(name: str, hop: Hop) -> Hop:
-        found.setdefault(name)
+        names.setdefault(name)
         return hop
 
-    walked(channel, note)
-    return list(found)
+    replace_hops(channel, note)
+    return list(names)
 
 
-def selected(names: Sequence[str], wanted: Sequence[str], what: str) -> np.ndarray:
-    """Which of the names are wanted, by name or by what stands before a dot.
+def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
+    """Which of the names are chosen, by name or by what stands before a dot.
 
     Raises:
-        ValueError: one that is there under no name.
+        ValueError: a choice that is there under no name.
     """
-    chosen = np.zeros(len(names), dtype=bool)
-    for one in wanted:
-        hit = np.array([name == one or name.startswith(f"{one}.") for name in names])
+    result = np.zeros(len(names), dtype=bool)
+    for choice in chosen:
+        hit = np.array([name == choice or name.startswith(f"{choice}.") for name in names])
         if not np.any(hit):
-            raise fail(what, f"names of transmitters {list(names)}", repr(one))
-        chosen |= hit
-    return chosen
+            raise fail(what, f"names of transmitters {list(names)}", repr(choice))
+        result |= hit
+    return result
 
 
 def unknown(channel: AbstractRandomAffine) -> ValueError:
-    """The error for a map of a kind whose transmitters are not known."""
+    """Error for a map of a kind whose transmitters are not known."""
     expected = "hops in series, stacks, mixtures, modes, losses and delays"
     return fail("transmitters of a channel", expected, type(channel).__name__)
