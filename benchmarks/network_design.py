@@ -13,7 +13,7 @@ from alone import milliseconds, show
 import heliograph as hg
 from heliograph.planning import Error
 from heliograph.planning.budget import unlimited
-from heliograph.planning.path_design import power_task
+from heliograph.planning.paths.design import power_task
 
 SENSORS, STARTS, REPEATS = 20, 30, 20
 ERROR_LIMIT, CONVEX_LIMIT, STARTS_LIMIT = 1.0, 2000.0, 10_000.0

@@ -5,8 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error, paths_of
-from heliograph.planning.paths import path_information
-from heliograph.planning.relaxation import SplitPaths, envelope, split
+from heliograph.planning.paths.model import path_information
+from heliograph.planning.paths.relaxation import SplitPaths, envelope, split
 from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, path_problem, two_hops
 
 
@@ -34,11 +34,11 @@ ONE_HOP = {
 @pytest.mark.parametrize("total", ONE_HOP)
 def test_one_hop_reaches_the_example(single, total):
     equal, best, powers, least = ONE_HOP[total]
-    found = hg.design(single, budget=total)
-    assert found.error == pytest.approx(best, abs=1e-8)  # printed digits
-    np.testing.assert_allclose([found.powers[f"{n}.hop1"][0] for n in NAMES], powers, atol=1e-5)
-    assert found.total == pytest.approx(total, rel=1e-12)
-    assert found.certificate.convex and found.certificate.gap < 1e-12
+    result = hg.design(single, budget=total)
+    assert result.error == pytest.approx(best, abs=1e-8)  # printed digits
+    np.testing.assert_allclose([result.powers[f"{n}.hop1"][0] for n in NAMES], powers, atol=1e-5)
+    assert result.total == pytest.approx(total, rel=1e-12)
+    assert result.certificate.convex and result.certificate.gap < 1e-12
     paths, _ = paths_of(single, Error())
     problem = path_problem(paths, Error(), np.eye(3), np.ones(6, dtype=bool), np.zeros((1, 6)))
     even = problem.exact(np.full((1, 6), total / 6))
@@ -49,43 +49,43 @@ def test_one_hop_reaches_the_example(single, total):
 
 
 def test_two_hops_reach_the_example_where_one_start_does_not(double):
-    found = hg.design(double, budget=6)
-    assert found.error == pytest.approx(1.36438855, abs=1e-8)
-    whole = [sum(found.powers[f"{n}.hop{h}"][0] for h in (1, 2)) for n in NAMES]
+    result = hg.design(double, budget=6)
+    assert result.error == pytest.approx(1.36438855, abs=1e-8)
+    whole = [sum(result.powers[f"{n}.hop{h}"][0] for h in (1, 2)) for n in NAMES]
     np.testing.assert_allclose(whole, [3.4644, 2.5356, 0, 0, 0, 0], atol=1e-4)
-    assert 1.3333 < found.certificate.bound < found.error  # 1.33340 by an envelope that touches exactly
-    assert found.certificate.words.startswith("best of 63 starts, stationary within")
+    assert 1.3333 < result.certificate.bound < result.error  # 1.33340 by an envelope that touches exactly
+    assert result.certificate.words.startswith("best of 63 starts, stationary within")
     alone = hg.design(double, budget=6, starts=1)
-    assert alone.error > 1.38 and alone.certificate.bound == pytest.approx(found.certificate.bound, rel=1e-6)
-    assert found.certificate.stationarity < 1e-9
-    assert hg.design(found.network, budget=6).present == pytest.approx(found.error, rel=1e-12)  # the network it gives
+    assert alone.error > 1.38 and alone.certificate.bound == pytest.approx(result.certificate.bound, rel=1e-6)
+    assert result.certificate.stationarity < 1e-9
+    assert hg.design(result.network, budget=6).present == pytest.approx(result.error, rel=1e-12)  # the network it gives
 
 
 def test_two_hops_at_more_power(double):
-    found = hg.design(double, budget=30, starts=8)
-    assert found.error == pytest.approx(0.76036110, abs=1e-8)
-    assert found.certificate.bound == pytest.approx(0.75968, abs=5e-6)
+    result = hg.design(double, budget=30, starts=8)
+    assert result.error == pytest.approx(0.76036110, abs=1e-8)
+    assert result.certificate.bound == pytest.approx(0.75968, abs=5e-6)
 
 
 def test_least_power_of_two_hops_and_what_no_allocation_undercuts(double):
-    found = hg.design(double, target_error=1.56566806, starts=16)
-    assert found.error == pytest.approx(1.56566806, rel=1e-10)
-    assert found.certificate.bound < found.total < 3.6  # 3.597 with the paths that are best at 6
+    result = hg.design(double, target_error=1.56566806, starts=16)
+    assert result.error == pytest.approx(1.56566806, rel=1e-10)
+    assert result.certificate.bound < result.total < 3.6  # 3.597 with the paths that are best at 6
 
 
 def test_the_price_is_the_slope_of_the_best_error(single):
     less, middle, more = (hg.design(single, budget=total) for total in (3.99, 4.0, 4.01))
     assert middle.price == pytest.approx((less.error - more.error) / 0.02, rel=1e-4)  # differences of second order
-    one = {name: value for name, value in middle.sensitivity.items() if middle.powers[name][0] > 0}
-    np.testing.assert_allclose(list(one.values()), -middle.price, rtol=1e-9)  # all that send earn the same
+    sending = {name: value for name, value in middle.sensitivity.items() if middle.powers[name][0] > 0}
+    np.testing.assert_allclose(list(sending.values()), -middle.price, rtol=1e-9)  # all that send earn the same
 
 
 def test_limits_of_each_and_peaks_hold(single):
     budget = Budget(total=6, per_transmitter={"a.hop1": 0.5}, peak=1.5)
-    found = hg.design(single, budget=budget, error=Error(period=2))
-    powers = np.array(list(found.powers.values()))
-    assert powers.max() <= 1.5 + 1e-9 and found.powers["a.hop1"].mean() <= 0.5 + 1e-9
-    assert found.total == pytest.approx(6, rel=1e-9) and found.certificate.gap < 1e-7
+    result = hg.design(single, budget=budget, error=Error(period=2))
+    powers = np.array(list(result.powers.values()))
+    assert powers.max() <= 1.5 + 1e-9 and result.powers["a.hop1"].mean() <= 0.5 + 1e-9
+    assert result.total == pytest.approx(6, rel=1e-9) and result.certificate.gap < 1e-7
     np.testing.assert_allclose(powers[:, 0], powers[:, 1], atol=1e-3)  # convex: one hop gains nothing by bursts
 
 
@@ -99,10 +99,10 @@ def test_bursts_beat_steady_sending_over_two_hops():
 
 
 def test_one_state_the_worst_direction_and_the_end_of_a_horizon(single):
-    one = hg.design(single, budget=2, error=Error({"x1": 1.0}))
+    single_state = hg.design(single, budget=2, error=Error({"x1": 1.0}))
     assert (
-        one.error == pytest.approx(one.covariance[0, 1, 1])
-        and one.error < hg.design(single, budget=2).covariance[0, 1, 1]
+        single_state.error == pytest.approx(single_state.covariance[0, 1, 1])
+        and single_state.error < hg.design(single, budget=2).covariance[0, 1, 1]
     )
     worst = hg.design(single, budget=2, error=Error(worst=True))
     assert worst.error == pytest.approx(np.linalg.eigvalsh(worst.covariance[0])[-1])
@@ -113,33 +113,33 @@ def test_one_state_the_worst_direction_and_the_end_of_a_horizon(single):
 
 
 def test_what_is_not_free_keeps_its_power(single):
-    found = hg.design(single, free=["a", "b.hop1"], budget=20)
+    result = hg.design(single, free=["a", "b.hop1"], budget=20)
     before = hg.power(single).mean
     for name in NAMES[2:]:
-        assert found.powers[f"{name}.hop1"][0] == pytest.approx(before[f"{name}.hop1"], rel=1e-12)
-    assert found.total == pytest.approx(20)
-    np.testing.assert_allclose(list(hg.power(found.network).mean.values()), [p[0] for p in found.powers.values()])
+        assert result.powers[f"{name}.hop1"][0] == pytest.approx(before[f"{name}.hop1"], rel=1e-12)
+    assert result.total == pytest.approx(20)
+    np.testing.assert_allclose(list(hg.power(result.network).mean.values()), [p[0] for p in result.powers.values()])
 
 
 def test_one_node_with_parallel_chains_is_the_same(single):
     joint = hg.LinearSensor(ROWS, np.diag(NOISES))
     chains = hg.parallel([node.channel for node in single.nodes.values()])
     whole = hg.Network(single.plant, {"all": hg.Node(joint, chains, {})})
-    found = hg.design(whole, budget=2)
-    assert found.error == pytest.approx(0.87632288, abs=1e-8)
-    assert list(found.powers)[1] == "all.part2.hop1"
+    result = hg.design(whole, budget=2)
+    assert result.error == pytest.approx(0.87632288, abs=1e-8)
+    assert list(result.powers)[1] == "all.part2.hop1"
 
 
 def test_the_designed_network_claims_the_designed_error(single):
-    found = hg.design(single, budget=10)
-    steady = steady_covariance(found.network.fused["best"])
-    assert np.trace(steady) == pytest.approx(found.error, rel=1e-9)
+    result = hg.design(single, budget=10)
+    steady = steady_covariance(result.network.fused["best"])
+    assert np.trace(steady) == pytest.approx(result.error, rel=1e-9)
 
 
 def test_drawn_runs_have_the_designed_error_and_power(single):
     """The filter's gain on runs drawn here: hops with gains of two values, noise, and the powers as amplifications."""
-    found, runs, draws = hg.design(single, budget=10), 5_000, np.random.default_rng(5)
-    p, power = found.covariance[0], np.array([found.powers[f"{n}.hop1"][0] for n in NAMES])
+    result, runs, draws = hg.design(single, budget=10), 5_000, np.random.default_rng(5)
+    p, power = result.covariance[0], np.array([result.powers[f"{n}.hop1"][0] for n in NAMES])
     pi = np.linalg.solve(np.eye(9) - np.kron(A, A), Q.ravel()).reshape(3, 3)
     amplify = np.sqrt(power / (np.einsum("ia,ab,ib->i", ROWS, pi, ROWS) + NOISES))
     paths, _ = paths_of(single, Error())
@@ -155,7 +155,7 @@ def test_drawn_runs_have_the_designed_error_and_power(single):
         g = mean * (1 + np.sqrt(KAPPA - 1) * draws.choice([-1, 1], size=(runs, 6)))
         z = (g * sent + draws.normal(size=(runs, 6))) / (mean * amplify)
         e = e - (z - (x - e) @ ROWS.T) @ gain.T
-    for drawn, expected in ((np.sum(e**2, axis=1), found.error), (np.sum(sent**2, axis=1), found.total)):
+    for drawn, expected in ((np.sum(e**2, axis=1), result.error), (np.sum(sent**2, axis=1), result.total)):
         assert abs(drawn.mean() - expected) < 3 * drawn.std() / np.sqrt(runs)
 
 
@@ -171,10 +171,10 @@ def test_an_unobserved_loss_is_fading(single):
 def test_a_wire_passes_on_what_its_sensor_measures(single):
     wired = hg.Node(hg.LinearSensor(ROWS[2:3], NOISES[2]), hg.perfect(), {})
     network = hg.Network(single.plant, {"wired": wired, "a": single.nodes["a"]})
-    found = hg.design(network, budget=1)
-    assert list(found.powers) == ["a.hop1"] and found.certificate.gap < 1e-12
-    steady = steady_covariance(found.network.fused["best"])
-    assert np.trace(steady) == pytest.approx(found.error, rel=1e-9)
+    result = hg.design(network, budget=1)
+    assert list(result.powers) == ["a.hop1"] and result.certificate.gap < 1e-12
+    steady = steady_covariance(result.network.fused["best"])
+    assert np.trace(steady) == pytest.approx(result.error, rel=1e-9)
 
 
 def test_an_error_that_nothing_sent_reaches_costs_nothing(single):

@@ -13,7 +13,7 @@ HOP = hg.hop(hg.Discrete([0.5, 1.5], [0.5, 0.5]), 0.3)
 @pytest.fixture(scope="module")
 def relays():
     pairs = [("north", "south"), ("south", "north")]
-    slots = [{hears: {"sensor": HOP}, "receiver": {sends: HOP}} for hears, sends in pairs]
+    slots = [{receiving: {"sensor": HOP}, "receiver": {sends: HOP}} for receiving, sends in pairs]
     return hg.model.RelayNetwork(PLANT, hg.LinearSensor([[1.0]], 0.5), ["north", "south"], slots)
 
 

@@ -15,10 +15,10 @@ from .feedback import (
     fed_back_channel as fed_back_channel,
     feedback_limit as feedback_limit,
 )
-from .path_networks import (
+from .paths.networks import (
     paths_of as paths_of,
 )
-from .paths import (
+from .paths.model import (
     independent_paths as independent_paths,
 )
 from .problem import (
@@ -28,6 +28,6 @@ from .problem import (
 from .realised import (
     designed_network as designed_network,
 )
-from .relaxation import (
+from .paths.relaxation import (
     split_power as split_power,
 )

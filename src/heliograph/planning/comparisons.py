@@ -9,10 +9,10 @@ import numpy as np
 from heliograph.model.channel import amplify_and_forward
 from heliograph.numerics.check import array, fail, instance
 from heliograph.numerics.readable import readable
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
 from heliograph.planning.problem import DesignProblem, PowerDesign
-from heliograph.planning.transmitters import Hop, replace_hops, transmitter_names
+from heliograph.planning.transmitters import Hop, Signal, transmitter_names, visit_hops
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.law import GivenMoments
@@ -90,8 +90,8 @@ class SiteMap(NamedTuple):
 def error_over_sites(
     best: PowerDesign,
     build: Callable[[float, float], Network],
-    x: Float[np.ndarray, "columns"],
-    y: Float[np.ndarray, "rows"],
+    x: ArrayLike,
+    y: ArrayLike,
     advance: Advance = _silent,
 ) -> SiteMap:
     """Least error at a design's total power, with its network standing elsewhere.
@@ -109,17 +109,18 @@ def error_over_sites(
     Raises:
         ValueError: a function that builds no network, what `hg.design` refuses.
     """
-    errors = np.zeros((len(y), len(x)))
+    columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
+    errors = np.zeros((len(rows), len(columns)))
     problem = best.problem.with_total(best.total)
     problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
-    for row, north in enumerate(y):
+    for row, north in enumerate(rows):
         advance(f"the map at y = {north:.4g}")
-        for column, east in enumerate(x):
+        for column, east in enumerate(columns):
             network = build(float(east), float(north))
             if not isinstance(network, Network):
                 raise fail("map", "a function of x and y that returns a Network", type(network).__name__)
             errors[row, column] = design(replace(problem, network=network)).error
-    return SiteMap(np.asarray(x), np.asarray(y), errors)
+    return SiteMap(columns, rows, errors)
 
 
 @readable
@@ -194,7 +195,7 @@ def _node(transmitter: str) -> str:
 def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
     """Channel in which a relay stands halfway of one hop."""
 
-    def change(hop_name: str, hop: Hop) -> AbstractRandomAffine:
+    def change(hop_name: str, hop: Hop, signal: Signal | None) -> AbstractRandomAffine:
         if hop_name != name or not isinstance(hop, GainAndNoise):
             return hop
         first, second = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))
@@ -202,4 +203,4 @@ def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> Abstr
         onward = GainAndNoise(law, np.eye(hop.outputs), hop.noise)
         return amplify_and_forward([GainAndNoise(law, hop.matrix, hop.noise), onward])
 
-    return replace_hops(channel, change)[0]
+    return visit_hops(channel, change)

@@ -7,7 +7,7 @@ Where the powers themselves are free p(x) = x and the rows are linear; else p is
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import Bounds, NonlinearConstraint, minimize
@@ -43,30 +43,20 @@ class Limits(NamedTuple):
     steps: int
 
 
-class Problem(Protocol):
-    """What a descent needs of a design problem: where x may be, its scale, and values at a point."""
+class Problem(NamedTuple):
+    """A design problem as a descent needs it.
 
-    @property
-    def low(self) -> Vector:
-        """Least values of x."""
+    low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
+    another, the last the sharpest. evaluate: error, powers and derivatives at x with a smoothing; None where they grow
+    without limit. restore: x moved back into the limits, as far as rounding took it out of them.
+    """
 
-    @property
-    def high(self) -> Vector:
-        """Largest values of x."""
-
-    @property
-    def unit(self) -> Vector:
-        """Scale of x."""
-
-    @property
-    def sharpnesses(self) -> Sequence[int | None]:
-        """Smoothings of the error, one after another, the last the sharpest."""
-
-    def evaluate(self, x: Vector, sharpness: int | None) -> Evaluation | None:
-        """Error, powers and derivatives; None where they grow without limit."""
-
-    def restore(self, x: Vector) -> Vector:
-        """The point moved back into the limits, as far as rounding took it out of them."""
+    low: Vector
+    high: Vector
+    unit: Vector
+    sharpnesses: Sequence[int | None]
+    evaluate: Callable[[Vector, int | None], Evaluation | None]
+    restore: Callable[[Vector], Vector]
 
 
 class Programme:

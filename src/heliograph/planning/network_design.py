@@ -7,24 +7,23 @@ import numpy as np
 from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.check import check_count, check_seed, fail, instance, items, scalar, shown
 from heliograph.numerics.types import ArrayLike, Bool
-from heliograph.planning.budget import Budget, as_budget, power_limits, unlimited
+from heliograph.planning.budget import as_budget, power_limits, unlimited
 from heliograph.planning.error import Error
-from heliograph.planning.free_numbers import Build
-from heliograph.planning.number_design import design_numbers
-from heliograph.planning.path_design import design_paths, power_task
-from heliograph.planning.path_networks import paths_of
-from heliograph.planning.paths import Paths
-from heliograph.planning.problem import DesignProblem, PowerDesign
+from heliograph.planning.numbers.design import design_numbers
+from heliograph.planning.paths.design import design_paths, power_task
+from heliograph.planning.paths.model import Paths
+from heliograph.planning.paths.networks import paths_of
+from heliograph.planning.problem import BudgetLike, Designable, DesignProblem, Free, PowerDesign
 from heliograph.planning.relay_design import design_relays
 from heliograph.planning.transmitters import selected
 from heliograph.simulation.network import Network
 
 
 def design(
-    network: Network | RelayNetwork | Paths | Build | DesignProblem,
-    free: Sequence[str] | Mapping[str, object] | None = None,
+    network: Designable,
+    free: Free | None = None,
     error: Error | None = None,
-    budget: Budget | ArrayLike | None = None,
+    budget: BudgetLike | None = None,
     target_error: ArrayLike | None = None,
     starts: int = 64,
     seed: int = 0,
@@ -65,7 +64,7 @@ def design(
     if isinstance(network, DesignProblem):
         problem = network
     else:
-        problem = DesignProblem(network, free, error, budget, target_error, starts, seed)  # type: ignore[arg-type]
+        problem = DesignProblem(network, free, error, budget, target_error, starts, seed)
     if problem.error is not None:
         instance("error", problem.error, Error, "an Error")
     item = problem.network

@@ -18,8 +18,8 @@ from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.planning.channel_power import sent_powers, steady_powers
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.transmitters import sent_powers, steady_powers
 from heliograph.relays.design import expected_maps, given_design
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import OWN, Network
@@ -207,6 +207,7 @@ def _drawn_moments(
         def step(x: jax.Array, item: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
             k, u = item
             moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
+            # The state moves, then every sensor measures it.
             now = at(plant, k)
             x = now.transition(x, u) + now.sample_noise(moves, u)
             moments = {}

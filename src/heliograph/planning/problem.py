@@ -1,8 +1,8 @@
 """The design problem and its result: powers (or other numbers) for a small error, with a certificate."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -10,13 +10,20 @@ from heliograph.model.relays import RelayNetwork
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, as_budget
 from heliograph.planning.error import Error
-from heliograph.planning.free_numbers import Build
-from heliograph.planning.paths import Paths
+from heliograph.planning.numbers.free_numbers import Build
+from heliograph.planning.paths.model import Paths
 from heliograph.planning.realised import designed_network
 from heliograph.simulation.network import Network
+
+if TYPE_CHECKING:
+    Designable: TypeAlias = "Network | RelayNetwork | Paths | Build | DesignProblem"
+    Free: TypeAlias = Sequence[str] | Mapping[str, object]
+    BudgetLike: TypeAlias = Budget | ArrayLike
+else:  # judged by `hg.design`, in one clear line
+    Designable = Free = BudgetLike = Any
 
 
 @readable
@@ -34,11 +41,11 @@ class DesignProblem:
         seed: of the starts that are drawn.
     """
 
-    network: Network | RelayNetwork | Paths | Build
-    free: tuple[str, ...] | Mapping[str, object] | None = None
+    network: Designable
+    free: Free | None = None
     error: Error | None = None
-    budget: Budget | float | None = None
-    target_error: float | None = None
+    budget: BudgetLike | None = None
+    target_error: ArrayLike | None = None
     starts: int = 64
     seed: int = 0
 

@@ -12,9 +12,9 @@ from heliograph.model.channel import parallel
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.sensor import LinearSensor
 from heliograph.numerics.types import Float
-from heliograph.planning.channel_power import allocate
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.transmitters import allocate
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 

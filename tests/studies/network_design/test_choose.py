@@ -16,25 +16,25 @@ PATHS = direct_paths()
 
 
 def test_choices_are_the_best_by_enumeration():
-    found = choose_sensors(PATHS, 3, 6.0)
-    each = {chosen: error_at(PATHS, [6.0 * (i in chosen) for i in range(6)]) for chosen in combinations(range(6), 3)}
-    assert found.chosen == min(each, key=each.get) and found.exact
-    assert found.error == pytest.approx(min(each.values()), rel=1e-10)
-    assert 0.6275 < found.bound < found.error
+    result = choose_sensors(PATHS, 3, 6.0)
+    errors = {chosen: error_at(PATHS, [6.0 * (i in chosen) for i in range(6)]) for chosen in combinations(range(6), 3)}
+    assert result.chosen == min(errors, key=errors.get) and result.exact
+    assert result.error == pytest.approx(min(errors.values()), rel=1e-10)
+    assert 0.6275 < result.bound < result.error
     assert choose_sensors(PATHS, 6, 6.0).bound == pytest.approx(error_at(PATHS, np.full(6, 6.0)), rel=1e-11)
 
 
 @pytest.mark.parametrize("count", [1, 2, 4])
 def test_a_search_finds_here_what_enumeration_does(count):
-    searched, found = choose_sensors(PATHS, count, 6.0, compared=0), choose_sensors(PATHS, count, 6.0)
-    assert searched.chosen == found.chosen and not searched.exact and "nothing can be better" in searched.words
+    searched, result = choose_sensors(PATHS, count, 6.0, compared=0), choose_sensors(PATHS, count, 6.0)
+    assert searched.chosen == result.chosen and not searched.exact and "nothing can be better" in searched.words
 
 
 def test_schedules_of_periods_one_to_four_have_the_printed_errors():
-    found = best_schedule(PATHS, 6.0, range(1, 5))
-    assert [round(found.by_period[k], 3) for k in range(1, 5)] == [1.167, 1.043, 1.006, 1.012]
-    assert (round(found.bound, 3), round(found.greedy, 3)) == (0.972, 1.024)
-    assert found.exact == (1, 2, 3, 4) and len(found.steps) == 3
+    result = best_schedule(PATHS, 6.0, range(1, 5))
+    assert [round(result.by_period[k], 3) for k in range(1, 5)] == [1.167, 1.043, 1.006, 1.012]
+    assert (round(result.bound, 3), round(result.greedy, 3)) == (0.972, 1.024)
+    assert result.exact == (1, 2, 3, 4) and len(result.steps) == 3
 
 
 def test_a_search_of_schedules_stays_above_the_bound():
@@ -46,24 +46,24 @@ def test_a_search_of_schedules_stays_above_the_bound():
 
 @pytest.mark.parametrize(("letters", "length"), [(2, 6), (3, 4), (6, 2)])
 def test_necklaces_stand_for_all_words(letters, length):
-    found = set(necklaces(letters, length))
+    result = set(necklaces(letters, length))
     rotations = {min(word[i:] + word[:i] for i in range(length)) for word in product(range(letters), repeat=length)}
-    assert found == rotations
+    assert result == rotations
 
 
 def test_bursts_beat_steady_sending_over_two_hops():
     far = independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
-    found = burst_sending(far, split_power([2.0, 2.0], 1.0), range(1, 11))
-    assert (found.every, round(found.errors[1], 4), round(found.error, 4)) == (8, 0.5235, 0.4026)
-    assert found.bound < found.error and "23.1 % below" in found.words
+    result = burst_sending(far, split_power([2.0, 2.0], 1.0), range(1, 11))
+    assert (result.every, round(result.errors[1], 4), round(result.error, 4)) == (8, 0.5235, 0.4026)
+    assert result.bound < result.error and "23.1 % below" in result.words
     assert burst_sending(far, [0.5, 0.5], [1, 2, 4, 8], peak=2.0).every == 4
     assert burst_sending(far, [50.0, 50.0], [1, 2]).every == 1  # not at high power
 
 
 def test_bursts_never_help_over_one_hop():
-    found = burst_sending(PATHS, np.ravel(list(hg.design(PATHS, budget=2.0).powers.values())), [1, 2, 3])
-    assert found.every == 1 and found.bound == pytest.approx(found.error, rel=1e-8)
-    assert list(found.errors.values()) == sorted(found.errors.values())
+    result = burst_sending(PATHS, np.ravel(list(hg.design(PATHS, budget=2.0).powers.values())), [1, 2, 3])
+    assert result.every == 1 and result.bound == pytest.approx(result.error, rel=1e-8)
+    assert list(result.errors.values()) == sorted(result.errors.values())
 
 
 def test_what_cannot_be_is_refused():

@@ -19,8 +19,8 @@ def searched(rho, exponent, hops):
 
     whole = [{"type": "eq", "fun": lambda x, i=i: np.split(x, 2)[i].sum() - 1} for i in range(2)]
     bounds = [(1e-6, 1.0)] * (2 * hops)
-    found = [minimize(noise, x, bounds=bounds, constraints=whole, options={"ftol": 1e-13}) for x in starts]
-    return min(one.fun for one in found if one.success)
+    result = [minimize(noise, x, bounds=bounds, constraints=whole, options={"ftol": 1e-13}) for x in starts]
+    return min(item.fun for item in result if item.success)
 
 
 @pytest.mark.parametrize(("rho", "exponent", "hops"), [(2.0, 3.0, 2), (20.0, 3.0, 3), (6.0, 2.4, 3)])

@@ -6,7 +6,7 @@ from scipy.linalg import solve_discrete_are
 
 from heliograph.numerics.check import InputError
 from heliograph.planning import split_power
-from heliograph.planning.paths import path_information
+from heliograph.planning.paths.model import path_information
 from heliograph.report.figures import png
 from heliograph_studies.network_design.theory import Radio, RelayScene, choose_relays, relay_line, relay_map, site_map
 from tests.planning.example import NOISES, PLANT, ROWS
@@ -32,37 +32,37 @@ def test_the_error_is_that_of_the_paths_that_are_taken():
 
 @pytest.mark.parametrize("power", [1.0, 0.2])
 def test_one_sensor_has_its_relay_on_the_line(power):
-    found = relay_map(LINE, power, np.linspace(0, 1, 11), np.linspace(-0.3, 0.3, 3), starts=2)
+    result = relay_map(LINE, power, np.linspace(0, 1, 11), np.linspace(-0.3, 0.3, 3), starts=2)
     site = relay_line(1 / power, 3.0).sites[0]
-    assert min(abs(found.sites[0, 0] - site), abs(1 - found.sites[0, 0] - site)) < 1e-4  # flat at the minimum
-    assert abs(found.sites[0, 1]) < 1e-4
-    assert found.bound <= found.error <= found.bound * (1 + 1e-7)
+    assert min(abs(result.sites[0, 0] - site), abs(1 - result.sites[0, 0] - site)) < 1e-4  # flat at the minimum
+    assert abs(result.sites[0, 1]) < 1e-4
+    assert result.bound <= result.error <= result.bound * (1 + 1e-7)
 
 
 def test_relays_only_help_and_never_more_than_the_bound_allows():
-    one = relay_map(SCENE, POWER, np.linspace(0, 4, 9), np.linspace(0, 3, 7))
+    item = relay_map(SCENE, POWER, np.linspace(0, 4, 9), np.linspace(0, 3, 7))
     two = relay_map(SCENE, POWER, np.linspace(0, 4, 9), np.linspace(0, 3, 7), relays=2, starts=1)
-    assert one.bound == two.bound < two.error < one.error <= one.errors.min() < one.direct
-    assert one.errors.shape == (7, 9) and np.all(one.errors <= one.direct)
+    assert item.bound == two.bound < two.error < item.error <= item.errors.min() < item.direct
+    assert item.errors.shape == (7, 9) and np.all(item.errors <= item.direct)
     draws = np.random.default_rng(0).uniform([0, 0], [4, 3], (50, 3, 2))
-    assert min(SCENE.error(sites, POWER) for sites in draws) > one.bound
-    assert SCENE.error(np.zeros((0, 2)), POWER) == pytest.approx(one.direct, rel=1e-14)
-    assert "no sites can be better" in one.words
+    assert min(SCENE.error(sites, POWER) for sites in draws) > item.bound
+    assert SCENE.error(np.zeros((0, 2)), POWER) == pytest.approx(item.direct, rel=1e-14)
+    assert "no sites can be better" in item.words
 
 
 def test_relays_are_chosen_among_sites():
     sites = np.random.default_rng(1).uniform([1, 0], [4, 3], (6, 2))
-    found, searched = choose_relays(SCENE, POWER, sites, 2), choose_relays(SCENE, POWER, sites, 2, compared=0)
+    result, searched = choose_relays(SCENE, POWER, sites, 2), choose_relays(SCENE, POWER, sites, 2, compared=0)
     errors = [SCENE.error(sites[[i, k]], POWER) for i in range(6) for k in range(i)]
-    assert found.error == min(errors) and found.exact and not searched.exact
-    assert found.bound == SCENE.error(sites, POWER) < found.error <= searched.error
+    assert result.error == min(errors) and result.exact and not searched.exact
+    assert result.bound == SCENE.error(sites, POWER) < result.error <= searched.error
     with pytest.raises(InputError, match="relays to choose: expected at most the 6 sites there are, got 7"):
         choose_relays(SCENE, POWER, sites, 7)
 
 
 def test_the_map_is_drawn():
-    found = relay_map(LINE, 0.2, np.linspace(0, 1, 5), np.linspace(-0.3, 0.3, 3), starts=1)
-    figure = site_map(found)
+    result = relay_map(LINE, 0.2, np.linspace(0, 1, 5), np.linspace(-0.3, 0.3, 3), starts=1)
+    figure = site_map(result)
     labels = figure.axes[0].get_legend_handles_labels()[1]
     assert labels == ["sensors", "receiver", "relay"] and "without" in figure.axes[0].get_title(loc="left")
     assert png(figure).startswith(b"\x89PNG")

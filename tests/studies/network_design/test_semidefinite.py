@@ -13,10 +13,10 @@ from tests.planning.example import direct_paths, paths_in_two_units, random_path
 @pytest.mark.parametrize("seed", range(3))
 def test_programme_and_design_agree(seed):
     paths, total = random_paths(seed), 2.0 + seed
-    found, programme = hg.design(paths, budget=total), semidefinite_design(paths, total)
-    assert found.error == pytest.approx(programme.error, rel=1e-7)  # the solver's accuracy
-    for bound in (found.bound, programme.bound):
-        assert bound <= min(found.error, programme.error)
+    result, programme = hg.design(paths, budget=total), semidefinite_design(paths, total)
+    assert result.error == pytest.approx(programme.error, rel=1e-7)  # the solver's accuracy
+    for bound in (result.bound, programme.bound):
+        assert bound <= min(result.error, programme.error)
 
 
 @pytest.mark.parametrize(
@@ -31,20 +31,20 @@ def test_programme_and_design_agree(seed):
 )
 def test_programme_and_design_agree_over_time(error, budget):
     paths = random_paths(5, error=error, unstable=error.horizon is not None)
-    found, programme = hg.design(paths, error=error, budget=budget), semidefinite_design(paths, budget, error)
-    assert found.error == pytest.approx(programme.error, rel=1e-7)
+    result, programme = hg.design(paths, error=error, budget=budget), semidefinite_design(paths, budget, error)
+    assert result.error == pytest.approx(programme.error, rel=1e-7)
 
 
 def test_the_worst_direction_is_bounded_by_its_dual():
     paths, error = random_paths(7), Error(worst=True)
-    found = semidefinite_design(paths, 3.0, error)
-    assert found.bound <= found.error <= found.bound * (1 + 1e-6)
-    assert found.error == pytest.approx(np.linalg.eigvalsh(steady(paths, found.powers[0]))[-1], rel=1e-9)
-    least = semidefinite_design(paths, error=error, target_error=found.error)
+    result = semidefinite_design(paths, 3.0, error)
+    assert result.bound <= result.error <= result.bound * (1 + 1e-6)
+    assert result.error == pytest.approx(np.linalg.eigvalsh(steady(paths, result.powers[0]))[-1], rel=1e-9)
+    least = semidefinite_design(paths, error=error, target_error=result.error)
     assert least.total == pytest.approx(3.0, rel=1e-6)
     assert least.bound <= 3.0 * (1 + 1e-9)
     # the descent smooths the largest eigenvalue: above the programme, and by no more than that leaves
-    assert found.bound <= hg.design(paths, error=error, budget=3.0).error <= found.error * (1 + 1e-3)
+    assert result.bound <= hg.design(paths, error=error, budget=3.0).error <= result.error * (1 + 1e-3)
 
 
 def test_powers_in_other_units_and_least_power_are_the_same():
@@ -57,8 +57,8 @@ def test_powers_in_other_units_and_least_power_are_the_same():
 
 def test_a_sensor_without_noise_and_a_hop_that_is_free():
     paths = independent_paths([[0.9]], [[0.3]], np.ones((3, 1)), [0.0, 0.1, 0.2], [1.0, 1.0, 1.1], [1.0, 2.0, 0.0])
-    found, programme = hg.design(paths, budget=1.0), semidefinite_design(paths, 1.0)
-    assert found.error == pytest.approx(programme.error, rel=1e-7) and found.bound <= programme.error
+    result, programme = hg.design(paths, budget=1.0), semidefinite_design(paths, 1.0)
+    assert result.error == pytest.approx(programme.error, rel=1e-7) and result.bound <= programme.error
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -67,8 +67,8 @@ def test_states_in_very_different_units_are_the_same_design(seed):
     plain, scaled, units = paths_in_two_units(seed)
     for worst in (False, True):
         error = Error(np.diag(units**-2.0), worst=worst)
-        found, again = semidefinite_design(plain, 2.0, Error(worst=worst)), semidefinite_design(scaled, 2.0, error)
-        assert again.error == pytest.approx(found.error, rel=1e-6)  # the solver's accuracy
+        result, again = semidefinite_design(plain, 2.0, Error(worst=worst)), semidefinite_design(scaled, 2.0, error)
+        assert again.error == pytest.approx(result.error, rel=1e-6)  # the solver's accuracy
         assert again.bound <= again.error <= again.bound * (1 + 1e-5)
 
 

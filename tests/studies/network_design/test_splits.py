@@ -67,12 +67,12 @@ LIMITS = [
 @pytest.mark.parametrize("limits", LIMITS, ids=["total", "each", "both", "small"])
 def test_the_closed_form_of_a_sum_is_the_cone_programme(limits):
     received = summed(3)
-    found, programme = coherent_powers(received, **limits), coherent_programme(received, **limits)
-    assert found.gap < 1e-14
-    assert found.error == pytest.approx(programme.error, rel=1e-7)  # the solver's accuracy
-    assert found.bound <= programme.error and programme.gap < 1e-7
-    assert found.powers.sum() <= limits.get("total", np.inf) * (1 + 1e-14)
-    assert np.all(found.powers <= limits.get("per_sensor", np.inf) * (1 + 1e-14))
+    result, programme = coherent_powers(received, **limits), coherent_programme(received, **limits)
+    assert result.gap < 1e-14
+    assert result.error == pytest.approx(programme.error, rel=1e-7)  # the solver's accuracy
+    assert result.bound <= programme.error and programme.gap < 1e-7
+    assert result.powers.sum() <= limits.get("total", np.inf) * (1 + 1e-14)
+    assert np.all(result.powers <= limits.get("per_sensor", np.inf) * (1 + 1e-14))
 
 
 def test_the_error_of_a_sum_is_that_of_the_riccati_equation():
@@ -86,10 +86,10 @@ def test_the_error_of_a_sum_is_that_of_the_riccati_equation():
 
 def test_the_total_has_its_closed_form_and_its_swap():
     received = summed(4)
-    found = coherent_powers(received, 3.0)
+    result = coherent_powers(received, 3.0)
     b, d, s = received.signal, received.spread, received.second
-    assert found.information == pytest.approx((b**2 / (d + received.noise * s / 3.0)).sum(), rel=1e-13)
-    assert coherent_least_power(received, found.error).powers.sum() == pytest.approx(3.0, rel=1e-11)
+    assert result.information == pytest.approx((b**2 / (d + received.noise * s / 3.0)).sum(), rel=1e-13)
+    assert coherent_least_power(received, result.error).powers.sum() == pytest.approx(3.0, rel=1e-11)
     limit = received.error((b**2 / d).sum())
     with pytest.raises(InputError, match=f"above {limit:.6g}, which unlimited power leaves"):
         coherent_least_power(received, 0.99 * limit)

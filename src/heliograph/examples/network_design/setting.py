@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 import heliograph as hg
-from heliograph.planning.paths import Paths
+from heliograph.planning.paths.model import Paths
 
 TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 PROCESS = np.diag([0.1, 0.05, 0.2])

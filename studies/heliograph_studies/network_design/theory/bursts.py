@@ -18,7 +18,7 @@ from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.error import Error
-from heliograph.planning.paths import Paths, path_information
+from heliograph.planning.paths.model import Paths, path_information
 from heliograph_studies.network_design.theory.choose import ROUNDING, sensor_set
 
 LOUDEST = 1e6  # times the mean power, the most that a bound looks at

@@ -18,8 +18,8 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.error import Error
-from heliograph.planning.information_filter import Plants, adjoint, covariances
-from heliograph.planning.paths import Paths, path_information
+from heliograph.planning.paths.information_filter import Plants, adjoint, covariances
+from heliograph.planning.paths.model import Paths, path_information
 
 COMPARED = 5000  # choices that are all compared; above, a search
 ROUNDING = 1e-12  # relative, by which a bound stays below what is computed

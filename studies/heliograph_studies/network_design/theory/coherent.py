@@ -17,7 +17,7 @@ from heliograph.numerics.check import array, covariance, fail, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.moments import steady_covariance
-from heliograph.planning.paths import at_least
+from heliograph.planning.paths.model import at_least
 from heliograph.planning.problem import Certificate
 
 Sensors = Float[np.ndarray, "M"]

@@ -16,7 +16,7 @@ from scipy.optimize import minimize_scalar
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.relaxation import split_power
+from heliograph.planning.paths.relaxation import split_power
 from heliograph_studies.network_design.theory.splits import path_noise
 
 GRID = 400  # lengths of the short hops that are tried, evenly and on a logarithmic scale

@@ -14,9 +14,9 @@ from heliograph.numerics.check import array, covariance, fail, instance, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.error import Error
-from heliograph.planning.information_filter import Plants, covariances
 from heliograph.planning.moments import steady_covariance
-from heliograph.planning.paths import Paths, at_least, independent_paths
+from heliograph.planning.paths.information_filter import Plants, covariances
+from heliograph.planning.paths.model import Paths, at_least, independent_paths
 from heliograph_studies.network_design.theory.relay_line import relay_line
 from heliograph_studies.network_design.theory.splits import path_noise
 

@@ -14,8 +14,8 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
 from heliograph.planning.error import Error
-from heliograph.planning.information_filter import updated
-from heliograph.planning.paths import Paths
+from heliograph.planning.paths.information_filter import updated
+from heliograph.planning.paths.model import Paths
 from heliograph_studies.network_design.theory.choose import COMPARED, SensorSet, sensor_set, shared
 
 Steps = tuple[tuple[int, ...], ...]  # the sensors of each step

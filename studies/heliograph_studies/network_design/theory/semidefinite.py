@@ -16,8 +16,8 @@ from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, PowerLimits, Powers, as_budget, power_limits, unlimited
 from heliograph.planning.error import Error
-from heliograph.planning.path_design import PathProblem, PowerTask, least_error, least_power, power_task
-from heliograph.planning.paths import Paths
+from heliograph.planning.paths.design import PathProblem, PowerTask, least_error, least_power, power_task
+from heliograph.planning.paths.model import Paths
 
 if TYPE_CHECKING:
     from cvxpy import Constraint

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.relaxation import hop_noises, split_power
+from heliograph.planning.paths.relaxation import hop_noises, split_power
 
 
 def path_noise(alpha: ArrayLike, total: ArrayLike) -> float:

@@ -8,13 +8,13 @@ with a water level y that the budget sets, exactly, since the powers are piecewi
 powers leads down, for the linearised error is concave in p; how far to go the slopes at both ends say.
 """
 
-from typing import Protocol
+from collections.abc import Callable
 
 import numpy as np
 
 from heliograph.numerics.types import Float
 from heliograph.planning.budget import PowerLimits, Powers
-from heliograph.planning.relaxation import SplitPaths
+from heliograph.planning.paths.relaxation import SplitPaths
 
 CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
 STEPS = 500
@@ -22,42 +22,34 @@ PATIENCE, TRIES = 20, 12  # iterations that close the gap no further; points on 
 STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
 
 
-class ConvexProblem(Protocol):
-    """What water filling needs: limits of the powers, and the error with its sensitivities to information and power."""
-
-    @property
-    def limits(self) -> PowerLimits:
-        """Limits of the powers."""
-
-    def sensitivity(self, powers: Powers) -> tuple[float, Powers, Powers]:
-        """Error, -d error / d j of each free hop's path, and d error / d p, shapes (time, free)."""
+Point = tuple[float, Powers, Powers]  # error, -d error / d j of each free hop's path, d error / d p
 
 
-def water_filling(problem: ConvexProblem, whole: SplitPaths, start: Powers) -> Powers:
-    """Best powers by the fixed point, from a start, until the gap closes or shrinks no more.
+def water_filling(
+    limits: PowerLimits, sensitivity: Callable[[Powers], Point], whole: SplitPaths, start: Powers
+) -> Powers:
+    """Best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
 
-    `whole` holds the path of each free hop, column by column.
+    `sensitivity` gives error and derivatives at powers (time, free), `whole` the path of each free hop.
     """
     a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
     b = whole.full * whole.alpha[..., 0]
     best = p = start
     smallest, idle = np.inf, 0
-    here = problem.sensitivity(p)
+    here = sensitivity(p)
     for _ in range(STEPS):
         # The gap of Frank and Wolfe: what the error's tangent leaves to be gained.
-        gap = float(np.sum(here[2] * (p - problem.limits.best(-here[2]))))
+        gap = float(np.sum(here[2] * (p - limits.best(-here[2]))))
         idle = 0 if gap < (1 - CLOSED) * smallest else idle + 1
         if gap < smallest:
             smallest, best = gap, p
         if gap <= CLOSED * abs(here[0]) or idle > PATIENCE:
             break
-        p, here = _along(problem, p, here, _filled(problem.limits, here[1], a, b) - p)
+        p, here = _along(sensitivity, p, here, _filled(limits, here[1], a, b) - p)
     return best
 
 
-def _along(
-    problem: ConvexProblem, p: Powers, here: tuple[float, Powers, Powers], ahead: Powers
-) -> tuple[Powers, tuple[float, Powers, Powers]]:
+def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
     """A point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
 
     Where rounding hides the way down, half of it, by which the gap still shrinks.
@@ -65,12 +57,12 @@ def _along(
     slope = float(np.sum(here[2] * ahead))
     length = 1.0
     for _ in range(TRIES if slope < 0 else 0):
-        there = problem.sensitivity(p + length * ahead)
+        there = sensitivity(p + length * ahead)
         rise = float(np.sum(there[2] * ahead))
         if rise <= -0.5 * slope and there[0] <= here[0]:
             return p + length * ahead, there
         length *= min(max(slope / (slope - rise), 0.1), 0.9)
-    return p + ahead / 2, problem.sensitivity(p + ahead / 2)
+    return p + ahead / 2, sensitivity(p + ahead / 2)
 
 
 def _filled(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:

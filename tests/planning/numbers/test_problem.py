@@ -5,8 +5,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Error
-from heliograph.planning.free_numbers import as_numbers, function_of_numbers
-from heliograph.planning.number_problem import NumberProblem
+from heliograph.planning.numbers.free_numbers import as_numbers, function_of_numbers
+from heliograph.planning.numbers.problem import NumberProblem
 
 PLANT = hg.LinearPlant([[0.9]], 0.3, [0.0], 1.0)
 OUTSIDE = {"noise": 0.3}
@@ -37,7 +37,7 @@ def test_marks_are_the_same_each_time():
 def test_other_steps_other_functions_and_a_start_of_their_own_compile():
     shared = problem()._slopes
     others = [problem(horizon=3), problem(start=1.0), problem(build=lambda amplification: one_hop(amplification))]
-    assert all(one._slopes is not shared for one in others)
+    assert all(item._slopes is not shared for item in others)
 
 
 def test_a_number_outside_of_the_function_that_is_another_now_is_seen(monkeypatch):

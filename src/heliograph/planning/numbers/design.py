@@ -8,9 +8,9 @@ from scipy.optimize import nnls
 from heliograph.numerics.check import check_count, check_seed, fail, scalar
 from heliograph.numerics.types import Float
 from heliograph.planning.budget import PowerLimits, as_budget, power_limits, unlimited
-from heliograph.planning.descent import ACTIVE, Limits, Programme, Vector, search
-from heliograph.planning.free_numbers import Build, function_of_numbers
-from heliograph.planning.number_problem import NumberProblem
+from heliograph.planning.descent import ACTIVE, Limits, Problem, Programme, Vector, search
+from heliograph.planning.numbers.free_numbers import Build, function_of_numbers
+from heliograph.planning.numbers.problem import NumberProblem
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
 from heliograph.planning.realised import repeated
 
@@ -42,11 +42,12 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     limits = _limits(_allowed(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
-    best = search(problem, limits, begin)
+    descent = problem.for_descent()
+    best = search(descent, limits, begin)
     if best is None:
-        raise _unmet(problem, limits, begin)
+        raise _unmet(descent, limits, begin)
     # The design, and what Lagrange's conditions say of it.
-    now, conditions = problem.at(best), lagrange_conditions(problem, limits, best)
+    now, conditions = problem.at(best), lagrange_conditions(descent, limits, best)
     network, error = problem.network(best), problem.criterion.exact(now.covariances)
     value, unit = (error, "error") if target is None else (conditions.value, "power")
     return PowerDesign(
@@ -82,13 +83,13 @@ def _limits(allowed: PowerLimits, target: float | None) -> Limits:
     return Limits(np.concatenate([peaks, rows]), np.concatenate([np.ones(len(peaks)), most]), target, len(allowed.peak))
 
 
-def _unmet(problem: NumberProblem, limits: Limits, begin: list[Vector]) -> ValueError:
+def _unmet(problem: Problem, limits: Limits, begin: list[Vector]) -> ValueError:
     """Error that says what is least where limits cannot be met: the error within them, or the power sent anyway."""
     starts, sharpest = len(begin), problem.sharpnesses[-1]
     if limits.target is not None:
         best = search(problem, limits._replace(target=None), begin)
         if best is not None:
-            error = problem.at(best).error
+            error = Programme(problem, limits._replace(target=None), sharpest, best).size
             return fail(
                 "target error", f"at least {error:.6g}, the least found from {starts} starts", f"{limits.target:.6g}"
             )
@@ -99,7 +100,7 @@ def _unmet(problem: NumberProblem, limits: Limits, begin: list[Vector]) -> Value
     return fail("budget", expected, "none that is")
 
 
-def lagrange_conditions(problem: NumberProblem, limits: Limits, x: Vector) -> Conditions:
+def lagrange_conditions(problem: Problem, limits: Limits, x: Vector) -> Conditions:
     """Multipliers of the limits that leave least of the gradient, what they leave, and a watt's worth."""
     programme, z = Programme(problem, limits, problem.sharpnesses[-1], x), x / problem.unit
     value, gradient = programme.value(z)
@@ -117,5 +118,4 @@ def lagrange_conditions(problem: NumberProblem, limits: Limits, x: Vector) -> Co
     if limits.target is not None:
         of_error = multipliers[-1] * programme.size / limits.target  # the power that one less of the error costs
         worth = (worth + 1 / limits.steps) / of_error if of_error > 0 else np.zeros_like(worth)
-    shape = limits.steps, len(problem.names)
-    return Conditions(value * programme.size, left / max(value, 1e-300), np.reshape(worth, shape))
+    return Conditions(value * programme.size, left / max(value, 1e-300), worth.reshape(limits.steps, -1))

@@ -7,7 +7,6 @@ kappa = E g^2 / (E g)^2 and F that of p / (p + alpha), alpha = Var m / E g^2. So
 nothing is divided by a power, which may be zero.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,8 +16,8 @@ from heliograph.numerics.check import array, covariance, fail, names
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
-from heliograph.planning.information_filter import Plants, adjoint, covariances
 from heliograph.planning.moments import moments_over, steady_moment
+from heliograph.planning.paths.information_filter import Plants, adjoint, covariances
 
 Powers = Float[np.ndarray, "time hop"]
 PathValues = Float[np.ndarray, "time path"]
@@ -59,7 +58,7 @@ def independent_paths(
     error: Error | None = None,
     initial_mean: ArrayLike | None = None,
     initial_covariance: ArrayLike | None = None,
-    hop_names: Sequence[str] | None = None,
+    names_: tuple[str, ...] | None = None,
 ) -> Paths:
     """Paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.
 
@@ -75,7 +74,7 @@ def independent_paths(
         error: over which steps: steady unless it has a period or a horizon.
         initial_mean: mean of x_0, shape (n,), zero unless given; used over a horizon.
         initial_covariance: covariance of x_0, shape (n, n), needed over a horizon.
-        hop_names: names of the transmitters, "sender0" and so on unless given.
+        names_: names of the transmitters, "sender0" and so on unless given.
 
     Returns:
         The paths, which `hg.design` takes in place of a network.
@@ -110,7 +109,7 @@ def independent_paths(
         path=np.repeat(np.arange(len(c)), hops),
         kappa=np.tile(fading.ravel(), (steps, 1)),
         alpha=np.tile(costs.ravel(), (steps, 1)),
-        names=names("names of transmitters", hop_names, len(c) * hops, "sender"),
+        names=names("names of transmitters", names_, len(c) * hops, "sender"),
     )
 
 

@@ -18,12 +18,12 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.same import same
 from heliograph.numerics.types import Array, Float
-from heliograph.planning.descent import Evaluation
+from heliograph.planning.descent import Evaluation, Problem
 from heliograph.planning.error import Criterion, Error
-from heliograph.planning.free_numbers import YOUNG, Build, Numbers, Vector, young_scalars
-from heliograph.planning.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
 from heliograph.planning.moments import check_stable
-from heliograph.planning.reception import check_time, means_are_known, mode_system, sources_of, transmitters_of
+from heliograph.planning.numbers.free_numbers import YOUNG, Build, Numbers, Vector, young_scalars
+from heliograph.planning.numbers.mode_riccati import ModeSolution, ModeSystem, lagrangian, solve_riccati
+from heliograph.planning.numbers.reception import check_time, means_are_known, mode_system, sources_of, transmitters_of
 from heliograph.simulation.network import Network
 
 UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
@@ -127,10 +127,6 @@ class NumberProblem:
         if not all(means_are_known(name, first(source.channel)) for name, source in sources):
             self.young, self.numbers = True, Numbers(numbers.by_name | {YOUNG: young_scalars(error.steps)})
         self.names, self.criterion = transmitters_of(network), error.criterion(network.states)
-        self.sharpnesses = [criterion.sharpness for criterion in self.criterion.sharper()]
-        self.low, self.high = self.numbers.low, self.numbers.high
-        span = self.high - self.low
-        self.unit = np.maximum(np.where(np.isfinite(span), span, np.abs(self.numbers.start)), 1e-12)
         self._system, self._slopes = programs(TracedNetwork(build, self.numbers, error, self.young, network))
         self._last: dict[tuple[bytes, int | None], Point] = {}
 
@@ -167,6 +163,9 @@ class NumberProblem:
             return None
         return Evaluation(now.error, now.slopes.error, now.powers.ravel(), now.slopes.powers.reshape(-1, len(x)))
 
-    def restore(self, x: Vector) -> Vector:
-        """The point itself: only a descent leads back into limits of the powers."""
-        return x
+    def for_descent(self) -> Problem:
+        """Problem of a descent, in units of the numbers' ranges, or of their starts where they have none."""
+        low, high = self.numbers.low, self.numbers.high
+        unit = np.maximum(np.where(np.isfinite(high - low), high - low, np.abs(self.numbers.start)), 1e-12)
+        sharpnesses = [criterion.sharpness for criterion in self.criterion.sharper()]
+        return Problem(low, high, unit, sharpnesses, self.evaluate, lambda x: x)  # only a descent leads back

@@ -8,8 +8,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.free_numbers import as_numbers
-from heliograph.planning.number_problem import NumberProblem
+from heliograph.planning.numbers.free_numbers import as_numbers
+from heliograph.planning.numbers.problem import NumberProblem
 
 PLANT = hg.LinearPlant([[0.9, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), np.zeros(2), np.eye(2))
 BOTH = hg.LinearSensor(np.eye(2), np.diag([0.2, 0.4]))
@@ -93,12 +93,12 @@ def first_step(measured):
 
 def test_the_error_is_that_of_the_recursion(problem):
     name, item = problem
-    found = item.at(item.numbers.start).covariances[0]
+    result = item.at(item.numbers.start).covariances[0]
     network = item.network(item.numbers.start)
     if name == "shared gain":
         node = network.nodes["node"]
         best = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((200, 0)))
-        np.testing.assert_allclose(found, best.covariances[-1], rtol=1e-10)
+        np.testing.assert_allclose(result, best.covariances[-1], rtol=1e-10)
         powers = item.at(item.numbers.start).powers
         np.testing.assert_allclose(powers[0], list(hg.power(network).mean.values()), rtol=1e-12)
         return
@@ -111,15 +111,15 @@ def test_the_error_is_that_of_the_recursion(problem):
             k = y @ m.output[j].T @ np.linalg.inv(m.output[j] @ y @ m.output[j].T + m.law[j] * m.noise[j])
             after[j] = y - k @ m.output[j] @ y
         parts = after
-    np.testing.assert_allclose(found, parts.sum(axis=0), rtol=1e-11)
+    np.testing.assert_allclose(result, parts.sum(axis=0), rtol=1e-11)
 
 
 def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
     problem = problem_of("observed losses")
-    found = problem.at(problem.numbers.start)
-    p, q = np.diag(found.covariances[0])
-    assert found.error == pytest.approx(p + 0.5 * q, rel=1e-12)
-    m, runs = first_step(found.system), 200
+    result = problem.at(problem.numbers.start)
+    p, q = np.diag(result.covariances[0])
+    assert result.error == pytest.approx(p + 0.5 * q, rel=1e-12)
+    m, runs = first_step(result.system), 200
     draws, covariance, total = np.random.default_rng(0), np.eye(2), []
     for _ in range(200):  # the filters that know which losses there were
         j = draws.choice(2, runs, p=m.law)
@@ -133,9 +133,9 @@ def test_observed_losses_are_bounded_by_what_drawn_losses_leave():
 
 def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
     """The gain of the bound, run under each extreme law: (x, e) is a linear system with random coefficients."""
-    found = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
-    node = found.network.nodes["node"]
-    k = problem_of("uncertain").at(np.append(1.2, found.numbers["young"])).solution.gains[0, 0]
+    result = hg.design(uncertain, free={"amplification": (1.2, 1.2, 1.2)}, budget=100, starts=1)
+    node = result.network.nodes["node"]
+    k = problem_of("uncertain").at(np.append(1.2, result.numbers["young"])).solution.gains[0, 0]
     a, q, c = PLANT.matrix, PLANT.noise.covariance, 1.2 * SUM.matrix
     for p in (0.2, 0.3, 0.4):
         values, law = np.array([0.6, 1.0, 1.4]), np.array([p, 0.4, 0.6 - p])
@@ -149,9 +149,9 @@ def test_a_bound_holds_for_every_possible_law_and_is_no_looser_than_a_filters():
                 noise = np.zeros((4, 4))
                 noise[2:, 2:] = k @ k.T * (0.2 * (1.2 * g) ** 2 + 0.3)
                 z += share * (f @ moved @ f.T + noise)
-        assert np.linalg.eigvalsh(found.covariance[0] - z[2:, 2:])[0] > 0
+        assert np.linalg.eigvalsh(result.covariance[0] - z[2:, 2:])[0] > 0
     filters = hg.linear_filter(PLANT, node.sensor, node.channel).planned(np.zeros((300, 0)))
-    assert found.error <= np.trace(filters.covariances[-1]) * 1.05
+    assert result.error <= np.trace(filters.covariances[-1]) * 1.05
 
 
 def test_a_relay_is_placed_where_the_closed_form_puts_it():
@@ -170,17 +170,17 @@ def test_a_relay_is_placed_where_the_closed_form_puts_it():
 
     power = 1 / rho  # rho = sigma^2 d^e / (nu P)
     free = {"site": (0.4, 0.02, 0.98), "first": (0.05, 1e-4, 1.0), "second": (0.05, 1e-4, 1.0)}
-    found = hg.design(at, free=free, budget=power, starts=3)
-    site = float(found.numbers["site"])
+    result = hg.design(at, free=free, budget=power, starts=3)
+    site = float(result.numbers["site"])
     assert site * (1 - site) == pytest.approx(1 / rho, abs=1e-4)
     noise = received * rho - (received - 0.5)
     p = 0.1
     for _ in range(500):
         p = 1 / (1 / (0.95**2 * p + 0.1) + 1 / noise)
-    assert found.error == pytest.approx(p, rel=1e-7)
-    assert found.total == pytest.approx(power, rel=1e-7) and found.certificate.stationarity < 1e-4
-    assert found.certificate.words.endswith("no bound is known")
-    assert hg.power(found.network).total == pytest.approx(power, rel=1e-7)
+    assert result.error == pytest.approx(p, rel=1e-7)
+    assert result.total == pytest.approx(power, rel=1e-7) and result.certificate.stationarity < 1e-4
+    assert result.certificate.words.endswith("no bound is known")
+    assert hg.power(result.network).total == pytest.approx(power, rel=1e-7)
 
 
 def test_powers_and_amplifications_agree():
@@ -206,9 +206,9 @@ def test_numbers_marked_where_they_stand_are_free():
         link = hg.hop(law, 0.3, amplification=hg.free(0.5, "amplification", "positive"))
         return hg.Network(PLANT, {"node": hg.Node(SUM, link, {})})
 
-    found = hg.design(marked, budget=2, starts=1)
-    assert found.error == pytest.approx(hg.design(one_hop(1.0), budget=2).error, rel=1e-9)
-    assert hg.power(found.network).total == pytest.approx(2, rel=1e-9) and found.numbers["amplification"] > 0.5
+    result = hg.design(marked, budget=2, starts=1)
+    assert result.error == pytest.approx(hg.design(one_hop(1.0), budget=2).error, rel=1e-9)
+    assert hg.power(result.network).total == pytest.approx(2, rel=1e-9) and result.numbers["amplification"] > 0.5
 
 
 @pytest.mark.parametrize(

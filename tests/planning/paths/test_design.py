@@ -8,9 +8,9 @@ import heliograph as hg
 from heliograph.numerics.check import InputError
 from heliograph.planning import Budget, Error, independent_paths, paths_of
 from heliograph.planning.budget import power_limits
-from heliograph.planning.path_design import power_task
-from heliograph.planning.relaxation import SplitPaths
-from heliograph.planning.water_filling import water_filling
+from heliograph.planning.paths.design import power_task
+from heliograph.planning.paths.relaxation import SplitPaths
+from heliograph.planning.paths.water_filling import water_filling
 from tests.planning.example import (
     NOISES,
     direct_paths,
@@ -41,12 +41,12 @@ def test_six_sensors_have_the_printed_optimum(total):
     equal, best, powers, least = BEST[total]
     paths = direct_paths()
     assert error_at(paths, np.full(6, total / 6)) == pytest.approx(equal, abs=1e-8)
-    found = hg.design(paths, budget=total)
-    assert found.error == pytest.approx(best, abs=1e-8)
-    np.testing.assert_allclose(powers_of(found)[0], powers, atol=1e-5)
-    assert found.total == pytest.approx(total, rel=1e-12)
-    assert error_at(paths, powers_of(found)[0]) == pytest.approx(found.error, rel=1e-12)
-    assert found.certificate.convex and found.certificate.gap < 1e-14  # rounding
+    result = hg.design(paths, budget=total)
+    assert result.error == pytest.approx(best, abs=1e-8)
+    np.testing.assert_allclose(powers_of(result)[0], powers, atol=1e-5)
+    assert result.total == pytest.approx(total, rel=1e-12)
+    assert error_at(paths, powers_of(result)[0]) == pytest.approx(result.error, rel=1e-12)
+    assert result.certificate.convex and result.certificate.gap < 1e-14  # rounding
     swapped = hg.design(paths, target_error=error_at(paths, np.full(6, total / 6)))
     assert swapped.total == pytest.approx(least, abs=1e-4)
     assert swapped.certificate.gap < 1e-12 * total
@@ -58,7 +58,7 @@ def test_water_filling_is_the_optimum_before_any_descent(seed):
     """Its gap closes, and the descent that begins there changes powers by no more than a flat optimum hides."""
     paths, total = random_paths(seed), 2.0 + seed
     task = task_of(paths, total)
-    filled = water_filling(task.problem, SplitPaths(*task.whole()), task.starts[0])
+    filled = water_filling(task.problem.limits, task.problem.sensitivity, SplitPaths(*task.whole()), task.starts[0])
     error = task.problem.exact(filled)
     assert error - task.problem.lower_bound(filled) <= 1e-13 * error
     np.testing.assert_allclose(filled, powers_of(hg.design(paths, budget=total)), atol=1e-6)
@@ -68,7 +68,7 @@ def test_water_filling_is_the_optimum_before_any_descent(seed):
 def test_design_and_plain_descent_agree(seed):
     """Plain descent is SciPy's, on the plain recursion with differences: nothing in common with the rest."""
     paths, total = random_paths(seed), 2.0 + seed
-    found = hg.design(paths, budget=total)
+    result = hg.design(paths, budget=total)
     descent = minimize(
         lambda x: error_at(paths, np.maximum(x, 0) * total),
         np.full(5, 0.2),
@@ -76,9 +76,9 @@ def test_design_and_plain_descent_agree(seed):
         constraints={"type": "eq", "fun": lambda x: x.sum() - 1},
         options={"ftol": 1e-13},
     )
-    assert found.certificate.gap <= 1e-10 * found.error
-    assert found.error == pytest.approx(descent.fun, rel=1e-6)  # that of differences
-    assert found.bound <= min(found.error, descent.fun)
+    assert result.certificate.gap <= 1e-10 * result.error
+    assert result.error == pytest.approx(descent.fun, rel=1e-6)  # that of differences
+    assert result.bound <= min(result.error, descent.fun)
 
 
 @pytest.mark.parametrize(
@@ -93,9 +93,9 @@ def test_design_and_plain_descent_agree(seed):
 )
 def test_limits_hold_over_time(error, budget):
     paths = random_paths(5, error=error, unstable=error.horizon is not None)
-    found = hg.design(paths, error=error, budget=budget)
-    assert found.certificate.gap <= 1e-12 * found.error
-    powers = powers_of(found)
+    result = hg.design(paths, error=error, budget=budget)
+    assert result.certificate.gap <= 1e-12 * result.error
+    powers = powers_of(result)
     mean = powers.mean(axis=0)
     assert mean.sum() == pytest.approx(budget.total, rel=1e-9)
     limits = budget.per_transmitter or np.inf, budget.peak or np.inf
@@ -109,12 +109,12 @@ def test_sending_at_every_step_alike_is_best_over_a_period():
 
 def test_the_worst_direction_is_bounded_by_the_weights_of_its_directions():
     paths, error = random_paths(7), Error(worst=True)
-    found = hg.design(paths, error=error, budget=3.0)
-    assert found.bound <= found.error <= found.bound * (1 + 1e-3)  # what smoothing the largest eigenvalue leaves
+    result = hg.design(paths, error=error, budget=3.0)
+    assert result.bound <= result.error <= result.bound * (1 + 1e-3)  # what smoothing the largest eigenvalue leaves
     trace = hg.design(paths, budget=3.0)
-    assert found.error < np.linalg.eigvalsh(steady(paths, powers_of(trace)[0]))[-1] - 1e-3  # or nothing would differ
-    assert found.error == pytest.approx(np.linalg.eigvalsh(steady(paths, powers_of(found)[0]))[-1], rel=1e-9)
-    least = hg.design(paths, error=error, target_error=found.error)
+    assert result.error < np.linalg.eigvalsh(steady(paths, powers_of(trace)[0]))[-1] - 1e-3  # or nothing would differ
+    assert result.error == pytest.approx(np.linalg.eigvalsh(steady(paths, powers_of(result)[0]))[-1], rel=1e-9)
+    least = hg.design(paths, error=error, target_error=result.error)
     assert least.total == pytest.approx(3.0, rel=1e-2) and least.bound <= 3.0 * (1 + 1e-9)
 
 
@@ -132,8 +132,8 @@ def test_the_gradient_is_that_of_differences():
 def test_powers_and_noises_in_other_units_are_the_same_design():
     paths = direct_paths()
     louder = paths._replace(alpha=1e6 * paths.alpha)
-    found, again = hg.design(paths, budget=2.0), hg.design(louder, budget=2e6)
-    np.testing.assert_allclose(powers_of(again), 1e6 * powers_of(found), rtol=1e-9, atol=1e-3)
+    result, again = hg.design(paths, budget=2.0), hg.design(louder, budget=2e6)
+    np.testing.assert_allclose(powers_of(again), 1e6 * powers_of(result), rtol=1e-9, atol=1e-3)
 
 
 def test_least_power_falls_with_the_target():
@@ -147,16 +147,16 @@ def test_least_power_falls_with_the_target():
 def test_a_sensor_without_noise_and_a_hop_that_is_free():
     """a = 0: the information is linear in the power. alpha = 0: it costs nothing."""
     paths = independent_paths([[0.9]], [[0.3]], np.ones((3, 1)), [0.0, 0.1, 0.2], [1.0, 1.0, 1.1], [1.0, 2.0, 0.0])
-    found = hg.design(paths, budget=1.0)
-    assert powers_of(found)[0, 2] == 0 and found.certificate.gap < 1e-14
+    result = hg.design(paths, budget=1.0)
+    assert powers_of(result)[0, 2] == 0 and result.certificate.gap < 1e-14
 
 
 def test_several_hops_are_designed_from_arrays_too():
-    found = hg.design(relayed_paths(), budget=6.0)
-    assert found.error == pytest.approx(1.36438855, abs=1e-8) and not found.certificate.convex
-    assert np.isnan(found.present)
+    result = hg.design(relayed_paths(), budget=6.0)
+    assert result.error == pytest.approx(1.36438855, abs=1e-8) and not result.certificate.convex
+    assert np.isnan(result.present)
     with pytest.raises(InputError, match="network of a design: expected a design of a Network"):
-        _ = found.network
+        _ = result.network
 
 
 def test_what_cannot_be_is_refused():
@@ -187,8 +187,8 @@ def test_what_cannot_be_is_refused():
 @pytest.mark.parametrize("seed", range(4))
 def test_states_in_very_different_units_are_the_same_design(seed):
     plain, scaled, units = paths_in_two_units(seed)
-    found, again = hg.design(plain, budget=2.0), hg.design(scaled, error=Error(np.diag(units**-2.0)), budget=2.0)
-    np.testing.assert_allclose(powers_of(again), powers_of(found), atol=1e-7)
+    result, again = hg.design(plain, budget=2.0), hg.design(scaled, error=Error(np.diag(units**-2.0)), budget=2.0)
+    np.testing.assert_allclose(powers_of(again), powers_of(result), atol=1e-7)
 
 
 def test_the_paths_of_a_network_have_the_powers_of_its_design():
@@ -201,6 +201,6 @@ def test_the_paths_of_a_network_have_the_powers_of_its_design():
     }
     network, error = hg.Network(plant, nodes), Error(horizon=3)
     paths, _ = paths_of(network, error)
-    found, design = hg.design(paths, error=error, budget=2.0), hg.design(network, error=error, budget=2.0)
-    assert found.error == pytest.approx(design.error, rel=1e-10) and found.bound <= design.error
-    np.testing.assert_allclose(powers_of(found), powers_of(design), rtol=1e-5)
+    result, design = hg.design(paths, error=error, budget=2.0), hg.design(network, error=error, budget=2.0)
+    assert result.error == pytest.approx(design.error, rel=1e-10) and result.bound <= design.error
+    np.testing.assert_allclose(powers_of(result), powers_of(design), rtol=1e-5)

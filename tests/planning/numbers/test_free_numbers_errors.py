@@ -6,9 +6,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.planning import Budget, Error
-from heliograph.planning.free_numbers import as_numbers
-from heliograph.planning.number_problem import NumberProblem
-from tests.planning.test_free_numbers import CASES, FADING, PLANT, check_gradients, observed_modes, uncertain
+from heliograph.planning.numbers.free_numbers import as_numbers
+from heliograph.planning.numbers.problem import NumberProblem
+from tests.planning.numbers.test_free_numbers import CASES, FADING, PLANT, check_gradients, observed_modes, uncertain
 
 SENSORS = {"p": hg.LinearSensor([[1.0, 0.0]], 0.2), "q": hg.LinearSensor([[0.0, 1.0]], 0.4)}
 NOISES = {"p": 0.3, "q": 0.6}
@@ -20,7 +20,7 @@ def two(**amplifications):
     def channel(name, a):
         if jnp.ndim(a) == 0:
             return hg.hop(FADING, NOISES[name], amplification=a)
-        return hg.model.over_time([hg.hop(FADING, NOISES[name], amplification=one) for one in a])
+        return hg.model.over_time([hg.hop(FADING, NOISES[name], amplification=item) for item in a])
 
     return hg.Network(PLANT, {n: hg.Node(SENSORS[n], channel(n, a), {}) for n, a in amplifications.items()})
 
@@ -43,7 +43,7 @@ def test_gradients_of_every_error_are_those_of_differences(build, free, error):
 
 
 @pytest.mark.parametrize(
-    ("free", "asked"),
+    ("free", "options"),
     [
         (
             CONSTANT,
@@ -56,20 +56,20 @@ def test_gradients_of_every_error_are_those_of_differences(build, free, error):
         (BY_STEP, {"error": Error(period=2), "target_error": 0.6}),
     ],
 )
-def test_designs_are_those_by_powers(free, asked):
+def test_designs_are_those_by_powers(free, options):
     """Error, power, price and sensitivities; 1e-6 of powers and prices, which a flat optimum tells less exactly."""
-    found, best = hg.design(two, free=free, starts=1, **asked), hg.design(two(p=1.0, q=1.0), **asked)
-    assert found.error == pytest.approx(best.error, rel=1e-7) and found.total == pytest.approx(best.total, rel=1e-6)
-    assert found.present > 0 and found.covariance.shape == best.covariance.shape
+    result, best = hg.design(two, free=free, starts=1, **options), hg.design(two(p=1.0, q=1.0), **options)
+    assert result.error == pytest.approx(best.error, rel=1e-7) and result.total == pytest.approx(best.total, rel=1e-6)
+    assert result.present > 0 and result.covariance.shape == best.covariance.shape
     sends = [name for name, power in best.powers.items() if power.mean() > 1e-3]
     for name in sends:
-        assert found.sensitivity[name] == pytest.approx(best.sensitivity[name], rel=1e-5)
-    assert found.price == pytest.approx(best.price, rel=1e-5)
-    assert found.certificate.stationarity < 1e-6
-    assert found.certificate.words.startswith("best of the one start, stationary within")
-    if asked["error"].period > 1:  # it runs on, and sends what it should
-        assert hg.power(found.network, horizon=40).mean["p.hop1"] == pytest.approx(
-            found.powers["p.hop1"].mean(), rel=0.1
+        assert result.sensitivity[name] == pytest.approx(best.sensitivity[name], rel=1e-5)
+    assert result.price == pytest.approx(best.price, rel=1e-5)
+    assert result.certificate.stationarity < 1e-6
+    assert result.certificate.words.startswith("best of the one start, stationary within")
+    if options["error"].period > 1:  # it runs on, and sends what it should
+        assert hg.power(result.network, horizon=40).mean["p.hop1"] == pytest.approx(
+            result.powers["p.hop1"].mean(), rel=0.1
         )
 
 
@@ -79,13 +79,13 @@ def test_without_a_limit_of_power_a_watt_is_worth_nothing_and_the_inner_optimum_
     def at(p):
         return two(p=1.0 + 0.0 * p, q=1.0 / (1.0 + (p - 0.4) ** 2))
 
-    found = hg.design(at, free={"p": (0.1, -1.0, 1.0)}, starts=1)
-    assert found.numbers["p"] == pytest.approx(0.4, abs=1e-5) and found.certificate.stationarity < 1e-6
-    assert found.price == 0.0 and set(found.sensitivity.values()) == {0.0}
+    result = hg.design(at, free={"p": (0.1, -1.0, 1.0)}, starts=1)
+    assert result.numbers["p"] == pytest.approx(0.4, abs=1e-5) and result.certificate.stationarity < 1e-6
+    assert result.price == 0.0 and set(result.sensitivity.values()) == {0.0}
 
 
 @pytest.mark.parametrize(
-    ("build", "free", "asked", "message"),
+    ("build", "free", "options", "message"),
     [
         (
             two,
@@ -109,6 +109,6 @@ def test_without_a_limit_of_power_a_watt_is_worth_nothing_and_the_inner_optimum_
         ),
     ],
 )
-def test_what_cannot_be_is_said_in_one_line(build, free, asked, message):
+def test_what_cannot_be_is_said_in_one_line(build, free, options, message):
     with pytest.raises(ValueError, match=message):
-        hg.design(build, free=free, starts=1, **asked)
+        hg.design(build, free=free, starts=1, **options)

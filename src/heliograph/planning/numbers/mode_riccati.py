@@ -157,6 +157,7 @@ def _adjoint(m: ModeSystem, loops: Parts, weights: Float[np.ndarray, "time n n"]
             result.append(back[k] @ (terms[k] + result[-1]))
         return result
 
+    # Around a period L before the first step is that behind the last.
     after = np.zeros(modes * n * n)
     if m.start is None:
         around = reduce(lambda product, factor: product @ factor, back)

@@ -9,12 +9,11 @@ from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
-from heliograph.planning.channel_power import sent_powers
 from heliograph.planning.error import Error
-from heliograph.planning.information_filter import Plants
 from heliograph.planning.moments import check_constant_noise, measurement_moment, moments_over, steady_moment
-from heliograph.planning.paths import Paths
-from heliograph.planning.transmitters import transmits
+from heliograph.planning.paths.information_filter import Plants
+from heliograph.planning.paths.model import Paths
+from heliograph.planning.transmitters import sent_powers, transmits
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Mixture, Series, Stack
@@ -57,6 +56,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     else:
         check_horizon(steps, covered)
         seconds, start = moments_over(plant, steps), np.asarray(first(plant).initial_covariance)
+    # Paths of each step, and the plant's moves.
     described = [_at_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     rows, second, signal, kappa, alpha, powers = (np.array(part) for part in list(zip(*described, strict=True))[:6])
     moves = [at(plant, k) for k in range(steps)]
@@ -188,9 +188,11 @@ def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"
         if not isinstance(sensor, LinearSensor):
             raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
         refuse_angles("design", sensor)
+        # Chains, and what their transmitters send at present.
         y, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
         chains, sends = chains_of(channel, np.eye(len(sensor.outputs), len(y))), sent_powers(channel, y, k)
         _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
+        # Each chain is a path: what it carries of the sensor's outputs, then its hops.
         for chain in chains:
             row = chain.row[:-1]
             step.rows.append(row @ np.asarray(sensor.matrix))

@@ -4,19 +4,19 @@ import numpy as np
 import pytest
 
 from heliograph.planning import Error
-from heliograph.planning.information_filter import Plants, RiccatiMap, adjoint, covariances, fixed_point
-from heliograph.planning.path_networks import paths_of
+from heliograph.planning.paths.information_filter import Plants, RiccatiMap, adjoint, covariances, fixed_point
+from heliograph.planning.paths.networks import paths_of
 from tests.planning.published import A, Q, path_problem, two_hops
 
 
 def recursion(plants, information, start, steps):
     """P^-1 = (A P A' + Q)^-1 + J, as it is written."""
-    p, found, period = start, [], len(information)
+    p, result, period = start, [], len(information)
     for k in range(steps):
         a, q = plants.transition[k % period], plants.process[k % period]
         p = np.linalg.inv(np.linalg.inv(a @ p @ a.T + q) + information[k % period])
-        found.append(p)
-    return np.array(found)
+        result.append(p)
+    return np.array(result)
 
 
 def random_steps(steps, seed):

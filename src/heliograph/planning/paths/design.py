@@ -8,12 +8,12 @@ import numpy as np
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Bool, Float, Int
 from heliograph.planning.budget import MET, PowerLimits, Powers
-from heliograph.planning.descent import Evaluation, Limits, Vector, search
+from heliograph.planning.descent import Evaluation, Limits, Problem, Vector, search
 from heliograph.planning.error import Criterion
-from heliograph.planning.paths import PathInformation, Paths, error_covariances, path_information, sensitivities
+from heliograph.planning.paths.model import PathInformation, Paths, error_covariances, path_information, sensitivities
+from heliograph.planning.paths.relaxation import SplitPaths, envelope, split_paths
+from heliograph.planning.paths.water_filling import water_filling
 from heliograph.planning.problem import Certificate, DesignProblem, PowerDesign
-from heliograph.planning.relaxation import SplitPaths, envelope, split_paths
-from heliograph.planning.water_filling import water_filling
 
 UNLIMITED = 1e13  # times alpha: more changes nothing but rounding
 REACHED = 1e-9  # relative: a target so near to what unlimited power leaves is not reached
@@ -36,30 +36,6 @@ class PathProblem(NamedTuple):
     information: Callable[[Powers], PathInformation]
     limits: PowerLimits
     scale: float
-
-    @property
-    def low(self) -> Vector:
-        """No power."""
-        return np.zeros(self.limits.peak.size)
-
-    @property
-    def high(self) -> Vector:
-        """Peak powers."""
-        return self.limits.peak.ravel()
-
-    @property
-    def unit(self) -> Vector:
-        """Scale of each power."""
-        return np.full(self.limits.peak.size, self.scale)
-
-    @property
-    def sharpnesses(self) -> list[int | None]:
-        """Smoothings of the largest eigenvalue."""
-        return [criterion.sharpness for criterion in self.criterion.sharper()]
-
-    def restore(self, x: Vector) -> Vector:
-        """Powers within the limits."""
-        return self.limits.clip(x.reshape(self.limits.peak.shape)).ravel()
 
     def covariances(self, powers: Powers) -> Float[np.ndarray, "time n n"]:
         """P after each step."""
@@ -109,9 +85,17 @@ class PathProblem(NamedTuple):
     def solve(self, starts: list[Powers], target: float | None = None) -> Powers | None:
         """Best powers found from these starts, for the least error or for the least total that reaches a target."""
         rows, most = self.limits.rows()
-        limits = Limits(rows, most, target, len(self.limits.peak))
-        best = search(self, limits, [start.ravel() for start in starts])
-        return None if best is None else np.maximum(best, 0.0).reshape(self.limits.peak.shape)
+        peak = self.limits.peak
+        problem = Problem(
+            low=np.zeros(peak.size),
+            high=peak.ravel(),
+            unit=np.full(peak.size, self.scale),
+            sharpnesses=[criterion.sharpness for criterion in self.criterion.sharper()],
+            evaluate=self.evaluate,
+            restore=lambda x: self.limits.clip(x.reshape(peak.shape)).ravel(),
+        )
+        best = search(problem, Limits(rows, most, target, len(peak)), [start.ravel() for start in starts])
+        return None if best is None else np.maximum(best, 0.0).reshape(peak.shape)
 
 
 class PowerTask(NamedTuple):
@@ -213,7 +197,7 @@ def least_error(task: PowerTask) -> tuple[Powers, Certificate]:
     problem, starts = task.problem, task.starts
     if task.convex and problem.criterion.sharpness is None and np.all(np.isfinite(starts[0])):
         whole = SplitPaths(*(part[:, problem.path] for part in task.whole()))
-        starts = [water_filling(problem, whole, starts[0])]
+        starts = [water_filling(problem.limits, problem.sensitivity, whole, starts[0])]
     powers = problem.solve(starts)
     assert powers is not None  # the starts are within the limits
     # The bound of a convex error, or of the concave envelopes above each path's information.

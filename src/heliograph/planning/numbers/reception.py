@@ -22,11 +22,10 @@ from heliograph.model.over_time import OverTime, at, first, steps_covered
 from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array, Bool, Float
-from heliograph.planning.channel_power import powers_of_law
 from heliograph.planning.error import Error
-from heliograph.planning.mode_riccati import ModeSystem
 from heliograph.planning.moments import check_constant_noise, measurement_moment, moments_over, steady_moment
-from heliograph.planning.transmitters import transmitter_names
+from heliograph.planning.numbers.mode_riccati import ModeSystem
+from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain, stationary
 from heliograph.random_affine.combine import Stack

@@ -14,7 +14,7 @@ import numpy as np
 
 from heliograph.numerics.check import array, fail, scalar
 from heliograph.numerics.types import ArrayLike, Bool, Float
-from heliograph.planning.paths import Paths, PathValues, Powers, at_least, fading, passed
+from heliograph.planning.paths.model import Paths, PathValues, Powers, at_least, fading, passed
 
 NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
 BISECTIONS = 120
