@@ -134,3 +134,12 @@ def test_the_steady_power_does_not_depend_on_the_modes_at_the_beginning():
         hg.power(varying)
     first = hg.power(result, horizon=1).mean["node.hop2"]
     assert first == pytest.approx(0.3 + (1 + 4 * 0.81 + 0.5), rel=1e-12)  # begins so, with a mean of 2
+
+
+def test_a_mixture_of_a_noise_and_a_hop_has_one_transmitter():
+    """Jamming without a signal is no transmitter; behind it a relay receives noise of .5, or the hop's 1.5 + .2."""
+    atoms = hg.random_affine
+    jamming = atoms.GainAndNoise(atoms.Constant(1.0), np.zeros((1, 1)), 0.5)
+    mixture = atoms.Mixture([jamming, hg.hop(1.0, 0.2)], [0.3, 0.7])
+    sent = hg.power(network(hg.amplify_and_forward([mixture, hg.hop(1.0, 0.1)]))).mean
+    assert sent == pytest.approx({"node.hop1": 1.5, "node.hop2": 0.3 * 0.5 + 0.7 * 1.7}, rel=1e-12)

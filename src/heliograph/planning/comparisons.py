@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.channel import amplify_and_forward
-from heliograph.numerics.check import array, fail, instance
+from heliograph.numerics.check import array, fail, function, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.network_design import design
@@ -109,6 +109,8 @@ def error_over_sites(
     Raises:
         ValueError: a function that builds no network, what `hg.design` refuses.
     """
+    instance("design", best, PowerDesign, "a PowerDesign")
+    function("network of a map", build, "x and y")
     columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
     errors = np.zeros((len(rows), len(columns)))
     problem = best.problem.with_total(best.total)
@@ -152,6 +154,7 @@ def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: 
     Raises:
         ValueError: a design of anything but a Network.
     """
+    instance("design", best, PowerDesign, "a PowerDesign")
     network = instance("network of the design", best.problem.network, Network, "a Network")
     problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
     result = []

@@ -11,6 +11,7 @@ from heliograph.filters.linear import linear_filter
 from heliograph.model.channel import parallel
 from heliograph.model.over_time import OverTime, at, over_time
 from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import instance
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
@@ -41,7 +42,8 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
     Raises:
         ValueError: an unstable plant without a horizon, a transmitter that receives nothing.
     """
-    plant = network.plant
+    plant = instance("network", network, Network, "a Network").plant
+    instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     # Channels with these powers, step by step.
     seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)

@@ -231,6 +231,43 @@ def test_bad_numbers_are_named(free, message):
         hg.design(one_hop, free=free, budget=1)
 
 
+@pytest.mark.parametrize("loss", [hg.erasure, hg.dropout])
+@pytest.mark.parametrize("budget", [None, 1.0])
+def test_an_arrival_probability_is_free_where_nothing_is_transmitted(loss, budget):
+    """The more arrives the better, up to its end; there are no powers."""
+
+    def built(arrival):
+        return hg.Network(PLANT, {"a": hg.Node(SUM, loss(hg.perfect(), arrival), {})})
+
+    best = hg.design(built, free={"arrival": (0.5, 0.1, 0.9)}, budget=budget, starts=1)
+    assert best.numbers["arrival"] == pytest.approx(0.9, abs=1e-9) and best.powers == {}
+    least = hg.design(built, free={"arrival": (0.5, 0.1, 0.9)}, target_error=best.error * 1.1, starts=1)
+    assert 0.1 < least.numbers["arrival"] < 0.9 and least.error <= best.error * 1.1 * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 2.0), (0.1, -np.inf)])
+def test_ends_at_which_there_is_no_network_are_refused_before_any_descent(low, high, monkeypatch):
+    monkeypatch.setattr("heliograph.planning.numbers.design.search", None)
+    sign, ends = (1, (0.5, low, high)) if high > 0 else (-1, (-0.5, -2.0, 1.0))
+
+    def built(noise):
+        return hg.Network(PLANT, {"a": hg.Node(SUM, hg.hop(1.0, sign * noise), {})})
+
+    wrong = r"ends of 'noise': expected numbers between which there is a network, got -?1\.0, where: hop noise"
+    with pytest.raises(ValueError, match=wrong):
+        hg.design(built, free={"noise": ends}, budget=1.0)
+
+
+def test_an_end_that_is_never_reached_may_be_none():
+    """A transmitter without power is refused; one of any power above zero is not."""
+
+    def built(power):
+        return hg.Network(PLANT, {"a": hg.Node(SUM, hg.hop(1.0, 0.3, power=power), {})})
+
+    best = hg.design(built, free={"power": (0.5, 0.0, 2.0)}, budget=1.0, starts=1)
+    assert best.numbers["power"] > 0
+
+
 def test_a_function_that_jax_cannot_follow_is_named():
     with pytest.raises(ValueError, match=r"network of free numbers: expected operations of jax\.numpy .*got Concret"):
         hg.design(lambda a: one_hop(float(a)), free={"a": (1.0, 0.1, 2.0)}, budget=1, starts=1)

@@ -38,7 +38,9 @@ def design_numbers(task: DesignProblem, build: Build) -> PowerDesign:
     target = None if task.target_error is None else float(scalar("target error", task.target_error, 0.0))
     if target == 0:
         raise fail("target error", "a number above zero", "0")
-    before = problem.at(problem.numbers.start)  # what cannot be is refused before any descent
+    # What cannot be is refused before any descent.
+    before = problem.at(problem.numbers.start)
+    problem.check_ends()
     limits = _limits(_allowed(problem, task.budget), target)
     draws = np.random.default_rng(seed)
     begin = [problem.numbers.start, *(problem.numbers.drawn(draws) for _ in range(starts - 1))]
@@ -69,7 +71,7 @@ def _allowed(problem: NumberProblem, budget: object) -> PowerLimits:
     if budget is None:
         return unlimited(steps, hops)
     limits = power_limits(as_budget(budget), problem.names, np.ones(hops, dtype=bool), np.zeros((steps, hops)))
-    if min(np.min(limits.peak), np.min(limits.mean), limits.total) <= 0:
+    if min(np.min(limits.peak, initial=np.inf), np.min(limits.mean, initial=np.inf), limits.total) <= 0:
         raise fail("budget", "limits above zero where numbers are free", "zero")
     return limits
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.model.over_time import first
-from heliograph.numerics.check import fail, instance
+from heliograph.numerics.check import InputError, fail, instance
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.same import same
 from heliograph.numerics.types import Array, Float
@@ -28,6 +28,7 @@ from heliograph.simulation.network import Network
 
 UNTRACEABLE = jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError
 PROGRAMS = 16  # networks whose programs are cached
+INSIDE = 1e-9  # of the way from an end to the start
 
 
 class Slopes(NamedTuple):
@@ -83,7 +84,7 @@ class TracedNetwork:
         of_powers = jax.tree.map(lambda part: jnp.zeros((size, *part.shape)), m)._replace(powers=unit)
         cotangents = jax.tree.map(lambda error, rest: jnp.concatenate([error[None], rest]), of_error, of_powers)
         slopes = jax.vmap(pull)(cotangents)[0]
-        return Slopes(slopes[0], slopes[1:].reshape(*m.powers.shape, -1))
+        return Slopes(slopes[0], slopes[1:].reshape(*m.powers.shape, len(x)))
 
 
 @lru_cache(PROGRAMS)
@@ -136,6 +137,23 @@ class NumberProblem:
         values = {name: float(v) if np.ndim(v) == 0 else v for name, v in named if name != YOUNG}
         with jax.enable_x64(True):
             return instance("network of free numbers", self.build(**values), Network, "a Network")
+
+    def check_ends(self) -> None:
+        """Raise ValueError where a number near an end of its range, the others at their starts, makes no network.
+
+        An end itself may be one that is never reached, as a noise of variance zero.
+        """
+        starts = {name: number.start for name, number in self.numbers.by_name.items()}
+        for name, (start, low, high) in self.numbers.by_name.items():
+            for end in (low, high):
+                near = np.where(np.isfinite(end), end, start)
+                near = near + INSIDE * (start - near)
+                values = {other: near if other == name else begin for other, begin in starts.items()}
+                try:
+                    self.network(np.concatenate([part.ravel() for part in values.values()]))
+                except InputError as error:
+                    what = f"{' '.join(str(end).split())}, where: {error}"
+                    raise fail(f"ends of {name!r}", "numbers between which there is a network", what) from None
 
     def at(self, x: Vector, criterion: Criterion | None = None) -> Point:
         """Everything at a point, of an eigenvalue as sharp as the criterion has it.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.model.plant import LinearPlant
-from heliograph.numerics.check import array, covariance, fail, names
+from heliograph.numerics.check import array, covariance, fail, instance, names
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float, Int
 from heliograph.planning.error import Error
@@ -83,7 +83,7 @@ def independent_paths(
         ValueError: wrong shapes, kappa below 1, negative variances, a plant that is not stable without a horizon, no
             law of x_0 with one.
     """
-    error = Error() if error is None else error
+    error = instance("error", Error() if error is None else error, Error, "an Error")
     a = array("transition of paths", transition, (None, None))
     n, hops, steps = len(a), 1 if np.ndim(alpha) < 2 else np.shape(alpha)[1], error.steps
     a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, minimize
 
-from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.error import Error
@@ -93,10 +93,10 @@ def sensor_set(paths: Paths, powers: ArrayLike, error: Error | None, states: tup
         raise fail("error of a choice", "a trace", "the worst direction")
     try:
         p = np.broadcast_to(np.asarray(powers, dtype=np.float64), (1, hops))
-    except ValueError:
-        raise fail("powers", f"one number or one for each of {hops} hops", f"shape {np.shape(powers)}") from None
+    except (TypeError, ValueError):
+        raise fail("powers", f"one number or one for each of {hops} hops", shown(powers)) from None
     if not np.all(np.isfinite(p) & (p >= 0)):
-        raise fail("powers", "finite numbers of at least zero", powers)
+        raise fail("powers", "finite numbers of at least zero", shown(powers))
     n = paths.rows.shape[-1]
     rows, information = paths.rows[0], path_information(paths, p).information[0]
     matrix = error.matrix(tuple(f"x{i}" for i in range(n)) if states is None else states)
@@ -128,7 +128,7 @@ def choose_sensors(
         return case.error(case.on([chosen]))
 
     shares, bound = shared(case, count)
-    exact = comb(number, count) <= compared
+    exact = comb(number, count) <= check_count("choices compared", compared, 0)
     if exact:
         best = min(combinations(range(number), count), key=of)
     else:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import array, covariance, fail, scalar
+from heliograph.numerics.check import array, covariance, fail, instance, scalar
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.moments import steady_covariance
@@ -108,6 +108,7 @@ def coherent_powers(
     Raises:
         ValueError: no limit, a negative one.
     """
+    instance("coherent sum", received, CoherentSum, "a CoherentSum")
     sum_, limit = _limits(received, total, per_sensor)
     count = len(received.signal)
     if sum_ == 0 or not np.any(limit * received.signal):
@@ -122,6 +123,7 @@ def coherent_least_power(received: CoherentSum, target: ArrayLike) -> CoherentDe
     Raises:
         ValueError: an error that no power reaches, with the one that unlimited power leaves.
     """
+    instance("coherent sum", received, CoherentSum, "a CoherentSum")
     target = float(scalar("target error", target, 0.0))
     b2 = received.signal**2
     loud = np.divide(b2, received.spread, out=np.where(b2 > 0, np.inf, 0.0), where=received.spread > 0).sum()
@@ -152,6 +154,7 @@ def coherent_programme(
         ValueError: no limit, a negative one, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
+    instance("coherent sum", received, CoherentSum, "a CoherentSum")
     cp = solvers()
     sum_, limit = _limits(received, total, per_sensor)
     unit = np.sqrt(received.second)

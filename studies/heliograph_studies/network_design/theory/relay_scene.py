@@ -85,10 +85,10 @@ class RelayScene:
         radio: Radio,
         error: Error | None = None,
     ):
+        error = instance("error", Error() if error is None else error, Error, "an Error")
         a = array("transition of a scene", transition, (None, None))
         n = len(a)
         q, c = covariance("process noise of a scene", process, n), array("rows of a scene", rows, (None, n))
-        error = Error() if error is None else error
         if error.worst or error.steps != 1 or error.horizon is not None:
             raise fail("error of a scene", "a steady trace", error)
         moment = steady_covariance(array("transition of a scene", a, (n, n)), q)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from heliograph.h_infinity.solver import run_solver, solvers
-from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.check import fail, instance, scalar
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.planning.budget import Budget, PowerLimits, Powers, as_budget, power_limits, unlimited
 from heliograph.planning.error import Error
@@ -53,7 +53,8 @@ def semidefinite_design(
         ValueError: paths of several hops, an error that no power reaches, a programme that the solver gives up.
         ModuleNotFoundError: cvxpy or clarabel is not installed (the extra `lmi`).
     """
-    error = Error() if error is None else error
+    instance("paths", paths, Paths, "Paths (independent_paths, paths_of)")
+    error = instance("error", Error() if error is None else error, Error, "an Error")
     steps, hops = paths.kappa.shape
     if hops != paths.rows.shape[1]:
         raise fail("paths of a semidefinite programme", "one hop each", f"{hops} hops of {paths.rows.shape[1]} paths")
