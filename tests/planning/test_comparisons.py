@@ -22,6 +22,8 @@ def test_a_budget_may_be_a_number():
 
 
 def test_what_is_no_problem_is_named():
+    with pytest.raises(ValueError, match="design of a DesignProblem: expected no further arguments"):
+        hg.design(DesignProblem(network(), budget=1.0), budget=2.0)
     with pytest.raises(ValueError, match="problem: expected a DesignProblem"):
         error_over_power(network(), [1.0])
     with pytest.raises(ValueError, match="network of the design: expected a Network"):

@@ -12,7 +12,7 @@ from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 
 WEIGHT = "weight of the error"
-SHARPER = (16, 128, 2048)  # smoothing of the largest eigenvalue, less and less: n^(1/2048) is left at the end
+SHARPER = (16, 128, 2048, 32768)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
 
 Matrices = Float[np.ndarray, "time n n"]
 

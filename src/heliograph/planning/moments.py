@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.linear.told_losses import spectral_radius
 from heliograph.model.over_time import OverTime, at, first
 from heliograph.model.plant import AnyPlant, LinearPlant
-from heliograph.model.sensor import AnySensor
+from heliograph.model.sensor import AnySensor, refuse_angles
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import is_traced, library
 from heliograph.numerics.types import Array, ArrayLike, Float
@@ -66,6 +66,15 @@ def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
     if not isinstance(start.noise, AbstractNoise):
         raise fail("noise of the plant", "a covariance or a noise law", "a function of the inputs")
     return start, start.noise
+
+
+def check_design_plant(plant: AnyPlant) -> LinearPlant:
+    """Plant of the first step; ValueError unless it is linear with constant noise, and has no inputs and no angles."""
+    start, _ = check_constant_noise(plant)
+    if start.inputs:
+        raise fail("plant of a design", "no inputs", list(start.inputs))
+    refuse_angles("design", start)
+    return start
 
 
 def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:

@@ -61,10 +61,11 @@ def design(
             free, neither a budget nor a target error, a budget that cannot be met, an error that no power reaches.
     Source: for one hop, Lagrange's conditions are water filling; the gap is that of Frank and Wolfe (1956).
     """
+    problem = DesignProblem(network, free, error, budget, target_error, starts, seed)
     if isinstance(network, DesignProblem):
+        if problem != DesignProblem(network):
+            raise fail("design of a DesignProblem", "no further arguments, which the problem holds", "some")
         problem = network
-    else:
-        problem = DesignProblem(network, free, error, budget, target_error, starts, seed)
     if problem.error is not None:
         instance("error", problem.error, Error, "an Error")
     item = problem.network

@@ -9,13 +9,14 @@ from scipy.linalg import block_diag
 
 from heliograph.filters.linear import linear_filter
 from heliograph.model.channel import parallel
-from heliograph.model.over_time import OverTime, at, over_time
+from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.sensor import LinearSensor
-from heliograph.numerics.check import instance
+from heliograph.numerics.check import array, fail, instance, table
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
 from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
-from heliograph.planning.transmitters import allocate
+from heliograph.planning.paths.model import at_least
+from heliograph.planning.transmitters import allocate, transmitter_names
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -40,11 +41,12 @@ def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "s
         The network; a period is repeated for about 100 steps.
 
     Raises:
-        ValueError: an unstable plant without a horizon, a transmitter that receives nothing.
+        ValueError: an unstable plant without a horizon, a transmitter that receives nothing or that there is not.
     """
     plant = instance("network", network, Network, "a Network").plant
     instance("error", error, Error, "an Error")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    powers = _checked(powers, nodes, error.steps)
     # Channels with these powers, step by step.
     seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
     steps = [
@@ -83,6 +85,18 @@ def repeated(network: Network) -> Network:
 
     result: Network = jax.tree.map(again, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
     return result
+
+
+def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
+    """Powers by transmitter, of all steps."""
+    known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
+    result = table("powers of a network", powers, "powers")
+    if unknown := sorted(set(result) - known):
+        raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
+    return {
+        name: at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
+        for name, power in result.items()
+    }
 
 
 def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:

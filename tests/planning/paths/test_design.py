@@ -110,7 +110,7 @@ def test_sending_at_every_step_alike_is_best_over_a_period():
 def test_the_worst_direction_is_bounded_by_the_weights_of_its_directions():
     paths, error = random_paths(7), Error(worst=True)
     result = hg.design(paths, error=error, budget=3.0)
-    assert result.bound <= result.error <= result.bound * (1 + 1e-3)  # what smoothing the largest eigenvalue leaves
+    assert result.bound <= result.error <= result.bound * (1 + 4e-5)  # n^(1/32768): what smoothing leaves
     trace = hg.design(paths, budget=3.0)
     assert result.error < np.linalg.eigvalsh(steady(paths, powers_of(trace)[0]))[-1] - 1e-3  # or nothing would differ
     assert result.error == pytest.approx(np.linalg.eigvalsh(steady(paths, powers_of(result)[0]))[-1], rel=1e-9)
@@ -204,3 +204,10 @@ def test_the_paths_of_a_network_have_the_powers_of_its_design():
     result, design = hg.design(paths, error=error, budget=2.0), hg.design(network, error=error, budget=2.0)
     assert result.error == pytest.approx(design.error, rel=1e-10) and result.bound <= design.error
     np.testing.assert_allclose(powers_of(result), powers_of(design), rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(1, 4))
+def test_two_worst_directions_at_once_leave_what_smoothing_does(seed):
+    """At the optimum of seed 2 two eigenvalues are equal: the gap is that of their smoothing, and of the weights."""
+    result = hg.design(random_paths(seed), error=Error(worst=True), budget=3.0)
+    assert result.certificate.gap < 4e-5 * result.error

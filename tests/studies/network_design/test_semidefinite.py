@@ -44,7 +44,7 @@ def test_the_worst_direction_is_bounded_by_its_dual():
     assert least.total == pytest.approx(3.0, rel=1e-6)
     assert least.bound <= 3.0 * (1 + 1e-9)
     # the descent smooths the largest eigenvalue: above the programme, and by no more than that leaves
-    assert result.bound <= hg.design(paths, error=error, budget=3.0).error <= result.error * (1 + 1e-3)
+    assert result.bound <= hg.design(paths, error=error, budget=3.0).error <= result.error * (1 + 4e-5)
 
 
 def test_powers_in_other_units_and_least_power_are_the_same():

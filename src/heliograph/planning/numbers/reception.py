@@ -23,7 +23,7 @@ from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail
 from heliograph.numerics.types import Array, Bool, Float
 from heliograph.planning.error import Error
-from heliograph.planning.moments import check_constant_noise, measurement_moment, moments_over, steady_moment
+from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.numbers.mode_riccati import ModeSystem
 from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine, memories
@@ -96,11 +96,7 @@ def transmitters_of(network: Network) -> tuple[str, ...]:
 
 def check_time(network: Network, error: Error) -> None:
     """Raise ValueError where what varies in a network does not fit the steps of an error, or none of it is steady."""
-    check_constant_noise(network.plant)
-    plant = first(network.plant)
-    if plant.inputs:
-        raise fail("plant of a design", "no inputs", list(plant.inputs))
-    refuse_angles("design", plant)
+    check_design_plant(network.plant)
     covered = steps_covered((network.plant, sources_of(network)))
     if error.horizon is not None:
         check_horizon(error.horizon, covered)

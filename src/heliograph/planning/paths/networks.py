@@ -5,12 +5,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.model.over_time import at, first, steps_covered
+from heliograph.model.over_time import at, steps_covered
 from heliograph.model.sensor import LinearSensor, refuse_angles
 from heliograph.numerics.check import check_horizon, fail, instance
 from heliograph.numerics.types import Float
 from heliograph.planning.error import Error
-from heliograph.planning.moments import check_constant_noise, measurement_moment, moments_over, steady_moment
+from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
 from heliograph.planning.paths.information_filter import Plants
 from heliograph.planning.paths.model import Paths
 from heliograph.planning.transmitters import sent_powers, transmits
@@ -46,7 +46,11 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     """
     instance("network", network, Network, "a Network")
     plant, steps = network.plant, instance("error", error, Error, "an Error").steps
-    _check_parts(network)
+    start_plant = check_design_plant(plant)
+    if network.relays is not None:
+        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
+    if network.common is not None:
+        raise _unfit("nodes that share a channel (give a function of free numbers)")
     nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
     covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
     if error.horizon is None:
@@ -55,7 +59,7 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
         seconds, start = [steady_moment(plant)] * steps, None
     else:
         check_horizon(steps, covered)
-        seconds, start = moments_over(plant, steps), np.asarray(first(plant).initial_covariance)
+        seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
     # Paths of each step, and the plant's moves.
     described = [_at_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
     rows, second, signal, kappa, alpha, powers = (np.array(part) for part in list(zip(*described, strict=True))[:6])
@@ -63,19 +67,6 @@ def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "
     plants = Plants(np.array([p.matrix for p in moves]), np.array([p.noise.covariance for p in moves]), start)
     path, names = np.array(described[0].path), tuple(described[0].names)
     return Paths(plants, rows, second, signal, path, kappa, alpha, names), powers
-
-
-def _check_parts(network: Network) -> None:
-    """Raise ValueError where a plant or a network has parts that no independent paths have."""
-    check_constant_noise(network.plant)
-    plant = first(network.plant)
-    if plant.inputs:
-        raise fail("plant of a design", "no inputs", list(plant.inputs))
-    refuse_angles("design", network.plant)
-    if network.relays is not None:
-        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
-    if network.common is not None:
-        raise _unfit("nodes that share a channel (give a function of free numbers)")
 
 
 def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Chain]:
