@@ -6,7 +6,6 @@ import pytest
 import heliograph as hg
 from heliograph.planning import Budget, Error, paths_of
 from heliograph.planning.paths.model import path_information
-from heliograph.planning.paths.relaxation import SplitPaths, envelope, split
 from tests.planning.published import FIRST, KAPPA, NAMES, NOISES, ROWS, A, Q, one_hop, path_problem, two_hops
 
 
@@ -179,20 +178,6 @@ def test_a_wire_passes_on_what_its_sensor_measures(single):
 
 def test_an_error_that_nothing_sent_reaches_costs_nothing(single):
     assert hg.design(single, target_error=5.0).total == 0.0
-
-
-def test_the_envelope_is_concave_above_and_touches():
-    draws = np.random.default_rng(0)
-    alpha, full = draws.uniform(0.2, 5, (1, 4, 3)), draws.uniform(1, 3, (1, 4))
-    alpha[0, 0, 1:], alpha[0, 1, 2] = 0.0, 0.0  # one hop, two hops, three and three
-    whole = SplitPaths(full, full * draws.uniform(0.3, 0.95, (1, 4)), alpha)
-    bound, x = envelope(whole, np.full((1, 4), 200.0)), np.linspace(0, 200, 801)
-    exact = np.array([split(whole, np.full((1, 4), p)).information[0] for p in x])
-    above = np.array([bound.information(np.full((1, 4), p))[0][0] for p in x])
-    assert np.all(above >= exact * (1 - 1e-12)) and np.all(np.diff(above, 2, axis=0) <= 1e-12)
-    steepest = np.max(exact[1:] / x[1:, None], axis=0)[1:]
-    np.testing.assert_allclose(bound.ray[0, 1:], steepest, rtol=1e-3)  # the grid misses the point by half a step
-    assert bound.touch[0, 0] == 0.0
 
 
 @pytest.mark.parametrize(

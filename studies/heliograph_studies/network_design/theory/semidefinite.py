@@ -93,7 +93,7 @@ def _scaled_to(problem: PathProblem, powers: Powers, target: float) -> Powers:
     for _ in range(50):
         middle = (low + high) / 2
         low, high = (low, middle) if problem.exact(middle * powers) <= target else (middle, high)
-    return np.minimum(high * powers, problem.limits.peak)
+    return np.asarray(np.minimum(high * powers, problem.limits.peak))
 
 
 class _Programme:
