@@ -180,11 +180,11 @@ class Programme:
         def lagrangian(at: Vector) -> Vector:
             return np.asarray((self.value(at)[1] - multipliers @ self.room_slope(at)[active])[index] * scale)
 
-        hessian = np.empty((len(index), len(index)))
+        here, hessian = lagrangian(z), np.empty((len(index), len(index)))
         for column, place in enumerate(index):
             shift = np.zeros_like(z)
             shift[place] = SHIFT * scale[column]
-            hessian[:, column] = (lagrangian(z + shift) - lagrangian(z - shift)) / (2 * SHIFT)
+            hessian[:, column] = (lagrangian(z + shift) - here) / SHIFT
         # The equations of Karush, Kuhn and Tucker on the active limits.
         system = np.block([[(hessian + hessian.T) / 2, -face.T], [face, np.zeros((len(face), len(face)))]])
         right = np.concatenate([-gradient, -room[active]])
