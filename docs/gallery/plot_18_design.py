@@ -2,13 +2,13 @@
 Where power belongs
 ===================
 
-Three sensors see a plant of two states. The first is heard directly, the other two through a relay each, which
-amplifies what it hears, noise included. How much should each of the five transmitters send? ``hg.design`` spreads a
+Three sensors measure a plant of two states. The first is received directly, the other two through a relay each, which
+amplifies what it receives, noise included. How much should each of the five transmitters send? ``hg.design`` spreads a
 budget so that the best linear filter of all that is received has the least error; and says how much better any
 other spread could be.
 
-Power does not go everywhere in proportion: below some budget a relayed path gets none, since two noisy hops tell
-next to nothing. Then it comes in at once, with a good share.
+Power does not go everywhere in proportion: below some budget a relayed path gets none, since two noisy hops carry
+next to no information. Then it comes in at once, with a good share.
 """
 
 import matplotlib.pyplot as plt
@@ -33,7 +33,7 @@ network = hg.Network(plant, {"near": near, "left": left, "right": right})
 budgets = np.geomspace(0.2, 40, 19)
 designs = [hg.design(network, budget=budget) for budget in budgets]
 few = budgets[::3]
-equal = [hg.design(network, budget=hg.planning.Budget(each=budget / 5)).error for budget in few]
+equal = [hg.design(network, budget=hg.planning.Budget(per_transmitter=budget / 5)).error for budget in few]
 
 fig, (left_ax, right_ax) = plt.subplots(1, 2, figsize=(9, 3.6), layout="constrained")
 left_ax.plot(few, equal, "C7--", label="the same for each transmitter")
@@ -58,7 +58,7 @@ for budget, best in list(zip(budgets, designs, strict=True))[::6]:
 print(designs[9].certificate.words)
 
 # %%
-# Asked the other way round: the least power that reaches a wanted error.
+# Asked the other way round: the least power that reaches a target error.
 
-cheap = hg.design(network, wanted=0.3)
+cheap = hg.design(network, target_error=0.3)
 print({name: round(float(power[0]), 2) for name, power in cheap.powers.items()}, "in all", round(cheap.total, 2))

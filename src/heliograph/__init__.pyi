@@ -114,7 +114,7 @@ from .live.timeline import (
 from .planning.network_design import (
     design as design,
 )
-from .planning.sent import (
+from .planning.power import (
     power as power,
 )
 from .report.progress import (

@@ -1,4 +1,4 @@
-"""How much noise an unstable plant bears when its sensor hears back, against iteration, eigenvalues and Monte Carlo."""
+"""Noise that an unstable plant tolerates when its sensor has feedback: iteration, eigenvalues, Monte Carlo."""
 
 import numpy as np
 import pytest
@@ -24,10 +24,10 @@ def test_noise_of_a_path_is_that_of_the_hops() -> None:
 
 
 def test_unit_power_keeps_an_unstable_plant_for_ever() -> None:
-    found = feedback_limit(PLANT, SENSOR, [HOP], 1.0)
-    assert found.bounded
-    assert found.limit == pytest.approx(1.21 / 0.21, rel=1e-12)
-    assert found.filtered is not None and found.filtered[0, 0] == pytest.approx(0.6447, abs=5e-5)
+    result = feedback_limit(PLANT, SENSOR, [HOP], 1.0)
+    assert result.bounded
+    assert result.limit == pytest.approx(1.21 / 0.21, rel=1e-12)
+    assert result.filtered is not None and result.filtered[0, 0] == pytest.approx(0.6447, abs=5e-5)
 
 
 def test_without_feedback_the_power_or_the_error_grows() -> None:
@@ -58,9 +58,9 @@ def test_the_error_is_the_simulated_one() -> None:
     steady = feedback_limit(PLANT, SENSOR, [HOP, HOP], powers).filtered
     assert steady is not None and claimed == pytest.approx(steady[0, 0], rel=1e-3)  # after 20 steps
     # what arrives is the last hop's power with its gain and noise: E z^2 = E g^2 p + Var m
-    heard = record.measurements["node"][:, :, 0] ** 2
-    errors = heard.std(axis=0) / np.sqrt(runs)
-    assert np.max(np.abs(heard.mean(axis=0) - 1.02 * (3.0 + 0.2)) / errors) < 4
+    received = record.measurements["node"][:, :, 0] ** 2
+    errors = received.std(axis=0) / np.sqrt(runs)
+    assert np.max(np.abs(received.mean(axis=0) - 1.02 * (3.0 + 0.2)) / errors) < 4
 
 
 @settings(max_examples=25, deadline=None)
@@ -77,16 +77,16 @@ def test_the_limit_is_where_the_error_ends_to_be_bounded(values: list[float], sh
     plant, sensor = hg.LinearPlant(a, np.diag([0.1, 0.2]), [0, 0], np.eye(2)), hg.LinearSensor([[1.0, 0.5]], 0.5)
     lam = np.prod([max(abs(v), 1.0) ** 2 for v in values])
     noise = max(share * lam / (lam - 1), 1.0) if lam > 1 else 7.0
-    found = feedback_limit(plant, sensor, [hg.hop(1.0, noise - 1)], 1.0)
-    assert found.bounded == (noise < found.limit)
+    result = feedback_limit(plant, sensor, [hg.hop(1.0, noise - 1)], 1.0)
+    assert result.bounded == (noise < result.limit)
     p, c = np.eye(2), np.array([[1.0, 0.5]])
     for _ in range(3000):
         p = a @ (p - p @ c.T @ c @ p / (noise * ((c @ p @ c.T).item() + 0.5))) @ a.T + np.diag([0.1, 0.2])
-    if found.predicted is None:
+    if result.predicted is None:
         later = a @ (p - p @ c.T @ c @ p / (noise * ((c @ p @ c.T).item() + 0.5))) @ a.T
         assert np.trace(p) > 30 and np.trace(later) + 0.3 > np.trace(p)  # it grows still
     else:
-        np.testing.assert_allclose(p, found.predicted, rtol=1e-6)
+        np.testing.assert_allclose(p, result.predicted, rtol=1e-6)
 
 
 def test_bad_input_is_one_clear_line() -> None:
@@ -109,7 +109,7 @@ def test_every_transmitter_sends_its_power() -> None:
     np.testing.assert_allclose(sent["node.hop1"], 1.0, rtol=1e-9)
     np.testing.assert_allclose(sent["node.hop2"], 3.0, rtol=1e-9)
     same = hg.Node(SENSOR, HOP, {"fed": fed_back_filter(PLANT, SENSOR, HOP)})
-    with pytest.raises(ValueError, match="hears back: expected a horizon"):
+    with pytest.raises(ValueError, match="with feedback: expected a horizon"):
         hg.power(hg.Network(hg.LinearPlant([[0.9]], 1.0, [0.0], [[1.0]]), {"node": same}))
-    with pytest.raises(ValueError, match="got a sensor that hears back"):
+    with pytest.raises(ValueError, match="got a sensor with feedback"):
         hg.design(network, error=hg.planning.Error(horizon=12), budget=3.0)

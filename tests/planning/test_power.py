@@ -19,20 +19,20 @@ def network(channel, plant=PLANT, sensor=SENSOR):
 
 
 def test_a_chain_by_hand():
-    """E y^2 = 1 + .5 in the steady state; the relay hears it by E g^2 = 1.25, with noise."""
+    """E y^2 = 1 + .5 in the steady state; the relay receives it by E g^2 = 1.25, with noise."""
     chain = hg.amplify_and_forward([hg.hop(FADING, 0.3, power=4.0), hg.hop(1.0, 0.1, amplification=2.0)])
-    found = hg.power(network(chain))
-    assert found.mean == pytest.approx({"node.hop1": 4 * 1.5, "node.hop2": 4 * (4 * 1.5 * 1.25 + 0.3)}, rel=1e-12)
-    assert found.growth == pytest.approx(0.81) and found.words == "what is sent stays bounded"
-    assert found.total == pytest.approx(sum(found.mean.values()))
+    result = hg.power(network(chain))
+    assert result.mean == pytest.approx({"node.hop1": 4 * 1.5, "node.hop2": 4 * (4 * 1.5 * 1.25 + 0.3)}, rel=1e-12)
+    assert result.growth == pytest.approx(0.81) and result.words == "what is sent stays bounded"
+    assert result.total == pytest.approx(sum(result.mean.values()))
 
 
 def test_over_time_the_mean_counts():
     """x_0 has mean 2 and variance 1, which stays: E y^2 = 4 .81^k + 1.5."""
-    found = hg.power(network(hg.hop(1.0, 0.3)), horizon=4)
-    np.testing.assert_allclose(found.over_time["node.hop1"], 4 * 0.81 ** np.arange(1, 5) + 1.5, rtol=1e-12)
-    assert found.peak["node.hop1"] == found.over_time["node.hop1"][0]
-    np.testing.assert_array_equal(found.standard_error["node.hop1"], 0.0)
+    result = hg.power(network(hg.hop(1.0, 0.3)), horizon=4)
+    np.testing.assert_allclose(result.over_time["node.hop1"], 4 * 0.81 ** np.arange(1, 5) + 1.5, rtol=1e-12)
+    assert result.peak["node.hop1"] == result.over_time["node.hop1"][0]
+    np.testing.assert_array_equal(result.standard_error["node.hop1"], 0.0)
 
 
 def test_an_unstable_plant_grows_and_says_so():
@@ -40,13 +40,13 @@ def test_an_unstable_plant_grows_and_says_so():
     wild = network(hg.hop(1.0, 0.2), plant)
     with pytest.raises(ValueError, match=r"steady power: expected a stable plant, or a horizon.*spectral radius 1\.1"):
         hg.power(wild)
-    found = hg.power(wild, horizon=60)
-    assert found.over_time["node.hop1"][[0, 59]] == pytest.approx([2.71, 5.3e5], rel=0.01)
-    assert found.words == "the plant is unstable: what is sent grows by 1.21 a step, without limit"
+    result = hg.power(wild, horizon=60)
+    assert result.over_time["node.hop1"][[0, 59]] == pytest.approx([2.71, 5.3e5], rel=0.01)
+    assert result.words == "the plant is unstable: what is sent grows by 1.21 a step, without limit"
 
 
 def chain_of(kind):
-    """Channels of every kind, two hops each, and how to see what their second transmitter hears."""
+    """Channels of every kind, two hops each, and how to see what their second transmitter receives."""
     first, second = hg.hop(FADING, 0.3), hg.hop(1.0, 0.1, amplification=1.5)
     chain = hg.random_affine.MarkovChain([[0.9, 0.1], [0.4, 0.6]], initial=[1.0, 0.0])
     return {
@@ -61,12 +61,12 @@ def chain_of(kind):
 @pytest.mark.parametrize("kind", ["dropout", "modes", "drift", "delay", "erasure"])
 def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
     hops = chain_of(kind)
-    found = hg.power(network(hg.amplify_and_forward(hops)), horizon=3).over_time
+    result = hg.power(network(hg.amplify_and_forward(hops)), horizon=3).over_time
     y2 = 4 * 0.81**3 + 1.5
-    assert found["node.hop1"][2] == pytest.approx(y2, rel=1e-12)
+    assert result["node.hop1"][2] == pytest.approx(y2, rel=1e-12)
     with jax.enable_x64(True):
 
-        def heard(key):
+        def received(key):
             begin, *keys = jax.random.split(key, 5)
             state = hops[0].init(begin)
             y = jnp.sqrt(y2)  # its sign and law do not matter: noise has mean zero
@@ -75,16 +75,16 @@ def test_a_relay_sends_what_draws_of_the_first_hop_give_it(kind):
             z = h[0, :1] * y + h[0, -1] if kind != "delay" else apply(h, jnp.tile(y, 3))
             return jnp.where(jnp.isnan(z[0]), 0.0, (1.5 * z[0]) ** 2)
 
-        drawn = np.asarray(jax.jit(jax.vmap(heard))(jax.random.split(jax.random.key(1), 40_000)))
-    assert abs(drawn.mean() - found["node.hop2"][2]) < 4 * drawn.std() / 200
+        drawn = np.asarray(jax.jit(jax.vmap(received))(jax.random.split(jax.random.key(1), 40_000)))
+    assert abs(drawn.mean() - result["node.hop2"][2]) < 4 * drawn.std() / 200
 
 
 def test_stacks_wires_and_names():
     plant = hg.LinearPlant(0.5 * np.eye(2), np.eye(2), np.zeros(2), np.eye(2))
     sensor = hg.LinearSensor(np.eye(2), 0.1)
     relayed = hg.amplify_and_forward([hg.hop(FADING, 0.3), hg.hop(1.0, 0.1)])
-    found = hg.power(hg.Network(plant, {"cart": hg.Node(sensor, hg.parallel([relayed, hg.perfect()]), {})}))
-    assert list(found.mean) == ["cart.part1.hop1", "cart.part1.hop2"]  # a wire sends nothing
+    result = hg.power(hg.Network(plant, {"cart": hg.Node(sensor, hg.parallel([relayed, hg.perfect()]), {})}))
+    assert list(result.mean) == ["cart.part1.hop1", "cart.part1.hop2"]  # a wire sends nothing
 
 
 def test_a_nonlinear_plant_is_drawn():
@@ -108,29 +108,38 @@ def test_relays_that_filter_send_what_their_design_says():
     design = hg.relays.own_error_design(relays, 10)
     schedules = hg.relays.relay_schedules(relays, design)
     receiver = hg.filters.ScheduledFilter(schedules.pop("receiver"))
-    found = hg.power(hg.Network.of_relays(relays, schedules, {"best": receiver}))
+    result = hg.power(hg.Network.of_relays(relays, schedules, {"best": receiver}))
     for name in ("north", "south"):
-        np.testing.assert_allclose(found.over_time[name], design.power[name], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.over_time["sensor"], 4 * 0.81 ** np.arange(1, 11) + 1.5, rtol=1e-12)
+        np.testing.assert_allclose(result.over_time[name], design.power[name], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(result.over_time["sensor"], 4 * 0.81 ** np.arange(1, 11) + 1.5, rtol=1e-12)
 
 
 def test_powers_given_are_powers_sent():
     """What a designed network sends over any chain is what was asked of it."""
-    asked = hg.design(two_hops(), budget=7, starts=1)
+    options = hg.design(two_hops(), budget=7, starts=1)
     np.testing.assert_allclose(
-        list(hg.power(asked.network).mean.values()), [p[0] for p in asked.powers.values()], atol=1e-12
+        list(hg.power(options.network).mean.values()), [p[0] for p in options.powers.values()], atol=1e-12
     )
     assert hg.power(one_hop()).total > 0
 
 
 def test_the_steady_power_does_not_depend_on_the_modes_at_the_beginning():
-    """A relay behind a chain that begins in its good mode hears half of its time .2 of the signal."""
+    """A relay behind a chain that begins in its good mode receives half of its time .2 of the signal."""
     chain = hg.random_affine.MarkovChain([[0.5, 0.5], [0.5, 0.5]], initial=[1.0, 0.0])
     modes = hg.random_affine.Modes(chain, [hg.hop(1.0, 0.3), hg.hop(0.2, 0.3)])
-    found = network(hg.amplify_and_forward([modes, hg.hop(1.0, 0.1)]))
-    assert hg.power(found).mean["node.hop2"] == pytest.approx(0.3 + 1.5 * (1 + 0.2**2) / 2, rel=1e-12)
+    result = network(hg.amplify_and_forward([modes, hg.hop(1.0, 0.1)]))
+    assert hg.power(result).mean["node.hop2"] == pytest.approx(0.3 + 1.5 * (1 + 0.2**2) / 2, rel=1e-12)
     varying = network(hg.model.over_time([hg.hop(1.0, 0.1, amplification=a) for a in (1.0, 2.0)]))
     with pytest.raises(ValueError, match=r"steady power: expected a network that does not vary \(give a horizon\)"):
         hg.power(varying)
-    first = hg.power(found, horizon=1).mean["node.hop2"]
+    first = hg.power(result, horizon=1).mean["node.hop2"]
     assert first == pytest.approx(0.3 + (1 + 4 * 0.81 + 0.5), rel=1e-12)  # begins so, with a mean of 2
+
+
+def test_a_mixture_of_a_noise_and_a_hop_has_one_transmitter():
+    """Jamming without a signal is no transmitter; behind it a relay receives noise of .5, or the hop's 1.5 + .2."""
+    atoms = hg.random_affine
+    jamming = atoms.GainAndNoise(atoms.Constant(1.0), np.zeros((1, 1)), 0.5)
+    mixture = atoms.Mixture([jamming, hg.hop(1.0, 0.2)], [0.3, 0.7])
+    sent = hg.power(network(hg.amplify_and_forward([mixture, hg.hop(1.0, 0.1)]))).mean
+    assert sent == pytest.approx({"node.hop1": 1.5, "node.hop2": 0.3 * 0.5 + 0.7 * 1.7}, rel=1e-12)

@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from heliograph.files.design_file import DesignFile
     from heliograph.report.design_page import DesignResults
     from heliograph.report.progress import Advance
+    from heliograph.report.results import Results
 
 NAME = "design"
 
@@ -19,60 +20,57 @@ def design(
     *,
     out: Annotated[Path, place("Folder for the page, its figures and the designed network; made if missing.")],
 ) -> None:
-    """Choose the powers of a network for the least error, or the least power for an error, and report.
+    """Choose the powers of a network for the least error, or the least power for a target error, and report.
 
     Parameters
     ----------
     task:
-        A TOML file that names the network, the budget or the wanted error, and what is free.
+        A TOML file that names the network, the budget or the target error, and what is free.
     """
     from heliograph.disk.quoting import visible
     from heliograph.files.design_file import read_design
-    from heliograph.report.results import Results, write_results
+    from heliograph.report.results import write_results
 
     target = folder("design", out, NAME) / NAME
-    asked = read_design(task)
+    file = read_design(task)
 
-    def tell(found: "DesignResults") -> Results:
+    def results(designed: "DesignResults") -> "Results":
         from heliograph.report.design_page import design_results
 
-        return design_results(found)
+        return design_results(designed)
 
-    found = write_results(target, stages(asked), lambda advance: work(asked, advance), tell)
-    print(visible(f"{target / 'report.html'}: error {found.design.error:.6g} at power {found.design.total:.6g}"))
-    print(visible(found.design.certificate.words))
-
-
-def stages(asked: "DesignFile") -> int:
-    """About how many steps there are to tell of."""
-    from heliograph.planning.front import POINTS
-
-    rows = 0 if asked.map is None else len(asked.map.y)
-    return 1 + rows + len(asked.front or range(POINTS)) + 3 * len(asked.network.nodes)
+    designed = write_results(target, stages(file), lambda advance: work(file, advance), results)
+    best = designed.design
+    print(visible(f"{target / 'report.html'}: error {best.error:.6g} at power {best.total:.6g}"))
+    print(visible(best.certificate.words))
 
 
-def work(asked: "DesignFile", advance: "Advance") -> "DesignResults":
-    """The design, the front about it, what more would buy, and the map."""
+def stages(file: "DesignFile") -> int:
+    """Approximate number of steps that progress is shown of."""
+    from heliograph.planning.comparisons import POINTS
+
+    rows = 0 if file.map is None else len(file.map.y)
+    return 1 + rows + len(file.front or range(POINTS)) + 3 * len(file.network.nodes)
+
+
+def work(file: "DesignFile", advance: "Advance") -> "DesignResults":
+    """The design, the front about it, the worth of changes, and the map."""
+    import heliograph as hg
     from heliograph.files.design_file import designed_source
-    from heliograph.planning.front import about, error_over_power
-    from heliograph.planning.purchases import purchases_of
-    from heliograph.planning.sent import power
-    from heliograph.planning.site_map import error_over_sites
+    from heliograph.planning.comparisons import totals_about
     from heliograph.report.design_page import SOURCE, DesignResults
 
     advance("designing")
-    network, task = asked.network, asked.task
-    found = task.solve(network)
-    horizon = None if task.error is None else task.error.horizon
-    before = power(network, horizon).mean
-    places = asked.map
+    best = hg.design(file.problem)
+    before = hg.power(file.network, best.problem.criterion.horizon).mean
+    places, totals = file.map, file.front or totals_about(best.total)
     return DesignResults(
-        reference=asked.reference,
-        source=asked.source,
-        design=found,
-        before={name: before.get(name, float("nan")) for name in found.powers},
-        front=error_over_power(network, task, asked.front or about(found.total), advance),
-        purchases=purchases_of(network, task, found, asked.exponent, advance),
-        map=None if places is None else error_over_sites(places.build, task, found, places.x, places.y, advance),
-        written=designed_source(asked, SOURCE, found.powers),
+        reference=file.reference,
+        source=file.source,
+        design=best,
+        before={name: before.get(name, float("nan")) for name in best.powers},
+        front=hg.planning.error_over_power(file.problem, totals, advance),
+        changes=hg.planning.worth_of_changes(best, file.exponent, advance),
+        map=None if places is None else hg.planning.error_over_sites(best, places.build, places.x, places.y, advance),
+        written=designed_source(file, SOURCE, best.powers),
     )

@@ -1,4 +1,4 @@
-"""A design in a TOML file: which network, what is free, the budget or the wanted error, and what is shown beside."""
+"""A design in a TOML file: which network, what is free, the budget or the target error, and what else is shown."""
 
 import tomllib
 from collections.abc import Callable, Mapping
@@ -12,20 +12,20 @@ import numpy as np
 from heliograph.files.network_file import load_function, load_network
 from heliograph.numerics.check import array, check_count, check_seed, fail, scalar
 from heliograph.planning.budget import Budget
-from heliograph.planning.criterion import Error
-from heliograph.planning.task import Task
+from heliograph.planning.error import Error
+from heliograph.planning.problem import DesignProblem
 from heliograph.simulation.network import Network
 
-KEYS = ("network", "free", "budget", "wanted", "error", "starts", "seed", "front", "path_loss_exponent", "map")
+KEYS = ("network", "free", "budget", "target_error", "error", "starts", "seed", "front", "path_loss_exponent", "map")
 TABLES = {
-    "budget": ("total", "each", "peak"),
+    "budget": ("total", "per_transmitter", "peak"),
     "error": ("weight", "worst", "horizon", "at_end", "period"),
     "map": ("network", "x", "y", "points"),
 }
 
 
 @dataclass(frozen=True)
-class MapAsked:
+class MapPlaces:
     """A function of a Python file that returns the network for a place (x, y), and the places, in its units."""
 
     build: Callable[[float, float], Network]
@@ -35,15 +35,15 @@ class MapAsked:
 
 @dataclass(frozen=True)
 class DesignFile:
-    """What the file asks; `reference` and `source` are the network's name in it and its Python source."""
+    """A design file as read; `reference` and `source` are the network's name in it and its Python source."""
 
     reference: str
     source: str
     network: Network
-    task: Task
+    problem: DesignProblem
     front: tuple[float, ...] | None
     exponent: float | None
-    map: MapAsked | None
+    map: MapPlaces | None
 
 
 def read_design(path: Path) -> DesignFile:
@@ -64,27 +64,32 @@ def read_design(path: Path) -> DesignFile:
             _check_keys(f"{path.name}, {key}", table[key], known)
     file, name = _place(path, table.get("network"), "network")
     free = table.get("free")
-    if free is not None and (not isinstance(free, list) or not all(isinstance(one, str) for one in free)):
+    if free is not None and (not isinstance(free, list) or not all(isinstance(item, str) for item in free)):
         raise fail(f"{path.name}, free", "a list of names", repr(free))
-    task = Task(
+    network = load_network(f"{file}:{name}" if name else str(file))
+    problem = DesignProblem(
+        network=network,
         free=None if free is None else tuple(free),
         error=Error(**_table(path, table, "error")) if "error" in table else None,
         budget=_budget(path, table),
-        wanted=float(scalar(f"{path.name}, wanted", table["wanted"], 0.0)) if "wanted" in table else None,
+        target_error=_number(path, table, "target_error"),
         starts=check_count(f"{path.name}, starts", table.get("starts", 64)),
         seed=check_seed(f"{path.name}, seed", table.get("seed", 0)),
     )
     front = table.get("front")
-    exponent = table.get("path_loss_exponent")
     return DesignFile(
         reference=f"{file.name}:{name}" if name else file.name,
         source=file.read_text(encoding="utf-8"),
-        network=load_network(f"{file}:{name}" if name else str(file)),
-        task=task,
+        network=network,
+        problem=problem,
         front=None if front is None else tuple(array(f"{path.name}, front", front, (None,)).tolist()),
-        exponent=None if exponent is None else float(scalar(f"{path.name}, path_loss_exponent", exponent, 0.0)),
+        exponent=_number(path, table, "path_loss_exponent"),
         map=_map(path, table) if "map" in table else None,
     )
+
+
+def _number(path: Path, table: Mapping[str, Any], key: str) -> float | None:
+    return float(scalar(f"{path.name}, {key}", table[key], 0.0)) if key in table else None
 
 
 def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
@@ -94,16 +99,16 @@ def _budget(path: Path, table: Mapping[str, Any]) -> Budget | None:
     return Budget(**value) if isinstance(value, dict) else Budget(scalar(f"{path.name}, budget", value, 0.0))
 
 
-def _map(path: Path, table: Mapping[str, object]) -> MapAsked:
-    asked = _table(path, table, "map")
-    file, name = _place(path, asked.get("network"), "map.network")
+def _map(path: Path, table: Mapping[str, object]) -> MapPlaces:
+    values = _table(path, table, "map")
+    file, name = _place(path, values.get("network"), "map.network")
     if not name:
         raise fail(f"{path.name}, map.network", 'a file and a function of x and y, as "my_network.py:at"', file.name)
-    points = check_count(f"{path.name}, map.points", asked.get("points", 11), 2)
-    ends = [array(f"{path.name}, map.{key}", asked.get(key, "none"), (2,)) for key in ("x", "y")]
+    points = check_count(f"{path.name}, map.points", values.get("points", 11), 2)
+    ends = [array(f"{path.name}, map.{key}", values.get(key, "none"), (2,)) for key in ("x", "y")]
     build = load_function(file, file.read_text(encoding="utf-8"), name)
     x, y = (np.linspace(low, high, points) for low, high in ends)
-    return MapAsked(build, x, y)
+    return MapPlaces(build, x, y)
 
 
 def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
@@ -114,7 +119,7 @@ def _place(path: Path, value: object, key: str) -> tuple[Path, str]:
     place, name = (place, name) if colon and name.isidentifier() else (value, "")
     file = path.parent / place
     if not file.is_file():
-        raise fail(f"{path.name}, {key}", "a Python file beside it", repr(value))
+        raise fail(f"{path.name}, {key}", "a Python file in its folder", repr(value))
     return file, name
 
 
@@ -133,10 +138,10 @@ def _check_keys(where: str, table: Mapping[str, object], known: tuple[str, ...])
             raise fail(f"{where}, key {key!r}", f"one of {', '.join(known)}", f"an unknown key{hint}")
 
 
-def designed_source(asked: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
-    """Python source of the network with these powers, which reads that as it was from the file `source` beside it."""
-    error = Error() if asked.task.error is None else asked.task.error
-    _, colon, name = asked.reference.rpartition(":")
+def designed_source(file: DesignFile, source: str, powers: Mapping[str, np.ndarray]) -> str:
+    """Python source of the network with these powers, which reads that as it was from `source` in the same folder."""
+    error = file.problem.criterion
+    _, colon, name = file.reference.rpartition(":")
     place = f'str(Path(__file__).with_name("{source}"))' + (f' + ":{name}"' if colon else "")
     return "\n".join([
         '"""A network with designed powers, and the best linear filters for them."""',
@@ -146,7 +151,7 @@ def designed_source(asked: DesignFile, source: str, powers: Mapping[str, np.ndar
         "import heliograph as hg",
         "",
         "POWERS = {  # by transmitter, of each step of a period or horizon",
-        *(f"    {one!r}: {np.asarray(power).tolist()}," for one, power in powers.items()),
+        *(f"    {transmitter!r}: {np.asarray(power).tolist()}," for transmitter, power in powers.items()),
         "}",
         "network = hg.planning.designed_network(",
         f"    hg.files.load_network({place}),",

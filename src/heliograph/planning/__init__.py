@@ -1,4 +1,4 @@
-"""Networks designed by their own mathematics: powers, sites and schedules, with certificates of how good they are."""
+"""Network design: powers and other numbers for a small error, with certificates of how good they are."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Power budgets: what transmitters may send, and the best allocation within them for a linear cost, by a sort."""
+"""Power budgets: limits of what transmitters send, and linear gains maximised within them by a sort."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, SupportsFloat, cast
@@ -12,36 +12,44 @@ from heliograph.numerics.types import ArrayLike, Bool, Float
 
 MET = 1e-9  # relative excess over a limit that counts as met
 
+Powers = Float[np.ndarray, "time free"]
+PerTransmitter = float | dict[str, float] | None
+
 
 @readable
 class Budget(Module):
-    """Limits of power: of all transmitters together, of each one's mean over time, of each one at every step.
+    """Limits of the power that transmitters send: in total, in each transmitter's mean, and at every step.
 
-    `each` and `peak` are one number for every transmitter or numbers by name. Transmitters that are not free count
-    towards the total.
+    Transmitters that are not free count towards the total.
+
+    Args:
+        total: largest mean power of all transmitters together; none unless given.
+        per_transmitter: largest mean power over time of a transmitter: a number for all, or {name: number}.
+        peak: largest power of a transmitter at any step: a number for all, or {name: number}.
 
     Raises:
         ValueError: no limit at all, a negative one.
     """
 
     total: float | None
-    each: float | dict[str, float] | None
-    peak: float | dict[str, float] | None
+    per_transmitter: PerTransmitter
+    peak: PerTransmitter
 
     def __init__(
         self,
         total: ArrayLike | None = None,
-        each: ArrayLike | Mapping[str, float] | None = None,
+        per_transmitter: ArrayLike | Mapping[str, float] | None = None,
         peak: ArrayLike | Mapping[str, float] | None = None,
     ):
         self.total = None if total is None else float(scalar("total power", total, 0.0))
-        self.each, self.peak = _limits("power of each", each), _limits("peak power", peak)
-        if self.total is None and self.each is None and self.peak is None:
-            raise fail("budget", "a total, a limit of each transmitter or a peak", "none")
+        self.per_transmitter = _checked("power per transmitter", per_transmitter)
+        self.peak = _checked("peak power", peak)
+        if self.total is None and self.per_transmitter is None and self.peak is None:
+            raise fail("budget", "a total, a limit per transmitter or a peak", "none")
 
 
 def as_budget(value: object) -> Budget:
-    """A budget; a number is that of the total power."""
+    """Budget from one, or from a number: that of the total power."""
     if isinstance(value, Budget):
         return value
     try:
@@ -51,95 +59,103 @@ def as_budget(value: object) -> Budget:
     return Budget(number)
 
 
-def _limits(name: str, value: ArrayLike | Mapping[str, float] | None) -> float | dict[str, float] | None:
+def _checked(name: str, value: ArrayLike | Mapping[str, float] | None) -> PerTransmitter:
     if value is None:
         return None
     if isinstance(value, Mapping):
         named = table(name, value, "powers")
-        return {key: float(scalar(f"{name} {key!r}", one, 0.0)) for key, one in named.items()}
+        return {key: float(scalar(f"{name} {key!r}", number, 0.0)) for key, number in named.items()}
     return float(scalar(name, value, 0.0))
 
 
-class Allowed(NamedTuple):
-    """The powers p >= 0 (time, free transmitter) that a budget allows: a polytope.
+class PowerLimits(NamedTuple):
+    """Polytope of the powers p >= 0 (time, free transmitter) that a budget allows.
 
-    peak: of each entry; each: of the mean over time of each column; total: of the mean over time of their sum.
+    peak: of each entry; mean: of the mean over time of each column; total: of the mean over time of the sum. Infinite
+    where nothing limits.
     """
 
-    peak: Float[np.ndarray, "time free"]
-    each: Float[np.ndarray, "free"]
+    peak: Powers
+    mean: Float[np.ndarray, "free"]
     total: float
 
-    def most(self, gain: Float[np.ndarray, "time free"]) -> Float[np.ndarray, "time free"]:
-        """The allowed q with the largest gain.q, zero where there is none: limits are nested, so a sort."""
+    def best(self, gain: Powers) -> Powers:
+        """Allowed powers q with the largest <gain, q>, zero where there is no gain: limits are nested, so a sort."""
         result, steps = np.zeros_like(gain), len(gain)
-        left, each = self.total * steps, self.each * steps
+        left, mean = self.total * steps, self.mean * steps
         for flat in np.argsort(-gain, axis=None, kind="stable"):
             k, h = np.unravel_index(flat, gain.shape)
             if gain[k, h] <= 0 or left <= 0:
                 break
-            if not np.isfinite(one := min(float(self.peak[k, h]), float(each[h]), left)):
+            if not np.isfinite(power := min(float(self.peak[k, h]), float(mean[h]), left)):
                 raise fail("budget", "one that limits every transmitter that helps", "no limit")
-            result[k, h] = one
-            each[h] -= one
-            left -= one
+            result[k, h] = power
+            mean[h] -= power
+            left -= power
         return result
 
-    def even(self, on: Bool[np.ndarray, "time free"]) -> Float[np.ndarray, "time free"]:
-        """The largest allowed powers that are equal wherever `on` and no narrower limit holds."""
-        limit = np.where(on, np.minimum(self.peak, self.each), 0.0)  # a limit of the mean, kept at every step
-        if not np.isfinite(self.total):
+    def even(self, on: Bool[np.ndarray, "time free"]) -> Powers:
+        """Largest allowed powers that are equal wherever `on` and no narrower limit binds."""
+        limit = np.where(on, np.minimum(self.peak, self.mean), 0.0)  # a limit of the mean, at every step
+        total = self.total * len(on)
+        if not np.isfinite(total):
             return limit
-        level = _level(limit.ravel(), self.total * len(on))
-        return np.minimum(limit, level)
+        # The level at which min(limit, level) sums to the total, if it ever does.
+        ordered = np.sort(limit.ravel())
+        for i, bound in enumerate(ordered):
+            level = total / (len(ordered) - i)
+            if level <= bound:
+                return np.minimum(limit, level)
+            total -= bound
+        return limit
 
-    def fits(self, p: Float[np.ndarray, "time free"]) -> bool:
-        """Whether p is allowed."""
-        room = 1 + MET
-        return bool(
-            np.all(p >= 0)
-            and np.all(p <= self.peak * room)
-            and np.all(p.mean(axis=0) <= self.each * room)
-            and p.mean(axis=0).sum() <= self.total * room
-        )
+    def clip(self, powers: Powers) -> Powers:
+        """Powers scaled down where rounding, or a solver's accuracy, puts them above a limit."""
+        powers = np.clip(powers, 0.0, self.peak)
+        mean = powers.mean(axis=0)
+        powers = powers * np.divide(self.mean, mean, out=np.ones_like(mean), where=mean > self.mean)
+        total = powers.mean(axis=0).sum()
+        return powers * (self.total / total) if total > self.total else powers
+
+    def rows(self) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
+        """Finite limits of means over time as rows @ powers.ravel() <= 1, or <= 0 where nothing may be sent."""
+        steps, count = self.peak.shape
+        rows = np.concatenate([np.tile(np.eye(count), steps), np.ones((1, steps * count))]) / steps
+        most = np.append(self.mean, self.total)
+        rows, most = rows[np.isfinite(most)], most[np.isfinite(most)]
+        scale = np.where(most > 0, most, 1.0)
+        return rows / scale[:, None], most / scale
 
 
-def _level(limit: Float[np.ndarray, "k"], total: float) -> float:
-    """The level at which numbers min(limit, level) sum to the total, infinite if they never do."""
-    ordered = np.sort(limit)
-    for i, one in enumerate(ordered):
-        level = total / (len(ordered) - i)
-        if level <= one:
-            return float(level)
-        total -= one
-    return float("inf")
+def unlimited(steps: int, count: int) -> PowerLimits:
+    """Limits that exclude nothing."""
+    return PowerLimits(np.full((steps, count), np.inf), np.full(count, np.inf), np.inf)
 
 
-def allowed(
+def power_limits(
     budget: Budget, names: Sequence[str], free: Bool[np.ndarray, "hop"], powers: Float[np.ndarray, "time hop"]
-) -> Allowed:
-    """What the budget leaves to the free transmitters, the others sending their `powers`.
+) -> PowerLimits:
+    """Limits that the budget leaves to the free transmitters, while the others send their `powers`.
 
     Raises:
         ValueError: limits for transmitters that there are not, powers of the others above the budget.
     """
-    each, peak = (_of_names(what, names) for what in (("each", budget.each), ("peak", budget.peak)))
-    held = np.where(free, 0.0, powers)
-    mean, total = held.mean(axis=0), np.inf if budget.total is None else budget.total
-    needed = [(f"power of {name!r}", one, most) for name, one, most in zip(names, mean, each, strict=True)]
-    needed += [(f"peak of {name!r}", one, most) for name, one, most in zip(names, held.max(axis=0), peak, strict=True)]
-    for what, one, limit in (*needed, ("total", mean.sum(), total)):
-        if one > limit * (1 + MET):
-            expected = f"a {what} of at least {one:.6g}, which is sent by what is not free"
+    mean_limit, peak = (_by_name(name, getattr(budget, name), names) for name in ("per_transmitter", "peak"))
+    fixed = np.where(free, 0.0, powers)
+    mean, total = fixed.mean(axis=0), np.inf if budget.total is None else budget.total
+    needs = [(f"power of {name!r}", *pair) for name, *pair in zip(names, mean, mean_limit, strict=True)]
+    needs += [(f"peak of {name!r}", *pair) for name, *pair in zip(names, fixed.max(axis=0), peak, strict=True)]
+    for what, power, limit in (*needs, ("total", mean.sum(), total)):
+        if power > limit * (1 + MET):
+            expected = f"a {what} of at least {power:.6g}, which is sent by what is not free"
             raise fail("budget", expected, f"{limit:.6g}")
-    return Allowed(np.tile(peak[free], (len(powers), 1)), each[free], max(total - mean.sum(), 0.0))
+    return PowerLimits(np.tile(peak[free], (len(powers), 1)), mean_limit[free], max(total - mean.sum(), 0.0))
 
 
-def _of_names(what: tuple[str, float | dict[str, float] | None], names: Sequence[str]) -> Float[np.ndarray, "hop"]:
-    name, limit = what
+def _by_name(what: str, limit: PerTransmitter, names: Sequence[str]) -> Float[np.ndarray, "hop"]:
     if not isinstance(limit, dict):
         return np.full(len(names), np.inf if limit is None else limit)
     unknown = sorted(set(limit) - set(names))
     if unknown:
-        raise fail(f"limit {name!r} of the budget", f"names of transmitters {list(names)}", unknown)
-    return np.array([limit.get(one, np.inf) for one in names])
+        raise fail(f"limit {what!r} of the budget", f"names of transmitters {list(names)}", unknown)
+    return np.array([limit.get(name, np.inf) for name in names])

@@ -1,146 +1,215 @@
-"""Small errors within a power budget: descent from a start, and Newton's method on the face where it ends."""
+"""One descent for all designs: sequential quadratic programmes from many starts, then Newton's method where they end.
 
+At a vector x a design problem has an error e(x) and transmits the powers p(x). Sought is
+    min e(x)         subject to  rows p(x) <= most  and  low <= x <= high,   or
+    min mean power   subject to  the same and  e(x) <= target.
+Where the powers themselves are free p(x) = x and the rows are linear; else p is any smooth function.
+"""
+
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
+from scipy.optimize import Bounds, NonlinearConstraint, minimize
 
-from heliograph.numerics.types import Float
-from heliograph.planning.budget import Allowed
-from heliograph.planning.objective import Objective
+from heliograph.numerics.types import Bool, Float
 
-Powers = Float[np.ndarray, "time free"]
+Vector = Float[np.ndarray, "x"]
 
 ITERATIONS = 400
-FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and one of many of which one will go on
+FINE, COARSE = 1e-14, 1e-8  # relative change at which a descent ends, and that of many of which the best goes on
+ROUNDS = 4  # of a descent begun again where it ended, its Hessian forgotten, and of Newton's method
+FEASIBLE = 1e-7  # relative excess over a limit that counts as none
+ACTIVE = 1e-7  # relative: how near a limit is one that is reached
 SHIFT = 1e-5  # relative, of the differences of gradients that make a Hessian
-OFF = 1e-7  # of the largest power: what counts as none
-ROUNDS = 4  # of Newton's method
-MISSED = 1e-9  # relative excess of an error that is mended afterwards
+ROUNDING = 1e-14  # relative
 
 
-class Found(NamedTuple):
-    """Powers and their error."""
+class Evaluation(NamedTuple):
+    """Error and transmitted powers (all steps of all transmitters in one row) at a point, and their derivatives."""
 
-    powers: Powers
     error: float
+    error_slope: Vector
+    powers: Float[np.ndarray, "entries"]
+    power_slope: Float[np.ndarray, "entries x"]
 
 
-def descend(objective: Objective, limits: Allowed, start: Powers, tolerance: float = FINE) -> Found:
-    """A local minimum from `start`, by sequential quadratic programmes in powers relative to the budget."""
-    shape, unit = start.shape, _unit(limits, start)
-    first = objective.value(start)
+class Limits(NamedTuple):
+    """Limits rows @ powers <= most, with most 1 or 0, and error <= target if given; `steps` make the mean power."""
 
-    def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = objective.value_and_gradient(np.maximum(x, 0.0).reshape(shape) * unit)
-        return value / first, gradient.ravel() * unit / first
-
-    rows, most = _rows(limits)
-    constraints = [LinearConstraint(rows, -np.inf, most / unit)] if len(rows) else []
-    bounds = Bounds(np.zeros(start.size), limits.peak.ravel() / unit)
-    result = minimize(function, start.ravel() / unit, jac=True, bounds=bounds, constraints=constraints,
-                      method="SLSQP", options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
-    found = _inside(limits, np.clip(result.x.reshape(shape) * unit, 0.0, limits.peak))
-    value = objective.value(found)
-    return Found(found, value) if value < first else Found(start, first)
+    rows: Float[np.ndarray, "limits entries"]
+    most: Float[np.ndarray, "limits"]
+    target: float | None
+    steps: int
 
 
-def lower_total(objective: Objective, limits: Allowed, wanted: float, start: Powers, tolerance: float = FINE) -> Powers:
-    """Powers of a locally least total whose error is no larger than wanted, from some that reach it."""
-    shape, unit = start.shape, max(float(start.mean(axis=0).sum()), np.finfo(float).tiny)
+class Problem(NamedTuple):
+    """A design problem as a descent needs it.
 
-    def room(x: np.ndarray) -> np.ndarray:
-        return np.array([1.0 - objective.value(np.maximum(x, 0.0).reshape(shape) * unit) / wanted])
-
-    def slope(x: np.ndarray) -> np.ndarray:
-        return -objective.value_and_gradient(np.maximum(x, 0.0).reshape(shape) * unit)[1].ravel() * unit / wanted
-
-    price = np.full(start.size, 1 / len(start))
-    rows, most = _rows(limits._replace(total=np.inf))
-    constraints: list[LinearConstraint | NonlinearConstraint] = [NonlinearConstraint(room, 0.0, np.inf, slope)]
-    if len(rows):
-        constraints.append(LinearConstraint(rows, -np.inf, most / unit))
-
-    def total(x: np.ndarray) -> tuple[float, np.ndarray]:
-        return float(price @ x), price
-
-    result = minimize(total, start.ravel() / unit, jac=True, method="SLSQP",
-                      bounds=Bounds(np.zeros(start.size), limits.peak.ravel() / unit), constraints=constraints,
-                      options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
-    found = _inside(limits._replace(total=np.inf), np.clip(result.x.reshape(shape) * unit, 0.0, limits.peak))
-    better = found.mean(axis=0).sum() < start.mean(axis=0).sum() and room(found.ravel() / unit)[0] > -MISSED
-    return found if better else start
-
-
-def polish(objective: Objective, limits: Allowed, found: Found) -> Found:
-    """Newton's method on the face of the budget where a descent ended, kept while the error does not rise.
-
-    The step solves H d + A' l = -g, A d = 0 over the powers that are neither zero nor at their peak, with A the limits
-    that are reached and H by differences of the gradient.
+    low, high, unit: least and largest values of x, and its scale. sharpnesses: smoothings of the error, one after
+    another, the last the sharpest. evaluate: error, powers and derivatives at x with a smoothing; None where they grow
+    without limit. restore: x moved back into the limits, as far as rounding took it out of them.
     """
+
+    low: Vector
+    high: Vector
+    unit: Vector
+    sharpnesses: Sequence[int | None]
+    evaluate: Callable[[Vector, int | None], Evaluation | None]
+    restore: Callable[[Vector], Vector]
+
+
+class Programme:
+    """A design problem with its limits, in x over its unit; values over their size at the start."""
+
+    def __init__(self, problem: Problem, limits: Limits, sharpness: int | None, start: Vector):
+        self.problem, self.limits, self.sharpness = problem, limits, sharpness
+        self.bounds = Bounds(problem.low / problem.unit, problem.high / problem.unit)
+        self._last: tuple[bytes, Evaluation | None] = (b"", None)
+        self.size = 1.0
+        value = self.value(start / problem.unit)[0]
+        self.size = max(value, 1e-12) if np.isfinite(value) else 1.0
+
+    def at(self, z: Vector) -> Evaluation | None:
+        """Evaluation at a point, the last one kept."""
+        key = z.tobytes()
+        if key != self._last[0]:
+            self._last = key, self.problem.evaluate(np.asarray(z * self.problem.unit), self.sharpness)
+        return self._last[1]
+
+    def value(self, z: Vector) -> tuple[float, Vector]:
+        """Error, or mean total power where there is a target, and its derivative."""
+        now = self.at(z)
+        if now is None:
+            return np.inf, np.zeros_like(z)
+        if self.limits.target is None:
+            return now.error / self.size, now.error_slope * self.problem.unit / self.size
+        scale = self.limits.steps * self.size
+        return float(now.powers.sum()) / scale, now.power_slope.sum(axis=0) * self.problem.unit / scale
+
+    def room(self, z: Vector) -> Float[np.ndarray, "limits"]:
+        """What is left of each limit, as a part of it; of the target last."""
+        rows, most, target, _ = self.limits
+        now = self.at(z)
+        if now is None:
+            return np.full(len(most) + (target is not None), -1.0)
+        left = most - rows @ now.powers
+        return left if target is None else np.append(left, 1 - now.error / target)
+
+    def room_slope(self, z: Vector) -> Float[np.ndarray, "limits x"]:
+        """Derivative of the room."""
+        rows, most, target, _ = self.limits
+        now = self.at(z)
+        if now is None:
+            return np.zeros((len(most) + (target is not None), len(z)))
+        slope = -(rows @ now.power_slope) * self.problem.unit
+        return slope if target is None else np.vstack([slope, -now.error_slope * self.problem.unit / target])
+
+    def feasible(self, z: Vector) -> bool:
+        """Whether the point exists and meets the limits."""
+        return self.at(z) is not None and bool(np.all(self.room(z) >= -FEASIBLE))
+
+    def merit(self, z: Vector) -> float:
+        """Value of a feasible point, else infinite."""
+        return self.value(z)[0] if self.feasible(z) else np.inf
+
+    def descend(self, z: Vector, tolerance: float) -> Vector:
+        """Point where a sequential quadratic programme ends, or the start where that is better."""
+        constraints = [NonlinearConstraint(self.room, 0.0, np.inf, self.room_slope)] if len(self.room(z)) else []
+        before = self.merit(z)
+        end = self._minimize(self.value, z, constraints, tolerance)
+        if np.isinf(before) and not self.feasible(end):
+            end = self._minimize(self._excess, end, [], tolerance)
+            return self._minimize(self.value, end, constraints, tolerance)
+        return end if self.merit(end) < before else z
+
+    def _excess(self, z: Vector) -> tuple[float, Vector]:
+        """Squared excess over the limits, for a way back into them."""
+        broken = np.minimum(self.room(z), 0.0)
+        return float(broken @ broken), 2 * broken @ self.room_slope(z)
+
+    def _minimize(
+        self,
+        function: Callable[[Vector], tuple[float, Vector]],
+        z: Vector,
+        constraints: list[NonlinearConstraint],
+        tolerance: float,
+    ) -> Vector:
+        result = minimize(function, z, jac=True, method="SLSQP", bounds=self.bounds, constraints=constraints,
+                          options={"ftol": tolerance, "maxiter": ITERATIONS})  # fmt: skip
+        end = np.clip(result.x, self.bounds.lb, self.bounds.ub)
+        unit = self.problem.unit
+        return self.problem.restore(end * unit) / unit if np.all(np.isfinite(end)) else z
+
+    def polish(self, z: Vector) -> Vector:
+        """Newton's method on the active limits, as long as the Lagrangian's exact penalty does not rise."""
+        for _ in range(ROUNDS):
+            newton = self._newton(z)
+            if newton is None:
+                break
+            step, multipliers, active = newton
+            if np.all(np.abs(step) <= ROUNDING):
+                break
+            unit = self.problem.unit
+            end = self.problem.restore(np.clip(z + step, self.bounds.lb, self.bounds.ub) * unit) / unit
+
+            penalties = [self._penalty(point, multipliers, active) for point in (z, end)]
+            if not (self.feasible(end) and penalties[1] <= penalties[0] * (1 + ROUNDING)):
+                break
+            z = end
+        return z
+
+    def _penalty(self, z: Vector, multipliers: Vector, active: Bool[np.ndarray, "limits"]) -> float:
+        """Value and, weighed by the multipliers, the excess over the active limits."""
+        excess = np.maximum(-self.room(z), 0.0)
+        return float(self.value(z)[0] + np.maximum(multipliers, 0.0) @ excess[active])
+
+    def _newton(self, z: Vector) -> tuple[Vector, Vector, Bool[np.ndarray, "limits"]] | None:
+        """Step d and multipliers m of H d - A' m = -g, A d = -room over what is at no bound, H of the Lagrangian."""
+        index = np.flatnonzero((z > self.bounds.lb + ACTIVE) & (z < self.bounds.ub - ACTIVE))
+        room = self.room(z)
+        active = room <= ACTIVE
+        if not len(index):
+            return None
+        scale = np.where(z[index] != 0, np.abs(z[index]), 1.0)
+        face = self.room_slope(z)[active][:, index] * scale
+        gradient = self.value(z)[1][index] * scale
+        # Multipliers that leave least of the gradient, then the Hessian of the Lagrangian by differences.
+        multipliers = np.linalg.lstsq(face.T, gradient, rcond=None)[0]
+
+        def lagrangian(at: Vector) -> Vector:
+            return np.asarray((self.value(at)[1] - multipliers @ self.room_slope(at)[active])[index] * scale)
+
+        here, hessian = lagrangian(z), np.empty((len(index), len(index)))
+        for column, place in enumerate(index):
+            shift = np.zeros_like(z)
+            shift[place] = SHIFT * scale[column]
+            hessian[:, column] = (lagrangian(z + shift) - here) / SHIFT
+        # The equations of Karush, Kuhn and Tucker on the active limits.
+        system = np.block([[(hessian + hessian.T) / 2, -face.T], [face, np.zeros((len(face), len(face)))]])
+        right = np.concatenate([-gradient, -room[active]])
+        if not np.all(np.isfinite(system)):
+            return None
+        solution = np.linalg.lstsq(system, right, rcond=1e-14)[0]
+        step = np.zeros_like(z)
+        step[index] = scale * solution[: len(index)]
+        return step, solution[len(index) :], active
+
+
+def search(problem: Problem, limits: Limits, starts: Sequence[Vector]) -> Vector | None:
+    """Best of the descents from these points, refined and polished; None where no limits are met from any."""
+    points, sharpest = [start / problem.unit for start in starts], problem.sharpnesses[-1]
+    # Coarse descents from everywhere, the largest eigenvalue sharper and sharper.
+    for sharpness in problem.sharpnesses if len(points) > 1 else problem.sharpnesses[:-1]:
+        programmes = [Programme(problem, limits, sharpness, z * problem.unit) for z in points]
+        points = [programme.descend(z, COARSE) for programme, z in zip(programmes, points, strict=True)]
+    programme = Programme(problem, limits, sharpest, points[0] * problem.unit)
+    best = min(points, key=programme.merit)
+    # A fine descent from the best, begun again as long as that helps.
     for _ in range(ROUNDS):
-        step = _newton(objective, limits, found.powers)
-        if step is None:
+        before = programme.merit(best)
+        best = programme.descend(best, FINE)
+        after = programme.merit(best)
+        if not (np.isinf(before) or after < before * (1 - FINE)):
             break
-        tried = _inside(limits, np.clip(found.powers + step, 0.0, limits.peak))
-        value = objective.value(tried)
-        if not value <= found.error * (1 + 1e-15):
-            break
-        found = Found(tried, value)
-    return found
-
-
-def _newton(objective: Objective, limits: Allowed, powers: Powers) -> Powers | None:
-    shape, size = powers.shape, max(float(powers.max(initial=0.0)), np.finfo(float).tiny)
-    inside = (powers > OFF * size) & (powers < limits.peak * (1 - OFF))
-    index = np.flatnonzero(inside)
-    if not len(index):
-        return None
-    hessian = np.empty((len(index), len(index)))
-    for column, flat in enumerate(index):
-        shift = np.zeros(powers.size)
-        shift[flat] = SHIFT * powers.ravel()[flat]
-        above, below = (objective.value_and_gradient(powers + sign * shift.reshape(shape))[1] for sign in (1, -1))
-        hessian[:, column] = (above - below).ravel()[index] / (2 * shift[flat])
-    gradient = objective.value_and_gradient(powers)[1].ravel()[index]
-    rows, most = _rows(limits)
-    reached = rows @ powers.ravel() >= most * (1 - OFF)
-    face = rows[reached][:, index]
-    face = face[np.abs(face).sum(axis=1) > 0]
-    scale = powers.ravel()[index]
-    system = np.block([
-        [scale[:, None] * (hessian + hessian.T) / 2 * scale, scale[:, None] * face.T],
-        [face * scale, np.zeros((len(face), len(face)))],
-    ])  # fmt: skip
-    right = np.concatenate([-scale * gradient, np.zeros(len(face))])
-    solved = np.linalg.lstsq(system, right, rcond=1e-14)[0][: len(index)]
-    step = np.zeros(powers.size)
-    step[index] = scale * solved
-    return step.reshape(shape)
-
-
-def _unit(limits: Allowed, start: Powers) -> float:
-    """What powers are counted in."""
-    finite = [limits.total, *limits.peak[np.isfinite(limits.peak)], float(start.max(initial=0.0))]
-    return max((one for one in finite if np.isfinite(one)), default=1.0) or 1.0
-
-
-def _rows(limits: Allowed) -> tuple[Float[np.ndarray, "limits entries"], Float[np.ndarray, "limits"]]:
-    """Limits of means over time as rows of the entries, and their values."""
-    steps, count = limits.peak.shape
-    bounded = np.flatnonzero(np.isfinite(limits.each)) if steps > 1 or count > 0 else np.zeros(0, dtype=int)
-    rows = [np.tile(np.eye(count)[h], steps) / steps for h in bounded]
-    most = list(limits.each[bounded])
-    if np.isfinite(limits.total):
-        rows.append(np.ones(steps * count) / steps)
-        most.append(limits.total)
-    return np.array(rows).reshape(-1, steps * count), np.array(most)
-
-
-def _inside(limits: Allowed, powers: Powers) -> Powers:
-    """The powers, less what rounding puts above a limit."""
-    mean = powers.mean(axis=0)
-    own = np.divide(limits.each, mean, out=np.ones_like(mean), where=mean > limits.each)
-    powers = powers * own
-    total = powers.mean(axis=0).sum()
-    return powers * (limits.total / total) if total > limits.total else powers
+    return programme.polish(best) * problem.unit if programme.feasible(best) else None

@@ -1,10 +1,10 @@
-"""Sending what the receiver does not expect: how much noise on the way an unstable plant bears, and with what error.
+"""Feedback of the receiver's prediction: how much noise an unstable plant tolerates on the way, and with what error.
 
 A sensor sends c x + v - c xhat with xhat the receiver's prediction; of E (y - c xhat)^2 = s = c P c' + r every
 transmitter makes its power p_h. Received over the path's mean gain, this has the second moment s D,
-  D = prod_h kappa_h (1 + alpha_h / p_h), kappa = E g^2 / (E g)^2, alpha = Var m / E g^2,
+    D = prod_h kappa_h (1 + alpha_h / p_h), kappa = E g^2 / (E g)^2, alpha = Var m / E g^2,
 so that the predicted error is P+ = A (P - P c' c P / (s D)) A' + Q: that of a filter whose packets arrive with
-probability 1 / D and which is not told. It is bounded if and only if 1 / D > 1 - 1 / Lambda.
+probability 1 / D and whose losses are not observed. It is bounded if and only if 1 / D > 1 - 1 / Lambda.
 """
 
 from collections.abc import Sequence
@@ -23,13 +23,14 @@ from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.atoms import GainAndNoise
 
-SETTLED = 1e-12  # relative change of a round at which the error is taken for steady: rounding of the linear equation
+CONVERGED = 1e-12  # relative change of a round at which the error is steady: rounding of the linear equation
 STEPS, ROUNDS = 20, 2000  # of the filter in a round; rounds
+WHAT = "hops of a sensor with feedback"
 
 
 @readable
 class FeedbackLimit(NamedTuple):
-    """The certificate of a plant whose sensor hears back: the error is bounded if and only if noise < limit.
+    """Certificate of a plant whose sensor has feedback: the error is bounded if and only if noise < limit.
 
     noise D = prod kappa_h (1 + alpha_h / p_h) of the path; limit = Lambda / (Lambda - 1), Lambda the product of the
     squared unstable eigenvalues (inf for a stable plant). predicted, filtered (n, n): the steady error covariances,
@@ -48,7 +49,7 @@ class FeedbackLimit(NamedTuple):
 
 
 class _Link(NamedTuple):
-    """Mean, second moment and noise variance of a hop whose transmitter sends at power 1 what it is given."""
+    """Mean, second moment and noise variance of a hop whose transmitter sends its input at power 1."""
 
     mean: float
     second: float
@@ -58,10 +59,19 @@ class _Link(NamedTuple):
 def feedback_limit(
     plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike
 ) -> FeedbackLimit:
-    """How much noise the path may add, how much it does, and the steady error, for one sensor that hears back.
+    """Certificate of a sensor with feedback: noise of its path, the most that keeps the error bounded, steady error.
 
-    `hops` from the sensor through its relays, as `hop(law, variance)`: of each counts what the air does; how much it
-    amplifies follows from its power in `powers` (hop,). That the error is bounded means that of `fed_back_filter`.
+    Bounded is the error of `hg.filters.fed_back_filter`.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor with one output.
+        hops: from the sensor through its relays, as `hg.hop(law, variance)`; how much each amplifies follows from its
+            power.
+        powers: of each transmitter, shape (hop,), or one number.
+
+    Returns:
+        noise D of the path, its limit, whether the error is bounded, and the steady covariances.
 
     Raises:
         ValueError: a plant or sensor that is not linear or varies, more than one output, an unstable mode that the
@@ -70,24 +80,31 @@ def feedback_limit(
     """
     a, q = plant_matrices(plant)
     c, r = sensor_matrices(sensor, len(a))
-    _check_seen(a, c)
+    _check_detectable(a, c)
     noise = noise_of_hops(hops, powers)
-    unstable = np.abs(np.linalg.eigvals(a))
-    lam = float(np.prod(unstable[unstable > 1] ** 2))
+    eigenvalues = np.abs(np.linalg.eigvals(a))
+    lam = float(np.prod(eigenvalues[eigenvalues > 1] ** 2))
     limit = lam / (lam - 1) if lam > 1 else np.inf
     if noise >= limit:
         return FeedbackLimit(noise, limit, None, None)
     predicted = _steady(a, q, c, r, noise)
-    return FeedbackLimit(noise, limit, predicted, _heard(predicted, c, r, noise))
+    return FeedbackLimit(noise, limit, predicted, _filtered(predicted, c, r, noise))
 
 
 def fed_back_channel(
     plant: LinearPlant, sensor: LinearSensor, hops: Sequence[GainAndNoise], powers: ArrayLike, horizon: int
 ) -> Channel:
-    """The channel over so many steps of a sensor that hears back, in which every transmitter keeps its power.
+    """Channel over a horizon of a sensor with feedback, in which every transmitter has a constant power.
 
-    a_1^2 = p_1 / (c P_k c' + r) falls and rises with what the receiver does not know, which is known before any data;
-    relays amplify by a_{h+1}^2 = p_{h+1} / (E g_h^2 p_h + Var m_h). For `fed_back_filter`.
+    a_1^2 = p_1 / (c P_k c' + r) falls and rises with the receiver's uncertainty, which is known before any data; relays
+    amplify by a_{h+1}^2 = p_{h+1} / (E g_h^2 p_h + Var m_h). For `hg.filters.fed_back_filter`.
+
+    Args:
+        plant: a linear plant.
+        sensor: a linear sensor with one output.
+        hops: as in `feedback_limit`.
+        powers: of each transmitter, shape (hop,), or one number.
+        horizon: number of steps.
 
     Raises:
         ValueError: as `feedback_limit`; a horizon below one.
@@ -96,18 +113,20 @@ def fed_back_channel(
     c, r = sensor_matrices(sensor, len(a))
     links, p = _links(hops), _powers(powers, len(hops))
     noise, steps = noise_of_hops(hops, powers), check_count("horizon", horizon)
-    relays = [np.sqrt(then / (one.second * sent + one.noise)) for one, sent, then in zip(links, p, p[1:], strict=False)]
+    # Relays amplify alike at all steps, the sensor by what is left of its signal.
+    relays = [
+        np.sqrt(then / (link.second * sent + link.noise)) for link, sent, then in zip(links, p, p[1:], strict=False)
+    ]
     filtered, channels = np.asarray(plant.initial_covariance), []
     for _ in range(steps):
         predicted = a @ filtered @ a.T + q
-        first = np.sqrt(p[0] / (c @ predicted @ c.T + r)[0, 0])
-        factors = [first, *relays]
+        factors = [np.sqrt(p[0] / (c @ predicted @ c.T + r)[0, 0]), *relays]
         channels.append(
             amplify_and_forward([
-                hop(one.law, one.noise, amplification=factor) for one, factor in zip(hops, factors, strict=True)
+                hop(item.law, item.noise, amplification=factor) for item, factor in zip(hops, factors, strict=True)
             ])
         )  # fmt: skip
-        filtered = _heard(predicted, c, r, noise)
+        filtered = _filtered(predicted, c, r, noise)
     return over_time(channels)
 
 
@@ -118,11 +137,11 @@ def noise_of_hops(hops: Sequence[GainAndNoise], powers: ArrayLike) -> float:
         ValueError: hops that are no single hops, powers that are not positive.
     """
     links = _links(hops)
-    each = zip(links, _powers(powers, len(links)), strict=True)
-    return float(np.prod([one.second / one.mean**2 * (1 + one.noise / (one.second * p)) for one, p in each]))
+    pairs = zip(links, _powers(powers, len(links)), strict=True)
+    return float(np.prod([link.second / link.mean**2 * (1 + link.noise / (link.second * p)) for link, p in pairs]))
 
 
-def _heard(p: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndarray:
+def _filtered(p: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndarray:
     """P - P c' c P / (s D)."""
     cross = p @ c.T
     return np.asarray(p - cross @ cross.T / (noise * (c @ cross + r)[0, 0]))
@@ -131,36 +150,38 @@ def _heard(p: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndar
 def _steady(a: np.ndarray, q: np.ndarray, c: np.ndarray, r: np.ndarray, noise: float) -> np.ndarray:
     """P = A (P - P c' c P / (s D)) A' + Q: steps of the filter, and the steady error of their gain once it is bounded.
 
-    With a gain K kept, P+ = A ((I - K c) P (I - K c)' + K r K' + (D - 1) K (c P c' + r) K') A' + Q.
+    With a constant gain K, P+ = A ((I - K c) P (I - K c)' + K r K' + (D - 1) K (c P c' + r) K') A' + Q.
     """
     n = len(a)
     p = q
     for _ in range(ROUNDS):
         for _ in range(STEPS):
-            p = a @ _heard(p, c, r, noise) @ a.T + q
+            p = a @ _filtered(p, c, r, noise) @ a.T + q
+        # Steady error of the gain that these steps end with, by a linear equation.
         gain = p @ c.T / (noise * (c @ p @ c.T + r)[0, 0])
-        kept, fed = a @ (np.eye(n) - gain @ c), a @ gain
-        through = np.kron(kept, kept) + (noise - 1) * np.kron(fed @ c, fed @ c)
+        loop, amplified = a @ (np.eye(n) - gain @ c), a @ gain
+        through = np.kron(loop, loop) + (noise - 1) * np.kron(amplified @ c, amplified @ c)
         if spectral_radius(through) >= 1:
             continue
-        found = np.linalg.solve(np.eye(n * n) - through, (noise * r[0, 0] * fed @ fed.T + q).ravel()).reshape(n, n)
-        found = (found + found.T) / 2
-        if np.abs(found - p).max() <= SETTLED * np.abs(found).max():
-            return found
-        p = found
+        added = noise * r[0, 0] * amplified @ amplified.T + q
+        steady = np.linalg.solve(np.eye(n * n) - through, added.ravel()).reshape(n, n)
+        steady = (steady + steady.T) / 2
+        if np.abs(steady - p).max() <= CONVERGED * np.abs(steady).max():
+            return steady
+        p = steady
     return p
 
 
 def _links(hops: Sequence[GainAndNoise]) -> list[_Link]:
-    found = []
-    for one in items("hops", hops, "hops"):
-        if not isinstance(one, GainAndNoise) or one.inputs != 1 or one.outputs != 1:
-            raise fail("hops of a sensor that hears back", "single hops of one number", shown(one))
-        variance = float(np.asarray(one.noise.covariance)[0, 0])
-        found.append(_Link(float(one.law.moment(1)), float(one.law.moment(2)), variance))
-    if not found or any(one.mean == 0 for one in found):
-        raise fail("hops of a sensor that hears back", "at least one, each with a mean gain", shown(hops))
-    return found
+    links = []
+    for item in items("hops", hops, "hops"):
+        if not isinstance(item, GainAndNoise) or item.inputs != 1 or item.outputs != 1:
+            raise fail(WHAT, "single hops of one number", shown(item))
+        variance = float(np.asarray(item.noise.covariance)[0, 0])
+        links.append(_Link(float(item.law.moment(1)), float(item.law.moment(2)), variance))
+    if not links or any(link.mean == 0 for link in links):
+        raise fail(WHAT, "at least one, each with a mean gain", shown(hops))
+    return links
 
 
 def _powers(powers: ArrayLike, count: int) -> np.ndarray:
@@ -170,10 +191,10 @@ def _powers(powers: ArrayLike, count: int) -> np.ndarray:
     return result
 
 
-def _check_seen(a: np.ndarray, c: np.ndarray) -> None:
+def _check_detectable(a: np.ndarray, c: np.ndarray) -> None:
     """One output, which shows every unstable mode (Hautus)."""
     if len(c) != 1:
-        raise fail("sensor that hears back", "one output", len(c))
+        raise fail("sensor with feedback", "one output", len(c))
     for value in np.linalg.eigvals(a):
         if abs(value) >= 1 and np.linalg.matrix_rank(np.vstack([a - value * np.eye(len(a)), c])) < len(a):
-            raise fail("sensor that hears back", "one that shows every unstable mode", f"none of {value:.4g}")
+            raise fail("sensor with feedback", "one that shows every unstable mode", f"none of {value:.4g}")

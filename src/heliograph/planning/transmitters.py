@@ -1,126 +1,279 @@
-"""Who sends in a channel, and how its transmitters are called.
+"""Transmitters of a channel: their names, the power that each sends, and channels in which they send other powers.
 
 Every map z = g A y + n with a random gain or a noise is a hop, and its transmitter sends A y; what is known and without
-noise is a wire. Transmitters are called by their place: "hop1", "hop2" along a chain, "part1.", "part2." in a stack,
-"choice1." where a mixture chooses among several.
+noise is a wire. Transmitters are named by their place: "hop1", "hop2" along a chain, "part1.", "part2." in a stack,
+"choice1." where a mixture chooses among several. A transmitter sends whether it is received or not: of modes and
+mixtures in which it is silent it knows nothing. Behind an observed loss (an erasure) a relay sends only what arrived.
 """
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from math import prod
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
 
 from heliograph.numerics.check import fail
-from heliograph.numerics.traced import is_traced, is_zero
+from heliograph.numerics.traced import is_traced, is_zero, library, plain
+from heliograph.numerics.types import Array, Float, Scalar
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.chain import stationary
 from heliograph.random_affine.combine import Mixture, Series, Stack
-from heliograph.random_affine.delay import Delayed, OfLine
+from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed
+from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed, joint_modes
+from heliograph.random_affine.second_moments import second_moment_tensor
 
+UNCHANGED = 1e-12  # change of a law in a step that counts as none
+
+Second = Float[Array, "p p"]  # E (y, 1)(y, 1)'
 Hop = GainAndNoise | Faded
-Act = Callable[[str, Hop], AbstractRandomAffine]
 
 
-def transmits(atom: Hop) -> bool:
-    """Whether anything is sent over the air."""
-    if isinstance(atom, Faded):
-        return True
-    return not (_is_one(atom) and is_zero(atom.noise.covariance))
+class Signal(NamedTuple):
+    """Second moment of what a map receives, and the probability that it arrives."""
+
+    second: Second
+    arrives: Scalar
 
 
-def _is_one(atom: GainAndNoise) -> bool:
-    return isinstance(atom.law, Constant) and not is_traced(atom.law.value) and float(atom.law.value) == 1.0
-
-
-def is_silent(channel: AbstractRandomAffine) -> bool:
-    """Whether nothing comes through but noise: what a loss, or a mode in which nothing is heard, is made of."""
-    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _is_one(channel)
+Visit = Callable[[str, Hop, Signal | None], AbstractRandomAffine]
 
 
 class Place(NamedTuple):
-    """Where in a channel: the prefix of names, and how many hops are before along the chain."""
+    """Place in a channel: the prefix of names, the number of hops before it along the chain, and the signal there."""
 
     prefix: str
     hops: int
+    signal: Signal | None
 
 
-BEGINNING = Place("", 0)
+def transmits(hop: Hop) -> bool:
+    """Whether anything is transmitted, rather than passed on by a wire."""
+    return isinstance(hop, Faded) or not (_gain_is_one(hop) and is_zero(hop.noise.covariance))
 
 
-def walked(channel: AbstractRandomAffine, act: Act, place: Place = BEGINNING) -> tuple[AbstractRandomAffine, Place]:
-    """The channel with every hop replaced by act(name, hop), and the place behind it.
+def _gain_is_one(hop: GainAndNoise) -> bool:
+    return isinstance(hop.law, Constant) and not is_traced(hop.law.value) and float(hop.law.value) == 1.0
+
+
+def is_silent(channel: AbstractRandomAffine) -> bool:
+    """Whether nothing comes through but noise: what a loss, or a mode without reception, is made of."""
+    return isinstance(channel, GainAndNoise) and is_zero(channel.matrix) and _gain_is_one(channel)
+
+
+def visit_hops(channel: AbstractRandomAffine, visit: Visit, signal: Signal | None = None) -> AbstractRandomAffine:
+    """Channel with every hop replaced by visit(name, hop, signal); the signal is followed through maps without memory.
 
     Raises:
         ValueError: a map of a kind whose transmitters are not known.
     """
+    return _visit(channel, visit, Place("", 0, signal))[0]
+
+
+def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[AbstractRandomAffine, Place]:
+    """The changed channel, and the place behind it; its signal is set by the series that the channel is in."""
     match channel:
         case GainAndNoise() | Faded():
             if not transmits(channel):
                 return channel, place
             after = place._replace(hops=place.hops + 1)
-            return act(f"{place.prefix}hop{after.hops}", channel), after
+            return visit(f"{place.prefix}hop{after.hops}", channel, place.signal), after
         case Series():
-            parts = []
-            for part in channel.maps:
-                part, place = walked(part, act, place)
-                parts.append(part)
+            parts, place = _visit_chain(channel.maps, visit, place)
         case Stack():
-            places = [Place(f"{place.prefix}part{i}.", 0) for i in range(1, len(channel.maps) + 1)]
-            parts = [walked(part, act, own)[0] for part, own in zip(channel.maps, places, strict=True)]
+            places = [Place(f"{place.prefix}part{i}.", 0, place.signal) for i in range(1, len(channel.maps) + 1)]
+            parts = [_visit(part, visit, at)[0] for part, at in zip(channel.maps, places, strict=True)]
         case Mixture() | Modes():
-            parts, place = _chosen(channel, act, place)
+            # Modes of a link have the same transmitters, as have a hop and its loss; others each theirs.
+            several = isinstance(channel, Mixture) and sum(not is_silent(part) for part in channel.maps) > 1
+            prefixes = [f"{place.prefix}choice{i}." for i in range(1, len(channel.maps) + 1)]
+            places = [Place(prefix, 0, place.signal) if several else place for prefix in prefixes]
+            pairs = [_visit(part, visit, at) for part, at in zip(channel.maps, places, strict=True)]
+            parts = [part for part, _ in pairs]
+            place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
         case Revealed():
             return channel, place
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]
-            inner, place = walked(getattr(channel, name), act, place)
+            inside = place
+            if isinstance(channel, OfLine) and place.signal is not None:
+                line = _line(place.signal.second, channel.inputs // sent(channel))
+                inside = place._replace(signal=place.signal._replace(second=line))
+            inner, place = _visit(getattr(channel, name), visit, inside)
+            if inner is getattr(channel, name):
+                return channel, place
             return eqx.tree_at(lambda c: getattr(c, name), channel, inner), place
         case _:
-            raise unknown(channel)
+            expected = "hops in series, stacks, mixtures, modes, losses and delays"
+            raise fail("transmitters of a channel", expected, type(channel).__name__)
+    if all(part is before for part, before in zip(parts, channel.maps, strict=True)):
+        return channel, place
     return eqx.tree_at(lambda c: c.maps, channel, tuple(parts)), place
 
 
-def _chosen(channel: Mixture | Modes, act: Act, place: Place) -> tuple[list[AbstractRandomAffine], Place]:
-    """The maps of which one is in force: modes of one link have the same transmitters, those of a mixture their own."""
-    own = [not is_silent(part) for part in channel.maps]
-    several = isinstance(channel, Mixture) and sum(own) > 1
-    places = [Place(f"{place.prefix}choice{i}.", 0) if several else place for i in range(1, len(own) + 1)]
-    pairs = [walked(part, act, at) for part, at in zip(channel.maps, places, strict=True)]
-    return [part for part, _ in pairs], place if several else max((at for _, at in pairs), key=lambda at: at.hops)
+def _visit_chain(
+    maps: Sequence[AbstractRandomAffine], visit: Visit, place: Place
+) -> tuple[list[AbstractRandomAffine], Place]:
+    """The changed maps of a series, each of which receives what comes through those before it."""
+    parts, signal = [], place.signal
+    for i, part in enumerate(maps):
+        changed, place = _visit(part, visit, place._replace(signal=signal))
+        parts.append(changed)
+        if signal is not None and i + 1 < len(maps):
+            signal = Signal(_behind(part, signal.second), signal.arrives * _arrival(part))
+    return parts, place
 
 
-def names_of(channel: AbstractRandomAffine) -> list[str]:
+def _arrival(channel: AbstractRandomAffine) -> Scalar:
+    """Probability that a signal comes through."""
+    if not channel.erases:
+        return 1.0
+    match channel:
+        case Erasure():
+            return plain(channel.arrival) * _arrival(channel.base)
+        case Series():
+            return prod(_arrival(part) for part in channel.maps)
+        case Delayed():
+            return _arrival(channel.link)
+    raise fail("transmitter behind a loss", "a chain that erases", type(channel).__name__)
+
+
+def _behind(channel: AbstractRandomAffine, second: Second) -> Second:
+    """E (z, 1)(z, 1)' behind a map, of what arrives."""
+    match channel:
+        case Erasure():
+            return _behind(channel.base, second)
+        case Series():
+            for part in channel.maps:
+                second = _behind(part, second)
+            return second
+        case Delayed():
+            return _behind(channel.link, second)
+    # E h Y h' by the second moments of the random map h, and its mean.
+    moments = channel.moments(2)
+    tensor = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    mean, xp = moments.mean[:-1] @ second[:, -1], library(tensor, second)
+    result: Second = xp.block(
+        [[xp.einsum("ijab,ab->ij", tensor, second), mean[:, None]], [mean[None], np.ones((1, 1))]]
+    )
+    return result
+
+
+def _line(second: Second, times: int) -> Second:
+    """Moment of the line (y_k, y_{k-1}, ...): each as the present one; a delay chooses one of them, so no two meet."""
+    xp = library(second)
+    mean, blocks = xp.tile(second[:-1, -1], times), xp.kron(np.eye(times), second[:-1, :-1])
+    result: Second = xp.block([[blocks, mean[:, None]], [mean[None], np.ones((1, 1))]])
+    return result
+
+
+def transmitter_names(channel: AbstractRandomAffine) -> list[str]:
     """Names of the transmitters, in order of appearance."""
-    found: dict[str, None] = {}
+    names: dict[str, None] = {}
 
-    def note(name: str, hop: Hop) -> Hop:
-        found.setdefault(name)
+    def note(name: str, hop: Hop, signal: Signal | None) -> Hop:
+        names.setdefault(name)
         return hop
 
-    walked(channel, note)
-    return list(found)
+    visit_hops(channel, note)
+    return list(names)
 
 
-def selected(names: Sequence[str], wanted: Sequence[str], what: str) -> np.ndarray:
-    """Which of the names are wanted, by name or by what stands before a dot.
+def selected(names: Sequence[str], chosen: Sequence[str], what: str) -> np.ndarray:
+    """Which of the names are chosen, by name or by what stands before a dot.
 
     Raises:
-        ValueError: one that is there under no name.
+        ValueError: a choice that is there under no name.
     """
-    chosen = np.zeros(len(names), dtype=bool)
-    for one in wanted:
-        hit = np.array([name == one or name.startswith(f"{one}.") for name in names])
+    result = np.zeros(len(names), dtype=bool)
+    for choice in chosen:
+        hit = np.array([name == choice or name.startswith(f"{choice}.") for name in names])
         if not np.any(hit):
-            raise fail(what, f"names of transmitters {list(names)}", repr(one))
-        chosen |= hit
-    return chosen
+            raise fail(what, f"names of transmitters {list(names)}", repr(choice))
+        result |= hit
+    return result
 
 
-def unknown(channel: AbstractRandomAffine) -> ValueError:
-    """The error for a map of a kind whose transmitters are not known."""
-    expected = "hops in series, stacks, mixtures, modes, losses and delays"
-    return fail("transmitters of a channel", expected, type(channel).__name__)
+def sent_powers(channel: AbstractRandomAffine, second: Second, step: int = 0) -> dict[str, Any]:
+    """Power of each transmitter at a step, the mean square of what it sends, from E (y, 1)(y, 1)' of the input.
+
+    Exact: modes have the law of the step.
+
+    Raises:
+        ValueError: a map of a kind whose transmitters are not known.
+    """
+    joint = joint_modes(channel, order=2)
+    law = joint.initial @ library(joint.transition).linalg.matrix_power(joint.transition, step)
+    return powers_of_law(channel, second, law)
+
+
+def steady_powers(channel: AbstractRandomAffine, second: Second) -> dict[str, Any]:
+    """Power of each transmitter in the long run, whatever modes the channel began with."""
+    joint = joint_modes(channel, order=2)
+    unchanged = np.allclose(joint.initial @ joint.transition, joint.initial, rtol=0.0, atol=UNCHANGED)
+    return powers_of_law(channel, second, joint.initial if unchanged else stationary(joint.transition))
+
+
+def powers_of_law(channel: AbstractRandomAffine, second: Second, law: Float[Array, "modes"]) -> dict[str, Any]:
+    """Power of each transmitter where the channel's modes have this law (one mode, of a channel without memory)."""
+    total: dict[str, Scalar] = dict.fromkeys(transmitter_names(channel), 0.0)
+    occurs = dict(total)
+    for weight, map_ in zip(law, joint_modes(channel, order=2).maps, strict=True):
+        # Powers in a mode; a transmitter that is not received there sends as in other modes.
+        powers: dict[str, Scalar] = {}
+
+        def note(name: str, hop: Hop, signal: Signal | None, powers: dict[str, Scalar] = powers) -> Hop:
+            assert signal is not None and isinstance(hop, GainAndNoise)
+            if not is_silent(hop):
+                powers[name] = signal.arrives * (hop.matrix @ signal.second[:-1, :-1] * hop.matrix).sum()
+            return hop
+
+        visit_hops(map_, note, Signal(second, 1.0))
+        for name, power in powers.items():
+            total[name] += weight * power
+            occurs[name] += weight
+    return {name: _over(total[name], occurs[name]) for name in total}
+
+
+def _over(total: Scalar, probability: Scalar) -> Scalar:
+    """Conditional mean; zero where the condition never holds."""
+    if is_traced(probability):
+        quotient: Scalar = total / library(probability).where(probability == 0, 1.0, probability)
+        return quotient
+    return 0.0 if is_zero(probability) else plain(total / probability)
+
+
+def allocate(
+    channel: AbstractRandomAffine, second: Second, powers: Mapping[str, float], step: int = 0
+) -> AbstractRandomAffine:
+    """Channel whose named transmitters send these powers: each amplifies what it receives to its power.
+
+    Raises:
+        ValueError: a transmitter that receives nothing which it could amplify.
+    """
+    for name in transmitter_names(channel):  # in order: a relay receives what those before it send
+        if name in powers:
+            now = sent_powers(channel, second, step)[name]
+            if now <= 0 < powers[name]:
+                channel = _amplified(channel, name, None)
+                now = sent_powers(channel, second, step)[name]
+            if now <= 0 < powers[name]:
+                raise fail(f"transmitter {name!r}", "a signal that can be amplified", "none")
+            channel = _amplified(channel, name, np.sqrt(powers[name] / now) if now > 0 else 0.0)
+    return channel
+
+
+def _amplified(channel: AbstractRandomAffine, name: str, factor: float | None) -> AbstractRandomAffine:
+    """Channel in which a transmitter amplifies by this factor more; None: sends what it receives, whatever it sent."""
+
+    def change(hop_name: str, hop: Hop, signal: Signal | None) -> Hop:
+        if hop_name != name:
+            return hop
+        matrix = np.eye(*np.shape(hop.matrix)) if factor is None else np.asarray(hop.matrix) * factor
+        result: Hop = eqx.tree_at(lambda h: h.matrix, hop, matrix)
+        return result
+
+    return visit_hops(channel, change)

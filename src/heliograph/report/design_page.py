@@ -1,4 +1,4 @@
-"""A design as figures and a page: the front, who sends how much, a map, what is certified, and what more would buy."""
+"""A design as figures and a page: the front, who sends how much, a map, the certificate, and the worth of changes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,10 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
 from heliograph.disk.quoting import in_figure, visible
-from heliograph.planning.front import Front
-from heliograph.planning.outcome import NetworkDesign
-from heliograph.planning.purchases import Purchase
-from heliograph.planning.site_map import SiteMap
+from heliograph.planning.comparisons import ChangeWorth, Front, SiteMap
+from heliograph.planning.problem import PowerDesign
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, PALE, STYLE, VERMILION, WIDTH
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Section, Table, Text
 from heliograph.report.results import Json, Results
@@ -26,39 +24,39 @@ SOURCE, DESIGNED = "network.py", "designed.py"
 
 @dataclass(frozen=True)
 class DesignResults:
-    """Everything a design's page tells. `before`: what each transmitter sends as the network is, in the mean."""
+    """Everything that a design's page shows. `before`: mean power of each transmitter as the network is."""
 
     reference: str
     source: str
-    design: NetworkDesign
+    design: PowerDesign
     before: Mapping[str, float]
     front: Front
-    purchases: Sequence[Purchase]
+    changes: Sequence[ChangeWorth]
     map: SiteMap | None
     written: str  # the designed network as Python source
 
 
-def design_results(found: DesignResults) -> Results:
+def design_results(results: DesignResults) -> Results:
     """Everything that the folder holds."""
-    return Results(figures(found), partial(page, found), summary(found), partial(write_networks, found))
+    return Results(figures(results), partial(page, results), summary(results), partial(write_networks, results))
 
 
-def write_networks(found: DesignResults, folder: Path) -> None:
-    """The network as it was, and beside it the designed one, which reads it."""
-    (folder / SOURCE).write_text(found.source, encoding="utf-8")
-    (folder / DESIGNED).write_text(found.written, encoding="utf-8")
+def write_networks(results: DesignResults, folder: Path) -> None:
+    """Write the network as it was, and in the same folder the designed one, which reads it."""
+    (folder / SOURCE).write_text(results.source, encoding="utf-8")
+    (folder / DESIGNED).write_text(results.written, encoding="utf-8")
 
 
-def mean_powers(design: NetworkDesign) -> dict[str, float]:
+def mean_powers(design: PowerDesign) -> dict[str, float]:
     """Mean power of each transmitter, zero where it is but rounding of the total."""
-    each = {name: float(np.mean(power)) for name, power in design.powers.items()}
-    return {name: power if power > ROUNDING * design.total else 0.0 for name, power in each.items()}
+    mean = {name: float(np.mean(power)) for name, power in design.powers.items()}
+    return {name: power if power > ROUNDING * design.total else 0.0 for name, power in mean.items()}
 
 
-def summary(found: DesignResults) -> dict[str, Json]:
+def summary(results: DesignResults) -> dict[str, Json]:
     """All numbers of the page."""
-    design, certificate = found.design, found.design.certificate
-    place = None if found.map is None else dict(zip(("x", "y", "error"), found.map.best, strict=True))
+    design, certificate = results.design, results.design.certificate
+    place = None if results.map is None else dict(zip(("x", "y", "error"), results.map.best, strict=True))
     return {
         "error": design.error,
         "present": design.present,
@@ -70,24 +68,24 @@ def summary(found: DesignResults) -> dict[str, Json]:
         },
         "sensitivity": dict(design.sensitivity),
         "price": design.price,
-        "front": {key: np.asarray(value).tolist() for key, value in found.front._asdict().items()},
-        "purchases": {one.name: {"value": one.value, "saved": one.saved} for one in found.purchases},
+        "front": {key: np.asarray(value).tolist() for key, value in results.front._asdict().items()},
+        "changes": {change.name: {"value": change.value, "saved": change.saved} for change in results.changes},
         "map": place,
     }  # fmt: skip
 
 
-def figures(found: DesignResults) -> dict[str, Figure]:
-    """Front, powers, and the map where one is asked for, by file name."""
-    drawn = {"front": front_figure(found.front, {"this design": (found.design.total, found.design.error)})}
-    drawn["powers"] = powers_figure(found.before, mean_powers(found.design))
-    if found.map is not None:
-        drawn["map"] = map_figure(found.map)
+def figures(results: DesignResults) -> dict[str, Figure]:
+    """Front, powers, and the map if there is one, by file name."""
+    drawn = {"front": front_figure(results.front, {"this design": (results.design.total, results.design.error)})}
+    drawn["powers"] = powers_figure(results.before, mean_powers(results.design))
+    if results.map is not None:
+        drawn["map"] = map_figure(results.map)
     return drawn
 
 
 @matplotlib.rc_context(STYLE)
 def front_figure(front: Front, marks: Mapping[str, tuple[float, float]]) -> Figure:
-    """Error over total power: what was found, the bound below which nothing is, and named points (power, error)."""
+    """Error over total power: the least found, the bound below which nothing is, and named points (power, error)."""
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots()
     # a bound at some power holds for all less: hence steps
@@ -126,12 +124,12 @@ def powers_figure(before: Mapping[str, float], after: Mapping[str, float]) -> Fi
 
 
 @matplotlib.rc_context(STYLE)
-def map_figure(found: SiteMap) -> Figure:
+def map_figure(sites: SiteMap) -> Figure:
     """The error over places, darker where it is smaller, with the best place."""
     figure = Figure(figsize=(WIDTH, 4.6), layout="constrained")
     axes = figure.subplots()
-    picture = axes.contourf(found.x, found.y, found.errors, levels=14, cmap="cividis")
-    east, north, least = found.best
+    picture = axes.contourf(sites.x, sites.y, sites.errors, levels=14, cmap="cividis")
+    east, north, least = sites.best
     axes.plot([east], [north], "*", color="white", markeredgecolor=INK, markersize=16)
     axes.set(xlabel="x", ylabel="y", aspect="equal", title=f"best at ({east:.3g}, {north:.3g}): {least:.4g}")
     axes.grid(visible=False)
@@ -139,37 +137,37 @@ def map_figure(found: SiteMap) -> Figure:
     return figure
 
 
-def page(found: DesignResults, drawings: Mapping[str, bytes]) -> Page:
+def page(results: DesignResults, drawings: Mapping[str, bytes]) -> Page:
     """The report; `drawings` holds each figure as SVG."""
-    design = found.design
-    sections = [_result(found), _front(drawings), _powers(found, drawings)]
-    if found.map is not None:
-        sections.append(_map(found.map, drawings))
+    design = results.design
+    sections = [_result(results), _front(drawings), _powers(results, drawings)]
+    if results.map is not None:
+        sections.append(_map(drawings))
     return Page(
         kicker="Heliograph design",
-        title=_finding(found),
+        title=_finding(results),
         lead=(
-            f"The network {visible(found.reference)} has the error {design.present:.4g} and sends "
-            f"{sum(found.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
+            f"The network {visible(results.reference)} has the error {design.present:.4g} and sends "
+            f"{sum(results.before.values()):.4g} as it is. Designed, it has the error {design.error:.4g} and sends "
             f"{design.total:.4g}."
         ),
-        sections=[*sections, _more(found), _rerun()],
+        sections=[*sections, _changes(results), _rerun()],
     )
 
 
-def _finding(found: DesignResults) -> str:
-    design, before = found.design, sum(found.before.values())
+def _finding(results: DesignResults) -> str:
+    design, before = results.design, sum(results.before.values())
     changed = [f"{100 * abs(1 - now / then):.3g} % {'less' if now < then else 'more'} {what}"
                for what, now, then in (("error", design.error, design.present), ("power", design.total, before))
                if then > 0 and abs(now - then) > 1e-3 * then]  # fmt: skip
     return f"By design: {' with '.join(changed)}" if changed else "No design is better than the network as it is"
 
 
-def _result(found: DesignResults) -> Section:
-    design = found.design
+def _result(results: DesignResults) -> Section:
+    design = results.design
     keys = [
         KeyFigure("error", f"{design.error:.4g}", f"{design.present:.4g} as the network is", BLUE),
-        KeyFigure("total power", f"{design.total:.4g}", f"{sum(found.before.values()):.4g} as it is", VERMILION),
+        KeyFigure("total power", f"{design.total:.4g}", f"{sum(results.before.values()):.4g} as it is", VERMILION),
         KeyFigure("not below", f"{design.certificate.bound:.4g}", f"{design.certificate.unit}, proven", GREEN),
     ]
     words = f"**How good it is:** {design.certificate.words}."
@@ -181,30 +179,30 @@ def _front(drawings: Mapping[str, bytes]) -> Section:
     return Section("Error against power", [Picture(drawings["front"], "Error falling with total power.", caption)])
 
 
-def _powers(found: DesignResults, drawings: Mapping[str, bytes]) -> Section:
-    after, slope = mean_powers(found.design), found.design.sensitivity
+def _powers(results: DesignResults, drawings: Mapping[str, bytes]) -> Section:
+    after, slope = mean_powers(results.design), results.design.sensitivity
     rows = [
-        [visible(name), f"{found.before.get(name, float('nan')):.4g}", f"{power:.4g}",
-         f"{np.max(found.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]
+        [visible(name), f"{results.before.get(name, float('nan')):.4g}", f"{power:.4g}",
+         f"{np.max(results.design.powers[name]):.4g}", f"{max(-slope[name], 0.0):.3g}"]
         for name, power in after.items()
     ]  # fmt: skip
     caption = (
         "**One more watt here**: by how much the error falls for one unit of mean power more at this transmitter; "
-        f"where a total binds, it is the same ({found.design.price:.3g}) for all that send, and less for the others."
+        f"where a total binds, it is the same ({results.design.price:.3g}) for all that send, and less for the others."
     )
     headers = ("transmitter", "as it is", "designed", "peak", "one more watt here")
     picture = Picture(drawings["powers"], "Bars of power by transmitter, with marks for what is sent now.")
     return Section("Who sends how much", [picture, Table(headers, rows, caption)])
 
 
-def _map(found: SiteMap, drawings: Mapping[str, bytes]) -> Section:
+def _map(drawings: Mapping[str, bytes]) -> Section:
     caption = "The least error at the design's total power, with the network standing as the map's function says."
     return Section("Where", [Picture(drawings["map"], "The error over places, with the best one.", caption)])
 
 
-def _more(found: DesignResults) -> Section:
-    unit = found.design.certificate.unit
-    rows = [[visible(one.name), f"{one.value:.4g}", f"{one.saved:+.3g}"] for one in found.purchases]
+def _changes(results: DesignResults) -> Section:
+    unit = results.design.certificate.unit
+    rows = [[visible(change.name), f"{change.value:.4g}", f"{change.saved:+.3g}"] for change in results.changes]
     caption = (
         f"The {unit} of the design made again after each change, and how much of it that saves. A relay halfway is put "
         "in where the exponent of the path loss is given."
@@ -216,6 +214,6 @@ def _rerun() -> Section:
     commands = f"heliograph run {DESIGNED} --measurements data.csv --out estimates.csv"
     text = (
         f"`{DESIGNED}` is the network with these powers and the best linear filters for them; it reads `{SOURCE}`, "
-        "the network as it was, beside it. `summary.json` holds every number of this page."
+        "the network as it was, in the same folder. `summary.json` holds every number of this page."
     )
     return Section("Run it", [Code(commands), Text([text])])

@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph as hg
-from heliograph.planning import Front, NetworkDesign, RelayLine, SendingSchedule, Task, error_over_power
+from heliograph.planning import DesignProblem, PowerDesign, error_over_power
+from heliograph.planning.comparisons import Front
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import networks as demo_networks
 from heliograph_studies.demo.compute import one_trial
@@ -14,6 +15,17 @@ from heliograph_studies.demo.recording import read_recording
 from heliograph_studies.demo.twin import Design, as_it_is, twins
 from heliograph_studies.network_design import setting
 from heliograph_studies.network_design.published import Circuit, circuit, packets
+from heliograph_studies.network_design.theory import (
+    Bursts,
+    Choice,
+    RelayLine,
+    SendingSchedule,
+    best_relays,
+    best_schedule,
+    burst_sending,
+    choose_sensors,
+    relay_line,
+)
 
 ONE_HOP, TWO_HOPS = (2.0, 10.0, 50.0), (6.0, 30.0)  # total powers
 FRONT = (2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
@@ -30,9 +42,9 @@ class Case(NamedTuple):
     """One total power: the error of equal powers, the best found, and the least power for the error of equal ones."""
 
     equal: float
-    best: NetworkDesign
-    least: NetworkDesign
-    narrow: NetworkDesign  # the least power on the paths of the best
+    best: PowerDesign
+    least: PowerDesign
+    narrow: PowerDesign  # the least power on the paths of the best
 
 
 class Outcome(NamedTuple):
@@ -45,9 +57,9 @@ class Outcome(NamedTuple):
     circuit: Circuit
     packets: dict[float, dict[str, float]]
     schedule: SendingSchedule
-    bursts: hg.planning.Bursts
+    bursts: Bursts
     lines: dict[float, tuple[RelayLine, RelayLine]]  # one relay, and the best number of them with fading
-    sensors: dict[int, hg.planning.Choice]
+    sensors: dict[int, Choice]
 
 
 def case(relayed: bool, total: float) -> Case:
@@ -55,9 +67,9 @@ def case(relayed: bool, total: float) -> Case:
     network = setting.six(relayed)
     best = hg.design(network, budget=total)
     equal = equal_error(network, total)
-    least = hg.design(network, wanted=equal)
+    least = hg.design(network, target_error=equal)
     sending = [name for name, power in path_powers(best).items() if power > 1e-9 * total]
-    narrow = least if not relayed else hg.design(setting.six(relayed, sending), wanted=equal)
+    narrow = least if not relayed else hg.design(setting.six(relayed, sending), target_error=equal)
     return Case(equal, best, least, narrow)
 
 
@@ -69,7 +81,7 @@ def equal_error(network: hg.Network, total: float) -> float:
     return hg.design(designed, budget=total, starts=1).present  # whatever is found
 
 
-def path_powers(design: NetworkDesign) -> dict[str, float]:
+def path_powers(design: PowerDesign) -> dict[str, float]:
     """Mean power of all transmitters of each sensor's path."""
     found: dict[str, float] = {}
     for name, power in design.powers.items():
@@ -94,7 +106,7 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
         for total in totals:
             advance(f"six sensors over {'two hops' if relayed else 'one hop'}, power {total:g}")
             cases[relayed][total] = case(relayed, total)
-    front = error_over_power(setting.six(True), Task(), FRONT, advance)
+    front = error_over_power(DesignProblem(setting.six(True)), FRONT, advance)
     advance("the demonstration's relays")
     told_less = demonstration(seed)
     advance("published designs")
@@ -103,11 +115,9 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
     found = circuit()
     advance("schedules")
     paths = setting.six_paths()
-    schedule = hg.planning.best_schedule(paths, ON, PERIODS)
-    bursts = hg.planning.burst_sending(setting.slow_state(), [0.5, 0.5])
+    schedule = best_schedule(paths, ON, PERIODS)
+    bursts = burst_sending(setting.slow_state(), [0.5, 0.5])
     advance("sites")
-    lines = {
-        rho: (hg.planning.relay_line(rho, EXPONENT), hg.planning.best_relays(rho, EXPONENT, 8, 1.02)[0]) for rho in RHOS
-    }
-    sensors = {k: hg.planning.choose_sensors(paths, k, 2.0) for k in (1, 2, 3)}
+    lines = {rho: (relay_line(rho, EXPONENT), best_relays(rho, EXPONENT, 8, 1.02)[0]) for rho in RHOS}
+    sensors = {k: choose_sensors(paths, k, 2.0) for k in (1, 2, 3)}
     return Outcome(cases[False], cases[True], front, told_less, found, saved, schedule, bursts, lines, sensors)

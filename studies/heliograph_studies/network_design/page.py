@@ -6,12 +6,12 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
-from heliograph.planning import relay_line
 from heliograph.report.design_page import front_figure
 from heliograph.report.figures import AMBER, BLUE, GREEN, INK, STYLE, VERMILION, WIDTH
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph_studies.network_design import setting
 from heliograph_studies.network_design.compute import EXPONENT, Case, Outcome, path_powers
+from heliograph_studies.network_design.theory import relay_line
 
 COLOURS = (BLUE, AMBER, GREEN)  # of total powers
 EVEN = 60  # values of the noise in the picture of sites

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 import heliograph as hg
+from heliograph.planning.paths.model import Paths
 
 TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
 PROCESS = np.diag([0.1, 0.05, 0.2])
@@ -40,12 +41,12 @@ def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
     return hg.Network(plant, {name: nodes[name] for name in names})
 
 
-def six_paths() -> hg.planning.Paths:
+def six_paths() -> Paths:
     """The same sensors, heard directly, as plain numbers."""
     return hg.planning.independent_paths(TRANSITION, PROCESS, ROWS, NOISES, KAPPA, NEAR**3 / KAPPA)
 
 
-def slow_state() -> hg.planning.Paths:
+def slow_state() -> Paths:
     """A state that hardly moves, heard over two hops without fading."""
     return hg.planning.independent_paths([[0.99]], [[0.02]], [[1.0]], [0.2], 1.0, [[2.0, 2.0]])
 

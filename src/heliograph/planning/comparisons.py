@@ -1,0 +1,209 @@
+"""Designs compared: over total powers, over places, and after each change of the network by a sensor or a relay."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.model.channel import amplify_and_forward
+from heliograph.numerics.check import array, fail, function, instance
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+from heliograph.planning.network_design import design
+from heliograph.planning.problem import DesignProblem, PowerDesign
+from heliograph.planning.transmitters import Hop, Signal, transmitter_names, visit_hops
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.law import GivenMoments
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+SPAN, POINTS = 10.0, 9  # of the totals that are tried about a design's: down and up by this factor, so many
+SITE_STARTS, CHANGE_STARTS = 8, 16  # descents at each place, and after each change: compared, not built
+
+Advance = Callable[[str], None]
+
+
+def _silent(what: str) -> None:
+    """No word of progress."""
+
+
+@readable
+class Front(NamedTuple):
+    """Errors found, and bounds below which none is, at total powers in rising order; shapes (points,).
+
+    No error is above that of less power: what less power reaches, more reaches too.
+    """
+
+    totals: Float[np.ndarray, "points"]
+    errors: Float[np.ndarray, "points"]
+    bounds: Float[np.ndarray, "points"]
+
+
+def error_over_power(problem: DesignProblem, totals: Sequence[float], advance: Advance = _silent) -> Front:
+    """Least error at each of several total powers.
+
+    Args:
+        problem: the design problem; its other limits of power stay.
+        totals: total powers, shape (points,), positive.
+        advance: called with a word before each design.
+
+    Returns:
+        totals in rising order, errors, and bounds below which no error is, each of shape (points,).
+
+    Raises:
+        ValueError: totals that are not positive, what `hg.design` refuses.
+    """
+    instance("problem", problem, DesignProblem, "a DesignProblem")
+    powers = np.unique(array("budgets of the front", totals, (None,)))
+    if not len(powers) or powers[0] <= 0:
+        raise fail("budgets of the front", "positive numbers", list(totals))
+    designs = []
+    for total in powers:
+        advance(f"the best for a power of {total:.4g}")
+        designs.append(design(problem.with_total(float(total))))
+    errors = np.minimum.accumulate([best.error for best in designs])
+    return Front(powers, errors, np.minimum([best.bound for best in designs], errors))
+
+
+def totals_about(total: float) -> list[float]:
+    """Totals on both sides of a design's."""
+    return [float(power) for power in total * np.geomspace(1 / SPAN, SPAN, POINTS)]
+
+
+@readable
+class SiteMap(NamedTuple):
+    """Errors (len(y), len(x)) at places, and the best of them."""
+
+    x: Float[np.ndarray, "columns"]
+    y: Float[np.ndarray, "rows"]
+    errors: Float[np.ndarray, "rows columns"]
+
+    @property
+    def best(self) -> tuple[float, float, float]:
+        """Best place and its error: x, y, error."""
+        row, column = np.unravel_index(np.argmin(self.errors), self.errors.shape)
+        return float(self.x[column]), float(self.y[row]), float(self.errors[row, column])
+
+
+def error_over_sites(
+    best: PowerDesign,
+    build: Callable[[float, float], Network],
+    x: ArrayLike,
+    y: ArrayLike,
+    advance: Advance = _silent,
+) -> SiteMap:
+    """Least error at a design's total power, with its network standing elsewhere.
+
+    Args:
+        best: the design.
+        build: function that returns the network for a place (x, y).
+        x: places, shape (columns,).
+        y: places, shape (rows,).
+        advance: called with a word before each row.
+
+    Returns:
+        x, y, the errors at all places, shape (rows, columns), and the best place.
+
+    Raises:
+        ValueError: a function that builds no network, what `hg.design` refuses.
+    """
+    instance("design", best, PowerDesign, "a PowerDesign")
+    function("network of a map", build, "x and y")
+    columns, rows = array("x of a map", x, (None,)), array("y of a map", y, (None,))
+    errors = np.zeros((len(rows), len(columns)))
+    problem = best.problem.with_total(best.total)
+    problem = replace(problem, starts=min(problem.starts, SITE_STARTS))
+    for row, north in enumerate(rows):
+        advance(f"the map at y = {north:.4g}")
+        for column, east in enumerate(columns):
+            network = build(float(east), float(north))
+            if not isinstance(network, Network):
+                raise fail("map", "a function of x and y that returns a Network", type(network).__name__)
+            errors[row, column] = design(replace(problem, network=network)).error
+    return SiteMap(columns, rows, errors)
+
+
+@readable
+class ChangeWorth(NamedTuple):
+    """Worth of a change: the error (or the power, of a target error) of the design made again, and what that saves.
+
+    name: "one more a", "without a", "a relay halfway of a.hop1".
+    """
+
+    name: str
+    value: float
+    saved: float
+
+
+def worth_of_changes(best: PowerDesign, exponent: float | None = None, advance: Advance = _silent) -> list[ChangeWorth]:
+    """Worth of each sensor once more, of each left out, and of a relay halfway of each hop: the design made again.
+
+    A relay halfway makes two hops of one, each with 2^exponent times its power gain E g^2 and the same kappa and noise.
+    A change that a design refuses, such as a last sensor left out, is not listed.
+
+    Args:
+        best: the design of a network.
+        exponent: exponent of the path loss; relays are not tried without.
+        advance: called with a word before each design.
+
+    Returns:
+        Changes by name, with the value of the design and what it saves, the most first.
+
+    Raises:
+        ValueError: a design of anything but a Network.
+    """
+    instance("design", best, PowerDesign, "a PowerDesign")
+    network = instance("network of the design", best.problem.network, Network, "a Network")
+    problem = replace(best.problem, starts=min(best.problem.starts, CHANGE_STARTS))
+    result = []
+    for name, changed in _changes(problem, network, exponent).items():
+        advance(name)
+        value = design(changed).certificate.value
+        result.append(ChangeWorth(name, value, best.certificate.value - value))
+    return sorted(result, key=lambda change: -change.saved)
+
+
+def _changes(problem: DesignProblem, network: Network, exponent: float | None) -> dict[str, DesignProblem]:
+    """Problems of the changed networks, by the change."""
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    bare = {name: Node(node.sensor, node.channel, {}) for name, node in nodes.items()}
+    free = None if problem.free is None else tuple(problem.free)
+
+    def with_nodes(changed: dict[str, Node], names: tuple[str, ...] | None) -> DesignProblem:
+        return replace(problem, network=Network(network.plant, changed), free=names)
+
+    result = {}
+    for name, node in bare.items():
+        twin = f"{name} again"
+        result[f"one more {name}"] = with_nodes({**bare, twin: node}, None if free is None else (*free, twin))
+        rest = None if free is None else tuple(part for part in free if _node(part) != name)
+        if len(bare) > 1 and rest != () and problem.target_error is None:
+            left = {other: item for other, item in bare.items() if other != name}
+            result[f"without {name}"] = with_nodes(left, rest)
+        if exponent is not None and isinstance(node.channel, AbstractRandomAffine):
+            # Hops are counted anew behind a relay that is put between: nodes are free as a whole.
+            whole = None if free is None else tuple(dict.fromkeys(_node(part) for part in free))
+            for hop in transmitter_names(node.channel):
+                nearer = Node(node.sensor, _halfway(node.channel, hop, exponent), {})
+                result[f"a relay halfway of {name}.{hop}"] = with_nodes({**bare, name: nearer}, whole)
+    return result
+
+
+def _node(transmitter: str) -> str:
+    return transmitter.partition(".")[0]
+
+
+def _halfway(channel: AbstractRandomAffine, name: str, exponent: float) -> AbstractRandomAffine:
+    """Channel in which a relay stands halfway of one hop."""
+
+    def change(hop_name: str, hop: Hop, signal: Signal | None) -> AbstractRandomAffine:
+        if hop_name != name or not isinstance(hop, GainAndNoise):
+            return hop
+        first, second = (float(hop.law.moment(k)) * 2 ** (exponent * k / 2) for k in (1, 2))
+        law = GivenMoments([first, second])
+        onward = GainAndNoise(law, np.eye(hop.outputs), hop.noise)
+        return amplify_and_forward([GainAndNoise(law, hop.matrix, hop.noise), onward])
+
+    return visit_hops(channel, change)

@@ -1,0 +1,153 @@
+"""The number that a design makes small, made of the error covariances of all steps, and its derivative."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from heliograph.numerics.check import array, check_count, covariance, fail, flag
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+
+WEIGHT = "weight of the error"
+SHARPER = (16, 128, 2048, 32768)  # smoothing of the largest eigenvalue, less and less: n^(1/32768) is left at the end
+
+Matrices = Float[np.ndarray, "time n n"]
+
+
+@readable
+class Error(Module):
+    """Error that a design makes small: a number made of the covariance P of the best linear filter after each step.
+
+    The number is <W, P>, or the largest eigenvalue of W^1/2 P W^1/2, in the steady state unless a horizon is given.
+
+    Args:
+        weight: W as a matrix (n, n), or a number for each named state ({"position": 1.0} counts that state alone); the
+            identity unless given.
+        worst: the largest eigenvalue (the worst direction) in place of the trace.
+        horizon: the mean over so many steps from the plant's initial covariance on, in place of the steady state.
+        at_end: with a horizon, the error after its last step alone.
+        period: the steady mean over a period of so many steps, in each of which transmitters may have another power.
+
+    Raises:
+        ValueError: a horizon and a period, an end without a horizon, a weight that is no covariance or weighs nothing.
+    """
+
+    weight: np.ndarray | dict[str, float] | None
+    worst: bool = eqx.field(static=True)
+    horizon: int | None = eqx.field(static=True)
+    at_end: bool = eqx.field(static=True)
+    period: int = eqx.field(static=True)
+
+    def __init__(
+        self,
+        weight: ArrayLike | Mapping[str, float] | None = None,
+        worst: bool = False,
+        horizon: int | None = None,
+        at_end: bool = False,
+        period: int = 1,
+    ):
+        if isinstance(weight, Mapping):
+            self.weight = dict(weight)
+        else:
+            self.weight = None if weight is None else covariance(WEIGHT, weight)
+        self.worst, self.at_end = flag("worst", worst), flag("at_end", at_end)
+        self.horizon = None if horizon is None else check_count("horizon of the error", horizon)
+        self.period = check_count("period of the error", period)
+        if self.horizon is not None and self.period > 1:
+            raise fail("error", "a horizon or a period", "both")
+        if self.at_end and self.horizon is None:
+            raise fail("error at the end", "a horizon", "none")
+
+    @property
+    def steps(self) -> int:
+        """Number of steps over which the powers may differ."""
+        return self.period if self.horizon is None else self.horizon
+
+    def matrix(self, states: tuple[str, ...]) -> Float[np.ndarray, "n n"]:
+        """Weight W for a plant with these states.
+
+        Args:
+            states: names of the plant's states.
+
+        Raises:
+            ValueError: a state that the plant does not have, a weight of another size.
+        """
+        n = len(states)
+        if self.weight is None:
+            return np.eye(n)
+        if isinstance(self.weight, dict):
+            unknown = sorted(set(self.weight) - set(states))
+            if unknown:
+                raise fail(WEIGHT, f"numbers for some of the states {list(states)}", unknown)
+            diagonal = np.array([float(self.weight.get(name, 0.0)) for name in states])
+            matrix = covariance(WEIGHT, np.diag(diagonal), n)
+        else:
+            matrix = array(WEIGHT, self.weight, (n, n))
+        if not np.any(matrix):
+            raise fail(WEIGHT, "one that weighs something", "zero")
+        return np.asarray(matrix)
+
+    def criterion(self, states: tuple[str, ...]) -> "Criterion":
+        """Number for a plant with these states, as a function of covariances."""
+        shares = np.eye(self.steps)[-1] if self.at_end else np.full(self.steps, 1 / self.steps)
+        weight = np.tile(self.matrix(states), (self.steps, 1, 1))
+        return Criterion(weight, shares, SHARPER[-1] if self.worst else None)
+
+
+class Criterion(NamedTuple):
+    """Number sum_k share_k f(P_k), with f = <W, P>, or the largest eigenvalue of S = W^1/2 P W^1/2.
+
+    sharpness: None for the trace, else q: the eigenvalue as tr(S^q)^(1/q), smooth, and above it by no more than the
+    factor n^(1/q).
+    """
+
+    weight: Matrices
+    shares: Float[np.ndarray, "time"]
+    sharpness: int | None
+
+    def smooth(self, p: Matrices) -> tuple[float, Matrices]:
+        """Number at these covariances, smoothed where it is an eigenvalue, and its derivative by each P."""
+        values, weights = self._by_step(p)
+        return float(self.shares @ values), self.shares[:, None, None] * weights
+
+    def exact(self, p: Matrices) -> float:
+        """Number itself, not smoothed."""
+        if self.sharpness is None:
+            return self.smooth(p)[0]
+        root = _root(self.weight)
+        return float(self.shares @ np.linalg.eigvalsh(root @ p @ root)[:, -1])
+
+    def supporting(self, p: Matrices) -> "Criterion":
+        """Linear function <V, P> that touches the number at p and is nowhere above it."""
+        if self.sharpness is None:
+            return self
+        weights, root = self._by_step(p)[1], np.linalg.pinv(_root(self.weight))
+        size = np.trace(root @ weights @ root, axis1=1, axis2=2)
+        return self._replace(weight=weights / size[:, None, None], sharpness=None)
+
+    def sharper(self) -> "list[Criterion]":
+        """Criteria from the smoothest to this one."""
+        return [self] if self.sharpness is None else [self._replace(sharpness=q) for q in SHARPER]
+
+    def _by_step(self, p: Matrices) -> tuple[Float[np.ndarray, "time"], Matrices]:
+        """f and its derivative at each step."""
+        if self.sharpness is None:
+            return np.einsum("kij,kij->k", self.weight, p), self.weight
+        # tr(S^q)^(1/q) and its derivative W^1/2 S^(q-1) W^1/2 tr(S^q)^(1/q - 1), relative to the largest eigenvalue.
+        root = _root(self.weight)
+        values, vectors = np.linalg.eigh(root @ p @ root)
+        relative = np.maximum(values / values[:, -1:], 0.0)
+        total = (relative**self.sharpness).sum(axis=1)
+        share = relative ** (self.sharpness - 1) * (total ** (1 / self.sharpness - 1))[:, None]
+        turned = root @ vectors
+        return values[:, -1] * total ** (1 / self.sharpness), (turned * share[:, None]) @ np.swapaxes(turned, 1, 2)
+
+
+def _root(weight: Matrices) -> Matrices:
+    """W^1/2."""
+    values, vectors = np.linalg.eigh(weight)
+    scale = np.sqrt(np.maximum(values, 0.0))
+    return np.asarray((vectors * scale[:, None, :]) @ np.swapaxes(vectors, 1, 2))

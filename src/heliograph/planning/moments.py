@@ -1,0 +1,142 @@
+"""Second moments of a linear plant's true state and of what its sensors measure: what powers are made of.
+
+Pi = E (x, 1)(x, 1)' is that of the state, mean included, not of an estimate's error: Pi+ = A Pi A' + Q.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.linear.told_losses import spectral_radius
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, refuse_angles
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.noise import AbstractNoise
+
+DOUBLINGS = 60
+EPS = float(np.finfo(np.float64).eps)
+
+
+def check_stable(transition: Float[np.ndarray, "n n"]) -> None:
+    """Raise ValueError where a plant's second moments grow without limit."""
+    if (radius := spectral_radius(transition)) >= 1:
+        expected = "a stable plant, or a horizon, or feedback: what is sent of an unstable plant grows without limit"
+        raise fail("steady power", expected, f"spectral radius {radius:.6g}")
+
+
+def steady_covariance(transition: Float[Array, "n n"], process: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """Solution of X = A X A' + Q, the covariance of a stable plant in the long run.
+
+    Args:
+        transition: A, shape (n, n).
+        process: Q, shape (n, n).
+
+    Returns:
+        X, shape (n, n), accurate entry by entry whatever the units of the states; traced if A or Q is.
+
+    Raises:
+        ValueError: a plant that is not stable (where A is traced nobody can see it).
+    """
+    a, n = transition, len(transition)
+    if is_traced(a, process):
+        xp = library(a, process)
+        total = xp.linalg.solve(np.eye(n * n) - xp.kron(a, a), xp.ravel(process)).reshape(n, n)
+        return (total + total.T) / 2  # type: ignore[no-any-return]
+    check_stable(np.asarray(a))
+    # sum_k A^k Q A'^k, with twice as many terms after each doubling.
+    total, power = np.asarray(process), np.asarray(a)
+    for _ in range(DOUBLINGS):
+        more = power @ total @ power.T
+        total, power = total + more, power @ power
+        if np.all(np.abs(more) <= EPS * np.abs(total)):
+            break
+    return np.asarray((total + total.T) / 2)
+
+
+def check_constant_noise(plant: AnyPlant) -> tuple[LinearPlant, AbstractNoise]:
+    """Plant and noise of the first step; ValueError unless it is linear and its noise depends on no inputs."""
+    start = first(plant)
+    if not isinstance(start, LinearPlant):
+        raise fail("plant", "a LinearPlant", type(start).__name__)
+    if not isinstance(start.noise, AbstractNoise):
+        raise fail("noise of the plant", "a covariance or a noise law", "a function of the inputs")
+    return start, start.noise
+
+
+def check_design_plant(plant: AnyPlant) -> LinearPlant:
+    """Plant of the first step; ValueError unless it is linear with constant noise, and has no inputs and no angles."""
+    start, _ = check_constant_noise(plant)
+    if start.inputs:
+        raise fail("plant of a design", "no inputs", list(start.inputs))
+    refuse_angles("design", start)
+    return start
+
+
+def steady_moment(plant: AnyPlant) -> Float[Array, "n1 n1"]:
+    """Second moment E (x, 1)(x, 1)' in the steady state of a plant without inputs.
+
+    Raises:
+        ValueError: a plant that varies or is not stable.
+    """
+    start, noise = check_constant_noise(plant)
+    if isinstance(plant, OverTime):
+        raise fail("steady power", "a plant that does not vary (give a horizon)", "one that is an OverTime")
+    spread = steady_covariance(start.matrix, noise.covariance)
+    xp = library(start.matrix, noise.mean)
+    mean = xp.linalg.solve(np.eye(len(start.states)) - start.matrix, noise.mean)
+    return _second_moment(mean, spread)
+
+
+def moments_over(plant: AnyPlant, horizon: int, inputs: ArrayLike | None = None) -> list[Float[Array, "n1 n1"]]:
+    """Second moments E (x, 1)(x, 1)' at each step from the plant's initial law, the first after x_0 has moved once.
+
+    Args:
+        plant: a linear plant, which may vary in time.
+        horizon: number of steps.
+        inputs: (horizon, inputs); zero unless given.
+
+    Raises:
+        ValueError: a plant that is not linear.
+    """
+    start = first(plant)
+    if not isinstance(start, LinearPlant):
+        raise fail("plant", "a LinearPlant", type(start).__name__)
+    mean: Any = start.initial_mean
+    spread: Any = start.initial_covariance
+    u = np.zeros((horizon, len(start.inputs))) if inputs is None else np.asarray(inputs)
+    result = []
+    for k in range(horizon):
+        now = at(plant, k)
+        noise_mean, noise = _noise(now, u[k])
+        mean = now.matrix @ mean + now.input_matrix @ u[k] + noise_mean
+        spread = now.matrix @ spread @ now.matrix.T + noise
+        result.append(_second_moment(mean, spread))
+    return result
+
+
+def _noise(plant: LinearPlant, u: Float[np.ndarray, "inputs"]) -> tuple[Array, Array]:
+    """Mean and covariance of w; the noise may be a function of the inputs in operations of JAX."""
+    if isinstance(plant.noise, AbstractNoise):
+        return plant.noise.mean, plant.noise.covariance
+    with jax.enable_x64(True):
+        return np.asarray(plant.noise_mean()), np.asarray(plant.noise_covariance(jnp.asarray(u)))
+
+
+def measurement_moment(sensor: AnySensor, second: Float[Array, "n1 n1"], step: int = 0) -> Float[Array, "m1 m1"]:
+    """Second moment E (y, 1)(y, 1)' of a linear sensor from that of the state."""
+    now = at(sensor, step)
+    c, offset, noise = now.matrix, now.noise.mean, now.noise.covariance
+    xp = library(c, offset, noise, second)
+    rows = xp.block([[c, offset[:, None]], [np.zeros((1, c.shape[1])), np.ones((1, 1))]])
+    return rows @ second @ rows.T + xp.pad(noise, ((0, 1), (0, 1)))  # type: ignore[no-any-return]
+
+
+def _second_moment(mean: Float[Array, "n"], covariance: Float[Array, "n n"]) -> Float[Array, "n1 n1"]:
+    xp = library(mean, covariance)
+    extended = xp.append(mean, 1.0)
+    return xp.outer(extended, extended) + xp.pad(covariance, ((0, 1), (0, 1)))  # type: ignore[no-any-return]

@@ -1,0 +1,255 @@
+"""Reception of a network as its best linear filter needs it: mean gains, noises, observed modes, and sent powers.
+
+All of it follows from numbers that may be traced. An observed loss, and the observed mode of a link with memory, are
+modes; in a known mode a channel forgets. Where probabilities are uncertain, and with them a mean gain M_v, the error
+has a part K (M_v - M) y whose correlation with the rest nobody knows. Young's inequality, with one scalar b > 0 for
+each step, bounds what a gain K leaves by
+    (1 + b) [(I - K H) X (I - K H)' + K M R M' K'] + K [Spread + Shift / b] K',
+a step of the filter with (1 + b) A X A', (1 + b) Q and another noise; b is one more free number.
+"""
+
+from functools import reduce
+from itertools import product
+from math import prod
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import OverTime, at, first, steps_covered
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
+from heliograph.numerics.check import check_horizon, fail
+from heliograph.numerics.types import Array, Bool, Float
+from heliograph.planning.error import Error
+from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.numbers.mode_riccati import ModeSystem
+from heliograph.planning.transmitters import powers_of_law, transmitter_names
+from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.chain import MarkovChain, stationary
+from heliograph.random_affine.combine import Stack
+from heliograph.random_affine.modes import JointModes, Revealed, joint_modes
+from heliograph.random_affine.second_moments import has_known_mean, second_order
+from heliograph.random_affine.told import outcomes
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Common, Node
+
+MOST_MODES = 64  # of all nodes together
+
+
+class Source(NamedTuple):
+    """A sensor and the channel behind it, each of one step or OverTime."""
+
+    sensor: AnySensor
+    channel: Channel
+
+
+class Received(NamedTuple):
+    """At each step the chain into it, its law, H = E[G] C and the noise N by mode, and the transmitters' powers."""
+
+    chain: Float[Array, "time M M"]
+    law: Float[Array, "time M"]
+    output: Float[Array, "time M m n"]
+    noise: Float[Array, "time M m m"]
+    powers: Float[Array, "time hops"]
+
+
+class _Modes(NamedTuple):
+    """A channel by its observed modes: a chain (onwards from a step), its first law, and what arrives in each mode."""
+
+    onward: Array
+    initial: Array
+    maps: list[AbstractRandomAffine]
+    arrived: list[Bool[np.ndarray, "m"]]
+    forgets: bool
+
+
+def sources_of(network: Network) -> dict[str, Source]:
+    """Sensors with their channels by node.
+
+    Raises:
+        ValueError: relays that filter, sensors that are not linear, delays.
+    """
+    if network.relays is not None:
+        raise fail("network of a design", "nodes that receive sensors through channels", "relays that filter")
+    shared = {} if network.common is None else {"common": network.common}
+    result = {}
+    for name, node in (network.nodes | shared).items():
+        if isinstance(node, Node | Common):
+            sensor, channel = first(node.sensor), first(node.channel)
+            if not isinstance(sensor, LinearSensor) or channel.past:
+                got = "a channel with delays" if isinstance(sensor, LinearSensor) else type(sensor).__name__
+                raise fail(f"node {name!r}", "a LinearSensor and a channel without delays", got)
+            if isinstance(node, Node) and node.told_by is not None:
+                raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
+            refuse_angles("design", sensor)
+            result[name] = Source(node.sensor, node.channel)
+    return result
+
+
+def transmitters_of(network: Network) -> tuple[str, ...]:
+    """Names of all transmitters, in the order of `ModeSystem.powers`."""
+    sources = sources_of(network).items()
+    return tuple(f"{name}.{hop}" for name, source in sources for hop in transmitter_names(first(source.channel)))
+
+
+def check_time(network: Network, error: Error) -> None:
+    """Raise ValueError where what varies in a network does not fit the steps of an error, or none of it is steady."""
+    check_design_plant(network.plant)
+    covered = steps_covered((network.plant, sources_of(network)))
+    if error.horizon is not None:
+        check_horizon(error.horizon, covered)
+    elif steps_covered(network.plant) is not None:
+        raise fail("steady error", "a plant that does not vary (give a horizon)", "one that is an OverTime")
+    elif covered is not None and covered != error.period:
+        raise fail("parts that are OverTime", f"as many steps as the error's period, {error.period}", covered)
+
+
+def mode_system(network: Network, error: Error, young: Array | None = None) -> ModeSystem:
+    """System of the network's best linear filter. Exact noises; where probabilities are uncertain, upper bounds.
+
+    `young` is the scalar b of each step, None where the mean gains are known.
+
+    Raises:
+        ValueError: a channel with memory whose mode is not observed.
+    """
+    steps, forever = error.steps, error.horizon is None
+    plants = [at(network.plant, k) for k in range(steps)]
+    a = jnp.stack([jnp.asarray(plant.matrix) for plant in plants])
+    q = jnp.stack([jnp.asarray(plant.noise.covariance) for plant in plants])
+    # What is measured and sent, from the second moments of the state itself.
+    seconds = [steady_moment(plants[0])] * steps if forever else moments_over(network.plant, steps)
+    states, b = jnp.stack([jnp.asarray(second) for second in seconds]), None
+    if young is not None:
+        b = jnp.broadcast_to(young, (steps,))
+    nodes = [received(name, source, states, forever, b) for name, source in sources_of(network).items()]
+    count = prod(node.law.shape[1] for node in nodes)
+    if count > MOST_MODES:
+        raise fail("modes of a design", f"at most {MOST_MODES} together", count)
+    output, noise = _stacked(nodes)
+    scale = jnp.ones((steps, 1, 1)) * (1.0 if b is None else 1 + b[:, None, None])
+    return ModeSystem(
+        transition=jnp.sqrt(scale) * a,
+        process=scale * q,
+        chain=reduce(jax.vmap(jnp.kron), [node.chain for node in nodes]),
+        law=reduce(jax.vmap(jnp.kron), [node.law for node in nodes]),
+        output=output,
+        noise=noise,
+        powers=jnp.concatenate([node.powers for node in nodes], axis=1),
+        start=None if forever else jnp.asarray(first(network.plant).initial_covariance),
+    )
+
+
+def _stacked(nodes: list[Received]) -> tuple[Array, Array]:
+    """H and N of all nodes in each choice of a mode for each."""
+    outputs, noises = [], []
+    for modes in product(*(range(node.law.shape[1]) for node in nodes)):
+        pairs = list(zip(nodes, modes, strict=True))
+        outputs.append(jnp.concatenate([node.output[:, j] for node, j in pairs], axis=1))
+        blocks = [node.noise[:, j] for node, j in pairs]
+        noises.append(jax.vmap(lambda *parts: jax.scipy.linalg.block_diag(*parts))(*blocks))
+    return jnp.stack(outputs, axis=1), jnp.stack(noises, axis=1)
+
+
+def received(
+    name: str, source: Source, states: Float[Array, "time n1 n1"], forever: bool, young: Array | None
+) -> Received:
+    """What a node receives of states with E (x, 1)(x, 1)', in steps that repeat `forever` or begin with the first.
+
+    Raises:
+        ValueError: a channel with memory whose mode is not observed.
+    """
+    steps, varies = len(states), isinstance(source.sensor, OverTime) or isinstance(source.channel, OverTime)
+    spans = [range(k, k + 1) for k in range(steps)] if varies else [range(steps)]
+    channels = [at(source.channel, span[0]) for span in spans]
+    modes = [_observed_modes(name, channel) for channel in channels]
+    # The chain and its law at each step.
+    onward = jnp.concatenate([jnp.tile(m.onward, (len(span), 1, 1)) for m, span in zip(modes, spans, strict=True)])
+    if modes[0].forgets:
+        law: Array = jnp.concatenate(
+            [jnp.tile(m.initial, (len(span), 1)) for m, span in zip(modes, spans, strict=True)]
+        )
+        chain: Array = jnp.tile(law[:, None, :], (1, law.shape[1], 1))
+    else:
+        law, chain = _laws(onward, modes[0].initial, forever)
+    # H, N and powers over each span with one sensor and one channel.
+    parts = []
+    for span, channel, m in zip(spans, channels, modes, strict=True):
+        now = np.array(span)
+        b = None if young is None else young[now]
+        parts.append(_span(at(source.sensor, span[0]), channel, m, states[now], b, law[now]))
+    return Received(chain, law, *(jnp.concatenate(series) for series in zip(*parts, strict=True)))
+
+
+def means_are_known(name: str, channel: AbstractRandomAffine) -> bool:
+    """Whether no uncertain probability moves a mean gain, so that no scalar of Young's is needed."""
+    return all(has_known_mean(second_order(map_)) for map_ in _observed_modes(name, channel).maps)
+
+
+def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
+    if not memories(channel):
+        cases = outcomes(channel)
+        law = jnp.stack([jnp.asarray(case.probability) for case in cases])
+        maps, arrived = [case.map for case in cases], [case.arrived for case in cases]
+        return _Modes(jnp.tile(law, (len(cases), 1)), law, maps, arrived, forgets=True)
+    joint = _flagged(name, channel)
+    everything = np.ones(joint.maps[0].outputs, dtype=bool)
+    return _Modes(joint.transition, joint.initial, list(joint.maps), [everything] * len(joint.maps), forgets=False)
+
+
+def _flagged(name: str, channel: AbstractRandomAffine) -> JointModes:
+    """What arrives in each mode of a channel all of whose modes are observed."""
+    parts = channel.maps if isinstance(channel, Stack) else ()
+    rest = [part for part in parts if not isinstance(part, Revealed)]
+    chains = memories(channel)
+    markov = all(isinstance(memory, MarkovChain) for memory in chains.values())
+    if not markov or len(parts) - len(rest) != len(chains):
+        raise fail(f"channel of {name!r}", "chains whose modes are observed (hg.model.with_flag)", "one with memory")
+    return joint_modes(rest[0] if len(rest) == 1 else Stack(rest), order=2)
+
+
+def _laws(
+    onward: Float[Array, "time M M"], initial: Float[Array, "M"], forever: bool
+) -> tuple[Float[Array, "time M"], Float[Array, "time M M"]]:
+    """The law at each step, and the chain into it: around for ever, or from the initial law on."""
+    around = reduce(jnp.matmul, onward)
+    law = [stationary(around) if forever and len(around) > 1 else jnp.asarray(initial)]
+    for step in onward[:-1]:
+        law.append(law[-1] @ step)
+    into_first = onward[-1] if forever else jnp.tile(law[0], (len(law[0]), 1))
+    return jnp.stack(law), jnp.concatenate([into_first[None], onward[:-1]])
+
+
+def _span(
+    sensor: LinearSensor, channel: AbstractRandomAffine, modes: _Modes, states: Array, young: Array | None, law: Array
+) -> tuple[Array, Array, Array]:
+    """H, N and powers over steps with one sensor and one channel."""
+    y = jax.vmap(lambda second: measurement_moment(sensor, second))(states)
+    pairs = zip(modes.maps, modes.arrived, strict=True)
+    described = [_mode(map_, arrived, y, sensor, young) for map_, arrived in pairs]
+    output = jnp.stack([jnp.tile(h, (len(y), 1, 1)) for h, _ in described], axis=1)
+
+    def powers(now: Array, law: Array) -> Array:
+        sent = [jnp.asarray(power) for power in powers_of_law(channel, now, law).values()]
+        return jnp.stack(sent) if sent else jnp.zeros(0)
+
+    sent = jax.vmap(powers)(y, jnp.ones((len(y), 1)) if modes.forgets else law)
+    return output, jnp.stack([noise for _, noise in described], axis=1), sent
+
+
+def _mode(
+    channel: AbstractRandomAffine, arrived: Bool[np.ndarray, "m"], y: Array, sensor: LinearSensor, young: Array | None
+) -> tuple[Float[Array, "m n"], Float[Array, "time m m"]]:
+    """H, and N: what random gains make of E (y, 1)(y, 1)', and the sensor's noise; of what is lost, noise."""
+    described, present = second_order(channel), jnp.asarray(arrived)
+    gain = jnp.where(present[:, None], jnp.asarray(described.mean_gain), 0.0)
+    sensed = gain @ jnp.asarray(sensor.noise.covariance) @ gain.T + jnp.zeros((len(y), 1, 1))
+    noise = jax.vmap(lambda now: described.spread(now, present))(y)
+    if young is None:
+        noise = noise + sensed
+    else:
+        noise = noise + (1 + young)[:, None, None] * sensed
+        if described.uncertain:
+            noise = noise + jax.vmap(lambda now: described.shift(now, present))(y) / young[:, None, None]
+    return gain @ jnp.asarray(sensor.matrix), noise + jnp.diag(jnp.where(present, 0.0, 1.0))

@@ -1,0 +1,1 @@
+"""Powers of independent paths of hops: their information, convex bounds, and designs."""

@@ -1,0 +1,186 @@
+"""Independent paths of hops: the information a receiver gains over each from the powers of its transmitters.
+
+A path carries c x + v over hops `received = g sent + m`, each of which amplifies its input to its power p. Its noise,
+received over its mean gain less c x, is s K / F - t with s = E y^2, t = s - Var v, K the product of
+kappa = E g^2 / (E g)^2 and F that of p / (p + alpha), alpha = Var m / E g^2. So it carries the information
+    j = F / (s K - t F),   dj/dp_h = s K / (s K - t F)^2 dF/dp_h:
+nothing is divided by a power, which may be zero.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.model.plant import LinearPlant
+from heliograph.numerics.check import array, covariance, fail, instance, names, rank
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float, Int
+from heliograph.planning.error import Error
+from heliograph.planning.moments import moments_over, steady_moment
+from heliograph.planning.paths.information_filter import Plants, adjoint, covariances
+
+Powers = Float[np.ndarray, "time hop"]
+PathValues = Float[np.ndarray, "time path"]
+
+
+@readable
+class Paths(NamedTuple):
+    """Linear plant measured over independent paths; every array has a leading time axis, a period or a horizon.
+
+    plants: A and Q of each step. rows: c of each path. second: s = E y^2; signal: t = s - Var v. path: number of the
+    path of each hop, in the order of the hops. kappa, alpha: of each hop. names: of the hops' transmitters.
+    """
+
+    plants: Plants
+    rows: Float[np.ndarray, "time path n"]
+    second: PathValues
+    signal: PathValues
+    path: Int[np.ndarray, "hop"]
+    kappa: Powers
+    alpha: Powers
+    names: tuple[str, ...]
+
+
+class PathInformation(NamedTuple):
+    """Information j of each path at each step, and its derivative by the power of each hop."""
+
+    information: PathValues
+    slope: Powers
+
+
+def independent_paths(
+    transition: ArrayLike,
+    process: ArrayLike,
+    rows: ArrayLike,
+    noises: ArrayLike,
+    kappa: ArrayLike,
+    alpha: ArrayLike,
+    error: Error | None = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+    names_: tuple[str, ...] | None = None,
+) -> Paths:
+    """Paths of a plant x+ = A x + w and sensors y_i = c_i x + v_i, each measured over hops of its own.
+
+    A hop delivers g sent + m; relays amplify what they receive, noise included. Hops are listed path by path.
+
+    Args:
+        transition: A, shape (n, n).
+        process: Q = Cov w, shape (n, n).
+        rows: c_i, shape (M, n).
+        noises: Var v_i, shape (M,).
+        kappa: E g^2 / (E g)^2 of each hop, shape (M,) for one hop a path, (M, H) for several, or one number.
+        alpha: Var m / E g^2 of each hop, the noise in units of sent power, shaped likewise.
+        error: over which steps: steady unless it has a period or a horizon.
+        initial_mean: mean of x_0, shape (n,), zero unless given; used over a horizon.
+        initial_covariance: covariance of x_0, shape (n, n), needed over a horizon.
+        names_: names of the transmitters, "sender0" and so on unless given.
+
+    Returns:
+        The paths, which `hg.design` takes in place of a network.
+
+    Raises:
+        ValueError: wrong shapes, kappa below 1, negative variances, a plant that is not stable without a horizon, no
+            law of x_0 with one.
+    """
+    error = instance("error", Error() if error is None else error, Error, "an Error")
+    a = array("transition of paths", transition, (None, None))
+    n, hops, steps = len(a), 1 if rank("alpha of paths", alpha) < 2 else np.shape(alpha)[1], error.steps
+    a, q = array("transition of paths", a, (n, n)), covariance("process noise of paths", process, n)
+    c = array("rows of paths", rows, (None, n))
+    r = at_least(0.0, "noises of paths", array("noises of paths", noises, (len(c),)))
+    fading = at_least(1.0, "kappa of paths", array("kappa of paths", _by_hop(kappa, len(c), hops), (len(c), hops)))
+    costs = at_least(0.0, "alpha of paths", array("alpha of paths", _by_hop(alpha, len(c), hops), (len(c), hops)))
+    mean = array("initial mean of paths", np.zeros(n) if initial_mean is None else initial_mean, (n,))
+    start = None
+    if error.horizon is not None:
+        if initial_covariance is None:
+            raise fail("paths over a horizon", "initial_covariance", "none")
+        start = covariance("initial covariance of paths", initial_covariance, n)
+    # E y^2 of each sensor from the second moment of the state, its mean included.
+    plant = LinearPlant(a, q, mean, np.eye(n) if start is None else start)
+    seconds = [steady_moment(plant)] * steps if start is None else moments_over(plant, steps)
+    signal = np.einsum("in,tnm,im->ti", c, np.array(seconds)[:, :-1, :-1], c)
+    return Paths(
+        plants=Plants(np.tile(a, (steps, 1, 1)), np.tile(q, (steps, 1, 1)), start),
+        rows=np.tile(c, (steps, 1, 1)),
+        second=signal + r,
+        signal=signal,
+        path=np.repeat(np.arange(len(c)), hops),
+        kappa=np.tile(fading.ravel(), (steps, 1)),
+        alpha=np.tile(costs.ravel(), (steps, 1)),
+        names=names("names of transmitters", names_, len(c) * hops, "sender"),
+    )
+
+
+def at_least(least: float, name: str, value: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+    """Numbers, none below `least`; ValueError if some are."""
+    if value.size and np.min(value) < least:
+        raise fail(name, f"numbers of at least {least:g}", f"{np.min(value):g}")
+    return value
+
+
+def _by_hop(value: ArrayLike, sensors: int, hops: int) -> Float[np.ndarray, "..."]:
+    """Numbers (M, H), from (M,) for one hop, or from one number for all."""
+    numbers = np.asarray(value)
+    if numbers.ndim == 0:
+        return np.broadcast_to(numbers, (sensors, hops))
+    return numbers[:, None] if numbers.ndim == 1 and hops == 1 else numbers
+
+
+def fading(paths: Paths) -> PathValues:
+    """K, the product of kappa along each path."""
+    return np.asarray(_along(paths, paths.kappa)[0].prod(axis=-1))
+
+
+def _along(paths: Paths, values: Powers) -> tuple[Float[np.ndarray, "time path place"], Int[np.ndarray, "hop"]]:
+    """Values of hops by path and place on it, 1 where a path has no more; and the place of each hop."""
+    order = np.argsort(paths.path, kind="stable")
+    counts = np.bincount(paths.path, minlength=paths.second.shape[1])
+    place = np.empty_like(paths.path)
+    place[order] = np.arange(len(order)) - np.repeat(np.cumsum(counts) - counts, counts)
+    result = np.ones((len(values), len(counts), max(1, int(counts.max(initial=1)))))
+    result[:, paths.path, place] = values
+    return result, place
+
+
+def passed(powers: Powers, alpha: Powers) -> Powers:
+    """p / (p + alpha) of each hop; zero where neither power nor noise is."""
+    total = powers + alpha
+    # A hop without noise: any power does.
+    return np.asarray(np.divide(powers, total, out=np.ones_like(powers), where=total > 0))
+
+
+def path_information(paths: Paths, powers: Powers) -> PathInformation:
+    """Information j of each path at each step, and dj/dp of each hop, at these powers (time, hop)."""
+    along, place = _along(paths, passed(powers, paths.alpha))
+    # F, and the product of the other hops' factors for its derivative.
+    others = np.stack([np.delete(along, h, axis=-1).prod(axis=-1) for h in range(along.shape[-1])], axis=-1)
+    product, full = along.prod(axis=-1), paths.second * fading(paths)
+    left = full - paths.signal * product
+    total = powers + paths.alpha
+    by_power = np.divide(paths.alpha, total**2, out=np.zeros_like(powers), where=total > 0)
+    slope = (full / left**2)[:, paths.path] * others[:, paths.path, place] * by_power
+    return PathInformation(product / left, slope)
+
+
+def information_matrix(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
+    """J = sum_i j_i c_i' c_i."""
+    return np.asarray(np.swapaxes(paths.rows, 1, 2) @ (information[:, :, None] * paths.rows))
+
+
+def error_covariances(paths: Paths, information: PathValues) -> Float[np.ndarray, "time n n"]:
+    """Error covariance of the best linear filter after each step."""
+    return covariances(paths.plants, information_matrix(paths, information))
+
+
+def sensitivities(
+    paths: Paths,
+    information: PathValues,
+    p: Float[np.ndarray, "time n n"],
+    weights: Float[np.ndarray, "time n n"],
+) -> PathValues:
+    """Sensitivity -d cost / d j of each path: w_i = c_i P L P c_i'."""
+    ahead = adjoint(paths.plants, information_matrix(paths, information), p, weights)
+    projected = paths.rows @ p
+    return np.asarray(np.sum((projected @ ahead) * projected, axis=-1))

@@ -1,0 +1,208 @@
+"""A network as independent paths of hops, each of which carries one combination of a sensor's outputs."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.model.over_time import at, steps_covered
+from heliograph.model.sensor import LinearSensor, refuse_angles
+from heliograph.numerics.check import check_horizon, fail, instance
+from heliograph.numerics.types import Float
+from heliograph.planning.error import Error
+from heliograph.planning.moments import check_design_plant, measurement_moment, moments_over, steady_moment
+from heliograph.planning.paths.information_filter import Plants
+from heliograph.planning.paths.model import Paths
+from heliograph.planning.transmitters import sent_powers, transmits
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Mixture, Series, Stack
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+UNCORRELATED = 1e-12  # relative: a covariance of noises that counts as none
+
+
+class Chain(NamedTuple):
+    """A chain of hops for one number: the combination of (outputs, 1) it carries, and kappa and alpha of the hops."""
+
+    row: Float[np.ndarray, "m1"]
+    hops: dict[str, tuple[float, float]]
+
+
+def paths_of(network: Network, error: Error) -> tuple[Paths, Float[np.ndarray, "time hop"]]:
+    """Independent paths of a network, as the best linear filter of everything that its nodes receive has them.
+
+    Args:
+        network: nodes with linear sensors behind chains of hops.
+        error: over which steps: steady unless it has a period or a horizon.
+
+    Returns:
+        The paths, and the power that each transmitter sends at present, shape (time, hop).
+
+    Raises:
+        ValueError: a network that is not of independent paths, a plant that is not linear or, without a horizon, not
+            stable.
+    """
+    instance("network", network, Network, "a Network")
+    plant, steps = network.plant, instance("error", error, Error, "an Error").steps
+    start_plant = check_design_plant(plant)
+    if network.relays is not None:
+        raise fail("network", "a RelayNetwork alone, whose relays' gains are free", "a Network of relays that filter")
+    if network.common is not None:
+        raise _unfit("nodes that share a channel (give a function of free numbers)")
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    covered = steps_covered((plant, [(node.sensor, node.channel) for node in nodes.values()]))
+    if error.horizon is None:
+        if covered is not None:
+            raise fail("steady error", "a network that does not vary (give a horizon)", "parts that are OverTime")
+        seconds, start = [steady_moment(plant)] * steps, None
+    else:
+        check_horizon(steps, covered)
+        seconds, start = moments_over(plant, steps), np.asarray(start_plant.initial_covariance)
+    # Paths of each step, and the plant's moves.
+    described = [_at_step(nodes, k, np.asarray(second)) for k, second in enumerate(seconds)]
+    rows, second, signal, kappa, alpha, powers = (np.array(part) for part in list(zip(*described, strict=True))[:6])
+    moves = [at(plant, k) for k in range(steps)]
+    plants = Plants(np.array([p.matrix for p in moves]), np.array([p.noise.covariance for p in moves]), start)
+    path, names = np.array(described[0].path), tuple(described[0].names)
+    return Paths(plants, rows, second, signal, path, kappa, alpha, names), powers
+
+
+def chains_of(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str = "") -> list[Chain]:
+    """Chains of a channel that carries rows @ (y, 1).
+
+    Raises:
+        ValueError: a channel that is not made of independent chains, each for one number.
+    """
+    match channel:
+        case GainAndNoise() if not transmits(channel):  # a wire passes each number on
+            return [Chain(row, {}) for row in np.asarray(channel.matrix) @ rows]
+        case Stack():
+            parts = enumerate(channel.maps, 1)
+            return [chain for i, part in parts for chain in chains_of(part, rows, f"{prefix}part{i}.")]
+        case Series():
+            head, *rest = channel.maps
+            if isinstance(head, GainAndNoise) and not transmits(head) and rest:
+                onward = rest[0] if len(rest) == 1 else Series(rest)
+                combined = np.asarray(head.matrix) @ rows
+                combined[:, -1] += np.asarray(head.noise.mean)
+                return chains_of(onward, combined, prefix)
+            if isinstance(head, Series):
+                return chains_of(Series([*head.maps, *rest]), rows, prefix)
+            if isinstance(head, Stack):
+                raise _unfit("a stack that is sent on")
+    return [_chain(channel, rows, prefix)]
+
+
+def _chain(channel: AbstractRandomAffine, rows: Float[np.ndarray, "k m1"], prefix: str) -> Chain:
+    if channel.outputs != 1:
+        raise _unfit(f"one gain for {channel.outputs} numbers")
+    parts = list(channel.maps) if isinstance(channel, Series) else [channel]
+    row, fading, moved = rows[0], 1.0, False
+    hops: dict[str, tuple[float, float]] = {}
+    while parts:
+        part = parts.pop(0)
+        # Series and losses are opened; an unobserved loss is fading.
+        if isinstance(part, Series):
+            parts = [*part.maps, *parts]
+            continue
+        if isinstance(part, Mixture):
+            inner, lost = _loss(part)
+            parts, fading = [inner, *parts], fading * lost
+            continue
+        if not isinstance(part, GainAndNoise):
+            raise _unfit(type(part).__name__)
+        # Hops, and wires between them.
+        if not hops:
+            row = np.asarray(part.matrix)[0] @ rows if part.inputs > 1 else rows[0]  # of one number, in its units
+        if transmits(part):
+            if moved:
+                raise _unfit("a relay that takes a reference off")
+            hops[f"{prefix}hop{len(hops) + 1}"] = _hop(part)
+        elif part.inputs != 1 or part.outputs != 1:
+            raise _unfit("a wire of several numbers behind a hop")
+        elif hops:
+            moved = moved or bool(np.any(np.asarray(part.noise.mean)))
+    if hops:
+        last = list(hops)[-1]
+        hops[last] = (hops[last][0] * fading, hops[last][1])
+    elif fading > 1:
+        raise _unfit("a wire that loses what it carries")
+    return Chain(row, hops)
+
+
+def _hop(part: GainAndNoise) -> tuple[float, float]:
+    """kappa = E g^2 / (E g)^2 and alpha = Var m / E g^2."""
+    if len(part.law.extremes()) > 1:
+        raise _unfit("a gain with uncertain probabilities")
+    mean, square = float(part.law.moment(1)), float(part.law.moment(2))
+    if mean == 0:
+        raise fail("hop", "a gain whose mean is not zero (a linear filter receives no signal else)", "mean 0")
+    if np.any(np.asarray(part.noise.mean)):
+        raise _unfit("noise with a mean")
+    return square / mean**2, float(np.asarray(part.noise.covariance)[0, 0]) / square
+
+
+def _loss(part: Mixture) -> tuple[AbstractRandomAffine, float]:
+    """Channel behind an unobserved loss, and 1 / (arrival probability)."""
+    p = np.asarray(part.choice.probabilities)
+    silent = [isinstance(m, GainAndNoise) and not np.any(np.append(m.matrix, m.noise.covariance)) for m in part.maps]
+    if silent.count(False) != 1 or part.corner_count() > 1 or not (arrival := float(p[silent.index(False)])) > 0:
+        raise _unfit("a mixture of several channels")
+    return part.maps[silent.index(False)], 1 / arrival
+
+
+def _unfit(got: str) -> ValueError:
+    return fail("network", "independent paths, each a chain of hops for one number", got)
+
+
+class _Step(NamedTuple):
+    """One step: of each path c, s and t, of each hop kappa, alpha, the power sent now, the name, and its path."""
+
+    rows: list[np.ndarray]
+    second: list[float]
+    signal: list[float]
+    kappa: list[float]
+    alpha: list[float]
+    powers: list[float]
+    names: list[str]
+    path: list[int]
+
+
+def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
+    step = _Step([], [], [], [], [], [], [], [])
+    for name, node in nodes.items():
+        if node.told_by is not None:
+            raise _unfit("a sensor with feedback, whose power depends on the error")
+        sensor, channel = at(node.sensor, k), at(node.channel, k)
+        if not isinstance(sensor, LinearSensor):
+            raise fail(f"sensor of {name!r}", "a LinearSensor", type(sensor).__name__)
+        refuse_angles("design", sensor)
+        # Chains, and what their transmitters send at present.
+        y, noise = np.asarray(measurement_moment(sensor, state)), np.asarray(sensor.noise.covariance)
+        chains, sends = chains_of(channel, np.eye(len(sensor.outputs), len(y))), sent_powers(channel, y, k)
+        _check_uncorrelated(name, np.array([chain.row[:-1] for chain in chains]), noise)
+        # Each chain is a path: what it carries of the sensor's outputs, then its hops.
+        for chain in chains:
+            row = chain.row[:-1]
+            step.rows.append(row @ np.asarray(sensor.matrix))
+            step.second.append(float(chain.row @ y @ chain.row))
+            step.signal.append(step.second[-1] - float(row @ noise @ row))
+            if not chain.hops and not step.second[-1] > step.signal[-1]:
+                raise fail(f"sensor of {name!r}", "noise, since a wire adds none", "none")
+            for hop, (kappa, alpha) in chain.hops.items():
+                step.kappa.append(kappa)
+                step.alpha.append(alpha)
+                step.powers.append(sends[hop])
+                step.names.append(f"{name}.{hop}")
+                step.path.append(len(step.rows) - 1)
+    return step
+
+
+def _check_uncorrelated(name: str, rows: Float[np.ndarray, "path m"], covariance: Float[np.ndarray, "m m"]) -> None:
+    """Raise ValueError where paths carry noise of the sensor that they share."""
+    noise = rows @ covariance @ rows.T
+    deviation = np.sqrt(np.diag(noise))
+    if np.any(np.abs(noise - np.diag(np.diag(noise))) > UNCORRELATED * np.outer(deviation, deviation)):
+        raise _unfit(f"paths of {name!r} that share a sensor's noise")

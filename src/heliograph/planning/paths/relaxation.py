@@ -1,0 +1,161 @@
+"""Most information that a path of several hops carries for its power, and its concave envelope: bounds of all designs.
+
+With the power P of a path split at its best, p_h(l) = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with sum P, it
+carries j(P) = 1 / (D - t), D = A prod (1 + alpha_h / p_h), A = s K, and dD/dP = -l D. With several hops j is S-shaped.
+The ray from zero touches it once, and behind that point it is concave:
+  j' P / j = P l D / (D - t) <= 1  if and only if  D (1 - P l) >= t, and the left side never decreases, since
+  e = -P l' / l >= 2 - max_h a_h and P l = sum_h a_h with a_h = alpha_h / (p_h + alpha_h), so that e - 2 + P l >= 0;
+  j'' <= 0  if and only if  2 P l D / (D - t) <= P l + e, and there the left side is at most 2, the right at least 2.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.numerics.check import array, fail, scalar
+from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.planning.paths.model import Paths, PathValues, Powers, at_least, fading, passed
+
+NEWTON_STEPS = 60  # of the root in l, on a logarithmic scale on which Newton's steps cannot leave it
+BISECTIONS = 120
+DEAD = 1e150  # noise of a path in which a hop that is not free sends nothing
+
+Hops = Float[np.ndarray, "time path hops"]
+
+
+class Split(NamedTuple):
+    """Powers of the hops of each path, information j of the path, and dj/dP."""
+
+    powers: Hops
+    information: PathValues
+    slope: PathValues
+
+
+class SplitPaths(NamedTuple):
+    """Paths by the power P that their free hops send together.
+
+    full: A = s K over what hops of fixed power let pass; signal: t; alpha: of the free hops, zeros where a path has
+    fewer than another.
+    """
+
+    full: PathValues
+    signal: PathValues
+    alpha: Hops
+
+
+def split_paths(paths: Paths, free: Bool[np.ndarray, "hop"], fixed: Powers) -> SplitPaths:
+    """Paths by the power that their free hops send together, the others sending the powers `fixed`."""
+    full = paths.second * fading(paths)
+    hops = [np.flatnonzero((paths.path == i) & free) for i in range(full.shape[1])]
+    alpha = np.zeros((*full.shape, max(1, max(len(places) for places in hops))))
+    for i, places in enumerate(hops):
+        alpha[:, i, : len(places)] = paths.alpha[:, places]
+    factor = passed(fixed, paths.alpha)
+    for h in np.flatnonzero(~free):
+        i = paths.path[h]
+        full[:, i] = np.where(factor[:, h] > 0, full[:, i] / np.maximum(factor[:, h], 1 / DEAD), DEAD)
+    return SplitPaths(np.minimum(full, DEAD), paths.signal, alpha)
+
+
+def split_power(alpha: ArrayLike, total: ArrayLike) -> Float[np.ndarray, "H"]:
+    """Powers p_h >= 0 of a given sum that make the noise factor prod_h (1 + alpha_h / p_h) of a relay chain least.
+
+    p_h = (sqrt(alpha_h^2 + 4 alpha_h / l) - alpha_h) / 2 with the multiplier l that the sum sets. Plant, sensor and
+    fading do not matter. Two hops share in the ratio sqrt(alpha_1 (P + alpha_2)) to sqrt(alpha_2 (P + alpha_1)).
+
+    Args:
+        alpha: noise of each hop in units of sent power, Var m / E g^2, shape (H,). A hop without noise gets nothing.
+        total: the sum P of the powers.
+
+    Returns:
+        The powers, shape (H,).
+
+    Raises:
+        ValueError: a negative noise or total, no hops.
+    """
+    noise, power = hop_noises(alpha), float(scalar("total power", total, 0.0))
+    if not np.any(noise):
+        return np.zeros(len(noise))
+    unit = np.ones((1, 1))
+    return np.asarray(split(SplitPaths(unit, 0 * unit, noise[None, None]), power * unit).powers[0, 0])
+
+
+def hop_noises(alpha: ArrayLike) -> Float[np.ndarray, "H"]:
+    """Noises of a chain's hops, checked."""
+    noise = at_least(0.0, "alpha of hops", array("alpha of hops", alpha, (None,)))
+    if not len(noise):
+        raise fail("alpha of hops", "at least one", "none")
+    return noise
+
+
+def split(whole: SplitPaths, total: PathValues) -> Split:
+    """Best split of each path's power: one multiplier l for its hops, by Newton's method for log l."""
+    alpha, power = whole.alpha, np.where(total > 0, total, 1.0)[..., None]
+    hops = (alpha > 0).sum(axis=-1)
+    log = 2 * np.log(np.where(hops[..., None] > 0, np.sqrt(alpha).sum(axis=-1, keepdims=True), 1.0) / power)
+    for _ in range(NEWTON_STEPS):
+        p, falls = _shares(alpha, log)
+        reached = p.sum(axis=-1, keepdims=True)
+        step = np.log(np.divide(reached, power, out=np.ones_like(power), where=reached > 0))
+        step = np.divide(step * reached, falls, out=np.zeros_like(falls), where=falls > 0)
+        log = log + step
+        if np.all(np.abs(step) <= 1e-15 * (1 + np.abs(log))):
+            break
+    p = _shares(alpha, log)[0]
+    reached = p.sum(axis=-1, keepdims=True)
+    p = p * np.divide(power, reached, out=np.ones_like(power), where=reached > 0)
+    # j = (A / D) / (A - t A / D) and dj/dP = l D / (D - t)^2, in the ratio A / D, which vanishes with a power.
+    ratio = passed(p, alpha).prod(axis=-1)
+    below = whole.full - whole.signal * ratio
+    sends = (total > 0) | (hops == 0)  # a path that needs no power is always there
+    slope = np.exp(log[..., 0]) * ratio * whole.full / below**2
+    # Of no power: one hop begins with the slope 1 / (A alpha), several with none.
+    first = np.divide(1.0, whole.full * alpha.sum(axis=-1), out=np.zeros_like(ratio), where=hops == 1)
+    return Split(
+        np.where(sends[..., None], p, 0.0),
+        np.where(sends, ratio / below, 0.0),
+        np.where(hops == 0, 0.0, np.where(sends, slope, first)),
+    )
+
+
+def _shares(alpha: np.ndarray, log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """p_h(l) without cancellation, and -d sum P / d log l."""
+    over = np.exp(-log)
+    root = np.sqrt(alpha**2 + 4 * alpha * over)
+    whole = root + alpha
+    p = np.divide(2 * alpha * over, whole, out=np.zeros_like(whole), where=whole > 0)
+    falls = np.divide(alpha * over, root, out=np.zeros_like(root), where=root > 0)
+    return p, falls.sum(axis=-1, keepdims=True)
+
+
+class Envelope(NamedTuple):
+    """Concave envelope of j(P) on [0, cap]: a ray of this slope up to the power where it touches, then j itself."""
+
+    whole: SplitPaths
+    touch: PathValues
+    ray: PathValues
+
+    def information(self, total: PathValues) -> tuple[PathValues, PathValues]:
+        """Envelope and its slope at these powers of the paths."""
+        exact = split(self.whole, total)
+        on_ray = total < self.touch
+        return np.where(on_ray, self.ray * total, exact.information), np.where(on_ray, self.ray, exact.slope)
+
+
+def envelope(whole: SplitPaths, cap: PathValues) -> Envelope:
+    """Concave envelopes: a ray touches where D (1 - P l) = t, by bisection in log l, as the left side falls with l."""
+    alpha, hops = whole.alpha, (whole.alpha > 0).sum(axis=-1)
+    largest = np.where(hops > 0, alpha.max(axis=-1), 1.0)
+    low, high = np.log(1e-30 / largest), np.log(1e30 / largest)
+    for _ in range(BISECTIONS):
+        middle = (low + high) / 2
+        p = _shares(alpha, middle[..., None])[0]
+        noise = np.divide(alpha, p, out=np.zeros_like(p), where=p > 0)
+        left = whole.full * np.prod(1 + noise, axis=-1) * (1 - p.sum(axis=-1) * np.exp(middle))
+        rises = left >= whole.signal
+        low, high = np.where(rises, middle, low), np.where(rises, high, middle)
+    touch = np.where(hops > 1, _shares(alpha, low[..., None])[0].sum(axis=-1), 0.0)
+    touch = np.minimum(touch, cap)
+    there = split(whole, touch)
+    ray = np.divide(there.information, touch, out=np.zeros_like(touch), where=touch > 0)
+    return Envelope(whole, touch, ray)

@@ -1,0 +1,112 @@
+"""Water filling: a fast start for powers of which each path has one, by the condition of the optimum.
+
+Where a path has one free hop it carries the information j = p / (a p + b), concave in its power p, and the error is a
+convex function of the powers. At the optimum w_i dj_i/dp_i is the same for all that send, w_i = -d error / d j_i. With
+the weights w fixed that is
+    p_i = [y sqrt(w_i b_i) - b_i]^+ / a_i
+with a water level y that the budget sets, exactly, since the powers are piecewise linear in it. The way from p to those
+powers leads down, for the linearised error is concave in p; how far to go the slopes at both ends say.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from heliograph.numerics.types import Float
+from heliograph.planning.budget import PowerLimits, Powers
+from heliograph.planning.paths.relaxation import SplitPaths
+
+CLOSED = 1e-14  # gap, of the error, at which the powers are the best but for rounding
+STEPS = 500
+PATIENCE, TRIES = 20, 12  # iterations that close the gap no further; points on the way
+STEEPEST = 1e-9  # least a, of s kappa: below, a path that power makes free of noise is a little more than linear
+
+
+Point = tuple[float, Powers, Powers]  # error, -d error / d j of each free hop's path, d error / d p
+
+
+def water_filling(
+    limits: PowerLimits, sensitivity: Callable[[Powers], Point], whole: SplitPaths, start: Powers
+) -> Powers:
+    """Best powers within limits by the fixed point, from a start, until the gap closes or shrinks no more.
+
+    `sensitivity` gives error and derivatives at powers (time, free), `whole` the path of each free hop.
+    """
+    a = np.maximum(whole.full - whole.signal, STEEPEST * whole.full)
+    b = whole.full * whole.alpha[..., 0]
+    best = p = start
+    smallest, idle = np.inf, 0
+    here = sensitivity(p)
+    for _ in range(STEPS):
+        # The gap of Frank and Wolfe: what the error's tangent leaves to be gained.
+        gap = float(np.sum(here[2] * (p - limits.best(-here[2]))))
+        idle = 0 if gap < (1 - CLOSED) * smallest else idle + 1
+        if gap < smallest:
+            smallest, best = gap, p
+        if gap <= CLOSED * abs(here[0]) or idle > PATIENCE:
+            break
+        p, here = _along(sensitivity, p, here, _filled(limits, here[1], a, b) - p)
+    return best
+
+
+def _along(sensitivity: Callable[[Powers], Point], p: Powers, here: Point, ahead: Powers) -> tuple[Powers, Point]:
+    """A point lower on the way: its end, or where the slopes at both ends say that the lowest lies.
+
+    Where rounding hides the way down, half of it, by which the gap still shrinks.
+    """
+    slope = float(np.sum(here[2] * ahead))
+    length = 1.0
+    for _ in range(TRIES if slope < 0 else 0):
+        there = sensitivity(p + length * ahead)
+        rise = float(np.sum(there[2] * ahead))
+        if rise <= -0.5 * slope and there[0] <= here[0]:
+            return p + length * ahead, there
+        length *= min(max(slope / (slope - rise), 0.1), 0.9)
+    return p + ahead / 2, sensitivity(p + ahead / 2)
+
+
+def _filled(limits: PowerLimits, weights: Powers, a: Powers, b: Powers) -> Powers:
+    """Powers at the level that the limits set, under fixed weights."""
+    rise, dry = np.sqrt(np.maximum(weights, 0.0) * b) / a, b / a
+    steps = len(dry)
+    # The level at which each transmitter's mean is reached, then that of the total under these.
+    no_limit = np.full(steps, np.inf)
+    highest = np.broadcast_to([
+        _level(rise[:, i], dry[:, i], limits.peak[:, i], no_limit, limits.mean[i] * steps) for i in range(dry.shape[1])
+    ], dry.shape)  # fmt: skip
+    level = _level(rise.ravel(), dry.ravel(), limits.peak.ravel(), highest.ravel(), limits.total * steps)
+    return limits.clip(_at_level(np.minimum(level, highest), rise, dry, limits.peak))
+
+
+def _at_level(
+    level: Float[np.ndarray, "*k"],
+    rise: Float[np.ndarray, "*k"],
+    dry: Float[np.ndarray, "*k"],
+    peak: Float[np.ndarray, "*k"],
+) -> Float[np.ndarray, "*k"]:
+    """Powers min([level rise - dry]^+, peak); a sensor of no use stays dry at any level."""
+    with np.errstate(invalid="ignore"):
+        wet = np.where(rise > 0, level * rise - dry, 0.0)
+    return np.clip(wet, 0.0, peak)
+
+
+def _level(
+    rise: Float[np.ndarray, "k"],
+    dry: Float[np.ndarray, "k"],
+    peak: Float[np.ndarray, "k"],
+    highest: Float[np.ndarray, "k"],
+    total: float,
+) -> float:
+    """Level at which the powers sum to the total; infinite where they never do."""
+    live = rise > 0
+    rise, dry, peak, highest = rise[live], dry[live], peak[live], highest[live]
+    if not rise.size or not np.isfinite(total):
+        return np.inf
+    # The sum is piecewise linear in the level, with a turn where a power begins, or ends to grow.
+    turns = np.concatenate([dry / rise, (dry + peak) / rise, highest])
+    turns = np.unique(turns[np.isfinite(turns)])
+    sums = _at_level(np.minimum(turns[:, None], highest), rise, dry, peak).sum(axis=1)
+    if total < sums[-1]:
+        return float(np.interp(total, sums, turns))
+    growing = (highest > turns[-1]) & (rise * turns[-1] - dry < peak)
+    return float(turns[-1] + (total - sums[-1]) / rise[growing].sum()) if growing.any() else np.inf

@@ -1,0 +1,225 @@
+"""`hg.power`: what each transmitter of a network sends, from the moments of the true state."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.fed_back import FedBackFilter
+from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.linear.told_losses import spectral_radius
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at, first, steps_covered
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.relays import RECEIVER, SENSOR
+from heliograph.model.sensor import AnySensor, is_linear
+from heliograph.numerics.angle import wrapped
+from heliograph.numerics.check import array, check_count, check_horizon, check_seed, fail, instance
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.transmitters import sent_powers, steady_powers
+from heliograph.relays.design import expected_maps, given_design
+from heliograph.simulation.draws import seed_key
+from heliograph.simulation.network import OWN, Network
+from heliograph.simulation.node import Node
+
+BATCHES = 20  # of runs, from whose spread the standard errors come
+SAME = 1e-9  # of the entries of a schedule that is to be that of a design
+
+Sources = dict[str, tuple[AnySensor, Channel]]  # what sends, by the beginning of its transmitters' names
+Moments = Float[np.ndarray, "batch steps m1 m1"]  # E (y, 1)(y, 1)'
+
+
+@readable
+class SentPower(Module):
+    """Power that each transmitter sends, in the units of the sensor's output squared.
+
+    over_time: mean square at each step by name, (steps,), one step if steady; standard_error of it, zero where it is
+    exact. growth: spectral radius squared of a linear plant, the factor by which power grows in the long run at each
+    step where it is above 1; NaN where the plant is not linear.
+    """
+
+    over_time: dict[str, Float[np.ndarray, "steps"]]
+    standard_error: dict[str, Float[np.ndarray, "steps"]]
+    growth: float
+
+    @property
+    def mean(self) -> dict[str, float]:
+        """Mean over time."""
+        return {name: float(np.mean(power)) for name, power in self.over_time.items()}
+
+    @property
+    def peak(self) -> dict[str, float]:
+        """Largest mean square of any step."""
+        return {name: float(np.max(power)) for name, power in self.over_time.items()}
+
+    @property
+    def total(self) -> float:
+        """Mean over time of all transmitters together."""
+        return float(sum(self.mean.values()))
+
+    @property
+    def words(self) -> str:
+        """Whether the power stays bounded, in a line."""
+        if self.growth > 1:
+            return f"the plant is unstable: what is sent grows by {self.growth:.4g} a step, without limit"
+        return "what is sent stays bounded" if self.growth < 1 else "what is sent is known for these steps only"
+
+
+def power(
+    network: Network, horizon: int | None = None, inputs: ArrayLike | None = None, runs: int = 1000, seed: int = 0
+) -> SentPower:
+    """Power that each transmitter of a network sends: its sensors, and relays that amplify what they receive.
+
+    Exact where plant and sensors are linear without angles, from the second moment of the state itself; else from
+    drawn trajectories, the channels being exact still. Transmitters are named "node.hop1", "node.hop2" along the node's
+    channel, "node.part1.hop1" in a stack. Relays that filter have their names, the sensor that they measure is
+    "sensor", and slots are the steps. A sensor with feedback sends its innovation.
+
+    Args:
+        network: the network.
+        horizon: number of steps from the plant's initial law on; the steady state of a linear plant unless given.
+        inputs: inputs of the plant, (horizon, inputs); zero unless given.
+        runs: number of drawn trajectories, where plant or sensors are not linear.
+        seed: of the draws.
+
+    Returns:
+        The powers, with standard errors where they are drawn.
+
+    Raises:
+        ValueError: no horizon for a plant that is not stable or not linear, or for a sensor with feedback; inputs of
+            another shape.
+    """
+    instance("network", network, Network, "a Network")
+    start = first(network.plant)
+    rate = spectral_radius(np.asarray(start.matrix)) ** 2 if isinstance(start, LinearPlant) else float("nan")
+    if network.relays is not None:
+        sent = _of_relays(network, horizon)
+        return SentPower(sent, {name: np.zeros_like(power) for name, power in sent.items()}, rate)
+    sources = _sources(network)
+    covered = steps_covered((network.plant, sources))
+    if horizon is None and covered is not None:
+        raise fail("steady power", "a network that does not vary (give a horizon)", "parts that are OverTime")
+    steps = 1 if horizon is None else check_horizon(horizon, covered)
+    u = np.zeros((steps, len(start.inputs))) if inputs is None else array("inputs", inputs, (steps, len(start.inputs)))
+    # E (y, 1)(y, 1)' of each sensor: exact, or the mean of drawn trajectories.
+    linear = all(is_linear(network.plant, s) and not first(s).circular for s, _ in sources.values())
+    if linear and not start.circular:
+        seconds = [steady_moment(network.plant)] if horizon is None else moments_over(network.plant, steps, u)
+        y = {
+            name: np.array([[measurement_moment(sensor, x, k) for k, x in enumerate(seconds)]])
+            for name, (sensor, _) in sources.items()
+        }
+    elif horizon is None:
+        raise fail("power", "a horizon, since plant or sensor is not linear", "none")
+    else:
+        y = _drawn(network.plant, sources, u, check_count("runs", runs, BATCHES), check_seed("seed", seed))
+    for name, item in _feedback_filters(network).items():
+        y[name], rate = _innovation_moments(item, u, horizon), float("nan")
+    # What the hops make of it.
+    power, error = {}, {}
+    for name, (_, channel) in sources.items():
+        batches = [[_at_step(channel, k, now, horizon) for k, now in enumerate(batch)] for batch in y[name]]
+        for hop in batches[0][0]:
+            values = np.array([[now[hop] for now in batch] for batch in batches])
+            power[f"{name}.{hop}"] = values.mean(axis=0)
+            spread = values.std(axis=0, ddof=1) if len(values) > 1 else np.zeros(steps)
+            error[f"{name}.{hop}"] = spread / np.sqrt(len(values))
+    return SentPower(power, error, rate)
+
+
+def _at_step(channel: Channel, k: int, second: np.ndarray, horizon: int | None) -> dict[str, float]:
+    """What is sent at a step, or where there is no horizon in the long run."""
+    return steady_powers(at(channel, k), second) if horizon is None else sent_powers(at(channel, k), second, k)
+
+
+def _sources(network: Network) -> Sources:
+    if network.common is not None:
+        return {"common": (network.common.sensor, network.common.channel)}
+    return {name: (node.sensor, node.channel) for name, node in network.nodes.items() if isinstance(node, Node)}
+
+
+def _feedback_filters(network: Network) -> dict[str, FedBackFilter]:
+    """Filters that send their prediction back to the sensor, by node."""
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    return {name: f for name, node in nodes.items() for f in node.filters.values() if isinstance(f, FedBackFilter)}
+
+
+def _innovation_moments(item: FedBackFilter, inputs: Float[np.ndarray, "steps u"], horizon: int | None) -> Moments:
+    """C P C' + R of the filter's prediction, which no data change, as one batch of E (y - r, 1)(y - r, 1)'."""
+    if horizon is None or item.claim != "exact":
+        expected = "a horizon and a linear model, whose filter knows its error before any data"
+        raise fail("power of a sensor with feedback", expected, "no horizon" if horizon is None else item.claim)
+    state, moments = item.init(), []
+    for k, u in enumerate(inputs):
+        state = item.predict(state, u, k)
+        sensor = at(item.base.sensor, k)
+        c = np.asarray(sensor.matrix)
+        moment = np.eye(len(c) + 1)
+        moment[:-1, :-1] = c @ np.asarray(state.covariance) @ c.T + np.asarray(sensor.noise.covariance)
+        moments.append(moment)
+        state, _ = item.correct(state, np.zeros(item.received), k)
+    return np.array([moments])
+
+
+def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndarray, "steps"]]:
+    """Powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
+    relays = network.relays
+    assert relays is not None
+    filters = {name: network.nodes[name].filters[OWN] for name in relays.relays}
+    schedules = {name: item.gains.values for name, item in filters.items() if isinstance(item, ScheduledFilter)}
+    known = min(len(schedule.gain) for schedule in schedules.values())
+    steps = known if horizon is None else check_horizon(horizon, known)
+    moved = relays.steps(steps)
+    rows, n = expected_maps(moved)[0], len(relays.states)
+    ends = dict(zip(relays.filters, np.cumsum(relays.received), strict=True))
+    gains = {RECEIVER: np.zeros((steps, n, relays.received[-1]))}
+    # Each schedule has to be s+ = A s + K (z - B s - b) with the rows that the relay expects.
+    for (name, schedule), count in zip(schedules.items(), relays.received, strict=False):
+        gains[name] = np.asarray(schedule.gain)[:steps]
+        expected = rows[:, ends[name] - count : ends[name]]
+        pairs = (schedule.transition, moved.transition), (schedule.expected, expected)
+        if not all(np.shape(a)[1:] == b.shape[1:] and np.allclose(a[:steps], b, SAME, SAME) for a, b in pairs):
+            raise fail(f"schedule of {name!r}", "s+ = A s + K (z - B s - b), as relay_schedules makes them", "another")
+    y = np.array([measurement_moment(relays.sensor, x, k) for k, x in enumerate(moments_over(relays.plant, steps))])
+    sensor = np.trace(y[:, :-1, :-1], axis1=1, axis2=2) * moved.talks[:, 0]
+    return {SENSOR: sensor, **given_design(relays, gains).power}
+
+
+def _drawn(
+    plant: AnyPlant, sources: Sources, inputs: Float[np.ndarray, "steps u"], runs: int, seed: int
+) -> dict[str, Moments]:
+    """E (y, 1)(y, 1)' of each sensor over each batch of drawn trajectories."""
+    keys = jax.random.split(seed_key(seed), (BATCHES, runs // BATCHES))
+    sensors = {name: sensor for name, (sensor, _) in sources.items()}
+    return {name: np.asarray(y) for name, y in _drawn_moments(plant, sensors, jnp.asarray(inputs), keys).items()}
+
+
+@compiled
+def _drawn_moments(
+    plant: AnyPlant, sensors: dict[str, AnySensor], inputs: Array, keys: jax.Array
+) -> dict[str, jax.Array]:
+    def run(key: jax.Array) -> dict[str, jax.Array]:
+        begin, rest = jax.random.split(key)
+
+        def step(x: jax.Array, item: tuple[Array, Array]) -> tuple[jax.Array, dict[str, jax.Array]]:
+            k, u = item
+            moves, *draws = jax.random.split(jax.random.fold_in(rest, k), 1 + len(sensors))
+            # The state moves, then every sensor measures it.
+            now = at(plant, k)
+            x = now.transition(x, u) + now.sample_noise(moves, u)
+            moments = {}
+            for draw, (name, sensor) in zip(draws, sensors.items(), strict=True):
+                here = at(sensor, k)
+                y = jnp.append(wrapped(here.measure(x) + here.noise.sample(draw), here.angles), 1.0)
+                moments[name] = jnp.outer(y, y)
+            return x, moments
+
+        start = at(plant, 0).sample_initial(begin)
+        result: dict[str, jax.Array] = jax.lax.scan(step, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))[1]
+        return result
+
+    runs: dict[str, jax.Array] = jax.vmap(jax.vmap(run))(keys)
+    return jax.tree.map(lambda moments: moments.mean(axis=1), runs)  # type: ignore[no-any-return]

@@ -1,0 +1,118 @@
+"""A design as a network that runs: channels with the powers of the design, and the best linear filters of them."""
+
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+import jax
+import numpy as np
+from scipy.linalg import block_diag
+
+from heliograph.filters.linear import linear_filter
+from heliograph.model.channel import parallel
+from heliograph.model.over_time import OverTime, at, first, over_time
+from heliograph.model.sensor import LinearSensor
+from heliograph.numerics.check import array, fail, instance, table
+from heliograph.numerics.types import Float
+from heliograph.planning.error import Error
+from heliograph.planning.moments import measurement_moment, moments_over, steady_moment
+from heliograph.planning.paths.model import at_least
+from heliograph.planning.transmitters import allocate, transmitter_names
+from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
+
+BEST = "best"
+COVERED = 100  # steps for which a design with a period is written down
+T = TypeVar("T")
+
+
+def designed_network(network: Network, powers: Mapping[str, Float[np.ndarray, "steps"]], error: Error) -> Network:
+    """Network whose transmitters send these powers, with the best linear filters behind them.
+
+    Every node has the filter "best" behind its channel, and with several nodes "best" is also that of all that they
+    receive together.
+
+    Args:
+        network: the network as it is.
+        powers: of transmitters by name, as `hg.power` lists them, shape (steps,): of each step of the error's period
+            or horizon, one if steady. Others keep theirs.
+        error: the error that the powers are for: its period or horizon says over which steps.
+
+    Returns:
+        The network; a period is repeated for about 100 steps.
+
+    Raises:
+        ValueError: an unstable plant without a horizon, a transmitter that receives nothing or that there is not.
+    """
+    plant = instance("network", network, Network, "a Network").plant
+    instance("error", error, Error, "an Error")
+    nodes = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    powers = _checked(powers, nodes, error.steps)
+    # Channels with these powers, step by step.
+    seconds = [steady_moment(plant)] * error.period if error.horizon is None else moments_over(plant, error.horizon)
+    steps = [
+        {
+            name: allocate(
+                at(node.channel, k), measurement_moment(node.sensor, second, k), _of_node(name, powers, k), k
+            )
+            for name, node in nodes.items()
+        }
+        for k, second in enumerate(seconds)
+    ]
+    channels = {name: _over_time([step[name] for step in steps]) for name in nodes}
+    designed = {
+        name: Node(node.sensor, channels[name], {BEST: linear_filter(plant, node.sensor, channels[name])})
+        for name, node in nodes.items()
+    }
+    fused = {}
+    if len(nodes) > 1:
+        # All sensors and channels as one node, for the filter of all that is received.
+        sensors = {name: node.sensor for name, node in nodes.items()}
+        covered = min((sensor.steps for sensor in sensors.values() if isinstance(sensor, OverTime)), default=1)
+        joint = _over_time([_joined({name: at(s, k) for name, s in sensors.items()}) for k in range(covered)])
+        fused = {BEST: linear_filter(plant, joint, _over_time([parallel(list(step.values())) for step in steps]))}
+    result = Network(plant, designed, fused)
+    return repeated(result) if error.period > 1 else result
+
+
+def repeated(network: Network) -> Network:
+    """Network with everything in it that is OverTime repeated, over as many steps as a run may have."""
+
+    def again(leaf: object) -> object:
+        if not isinstance(leaf, OverTime):
+            return leaf
+        times = -(-COVERED // leaf.steps)
+        return OverTime(jax.tree.map(lambda v: np.tile(v, (times, *[1] * (np.ndim(v) - 1))), leaf.values))
+
+    result: Network = jax.tree.map(again, network, is_leaf=lambda leaf: isinstance(leaf, OverTime))
+    return result
+
+
+def _checked(powers: object, nodes: Mapping[str, Node], steps: int) -> dict[str, Float[np.ndarray, "steps"]]:
+    """Powers by transmitter, of all steps."""
+    known = {f"{name}.{hop}" for name, node in nodes.items() for hop in transmitter_names(first(node.channel))}
+    result = table("powers of a network", powers, "powers")
+    if unknown := sorted(set(result) - known):
+        raise fail("powers of a network", f"names of transmitters {sorted(known)}", unknown)
+    return {
+        name: at_least(0.0, f"power of {name!r}", array(f"power of {name!r}", power, (steps,)))
+        for name, power in result.items()
+    }
+
+
+def _of_node(name: str, powers: Mapping[str, Float[np.ndarray, "steps"]], k: int) -> dict[str, float]:
+    start = f"{name}."
+    return {key.removeprefix(start): float(power[k]) for key, power in powers.items() if key.startswith(start)}
+
+
+def _over_time(steps: Sequence[T]) -> T | OverTime:
+    """A single object for ever, or an object for each step."""
+    return steps[0] if len(steps) == 1 else over_time(steps)
+
+
+def _joined(sensors: Mapping[str, LinearSensor]) -> LinearSensor:
+    """All sensors as a single one, each output named by its node."""
+    return LinearSensor(
+        np.concatenate([np.asarray(s.matrix) for s in sensors.values()]),
+        block_diag(*(np.asarray(s.noise.covariance) for s in sensors.values())),
+        [f"{name} {output}" for name, s in sensors.items() for output in s.outputs],
+    )
