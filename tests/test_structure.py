@@ -15,6 +15,7 @@ SOURCE = Path(heliograph.__file__).parent
 # Later may import earlier, never the reverse.
 ORDER = [
     ["numerics"],
+    ["codegen"],
     ["disk"],
     ["random_affine"],
     ["model"],
