@@ -86,15 +86,24 @@ class Block:
 class Buffer:
     """Numbers in memory, `size` of each run; a known table has the same ones in all runs.
 
-    `kind`: "input", "output", "scratch" or "table". A buffer that the program itself fills is read after `block`'s
-    statement that fills it.
+    `kind`: "input", "scratch" or "table". A buffer that the program itself fills is read after the statement of `block`
+    that fills it. One that lies `inside` another starts at a place of it.
     """
 
-    __slots__ = ("block", "kind", "shape", "stores", "table", "type")
+    __slots__ = ("block", "inside", "kind", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
         self.stores: list[Store] = []
+        self.inside: tuple[Buffer, int] | None = None
+
+    @property
+    def owner(self) -> "tuple[Buffer, int]":
+        """The buffer whose memory this one is, and where in it this one starts."""
+        if self.inside is None:
+            return self, 0
+        whole, start = self.inside[0].owner
+        return whole, start + self.inside[1]
 
     @property
     def size(self) -> int:

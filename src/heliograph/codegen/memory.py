@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 
-from heliograph.codegen.graph import Buffer, Graph, Node, Type, Unsupported
+from heliograph.codegen.graph import Block, Buffer, Graph, Node, Type, Unsupported
 
 LONG = 64  # numbers: a known array that is longer is a table in memory
 MANY = 4096  # numbers: an array in memory that is longer is not loaded whole
@@ -25,7 +25,7 @@ class InMemory:
         moves: tuple[tuple[int, Node], ...] = (),
     ):
         self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
-        self.loaded: np.ndarray | None = None
+        self.loaded: tuple[Block, np.ndarray] | None = None  # and the block from which it may be used
 
     @classmethod
     def whole(cls, buffer: Buffer) -> "InMemory":
@@ -62,11 +62,11 @@ class InMemory:
 
     def nodes(self, graph: Graph) -> np.ndarray:
         """All of its numbers, loaded."""
-        if self.loaded is None:
+        if self.loaded is None or self.loaded[0] not in graph.current.inwards():
             if self.size > MANY:
                 raise Unsupported(f"an array of {self.size} numbers at once")
-            self.loaded = self._load(graph)
-        return self.loaded
+            self.loaded = graph.current, self._load(graph)
+        return self.loaded[1]
 
     def _load(self, graph: Graph) -> np.ndarray:
         strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
