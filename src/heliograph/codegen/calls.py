@@ -26,17 +26,23 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """A kernel over runs, traced for one run."""
-    params = equation.params
-    if params["runs"]:
-        raise Unsupported("a kernel over several runs")
+    """A kernel traced for one run; where it is mapped, over nodes say, once for each of these, which are last axes."""
+    params, several = equation.params, equation.params["runs"]
+    nodes = [lowering.nodes(x) for x in inputs]
+    ndim = [x.ndim - len(several) for x in nodes]
     avals: list[Any] = [v.aval for v in equation.invars]
-    examples = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in avals]
+    examples = [jax.ShapeDtypeStruct(a.shape[:n], a.dtype) for a, n in zip(avals, ndim, strict=True)]
     tree, function = params["tree"], params["kernel"].function
     inner = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))(*examples)
-    results = lowering.inline(inner, inputs)
-    shapes: list[Any] = [v.aval for v in equation.outvars]
-    return [np.broadcast_to(lowering.nodes(x), s.shape) for x, s in zip(results, shapes, strict=True)]
+    results = [np.empty((*shape, *several), dtype=object) for shape, _ in params["told"]]
+    for place in np.ndindex(*several):
+        given = []
+        for x, n in zip(nodes, ndim, strict=True):
+            there = tuple(i if size > 1 else 0 for i, size in zip(place, x.shape[n:], strict=True))
+            given.append(np.asarray(x[(..., *there)], dtype=object))
+        for result, value in zip(results, lowering.inline(inner, given), strict=True):
+            result[(..., *place)] = lowering.nodes(value)
+    return results
 
 
 def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
