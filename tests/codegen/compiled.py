@@ -15,17 +15,8 @@ class Compiled:
     """The functions of these names on vectors of 8 numbers; a call takes and gives arrays."""
 
     def __init__(self, names: Iterable[str]):
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
         names = list(names)
-        text = functions(WIDTH, names) + "".join(_loop(name) for name in names)
-        target = llvm.Target.from_default_triple().create_target_machine(
-            cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=1
-        )
-        module = llvm.parse_assembly(text)
-        module.verify()
-        self.engine = llvm.create_mcjit_compiler(module, target)
-        self.engine.finalize_object()
+        self.engine = engine_of(functions(WIDTH, names) + "".join(_loop(name) for name in names))
 
     def __call__(self, name: str, *arguments: np.ndarray) -> np.ndarray:
         """The function's results."""
@@ -36,6 +27,20 @@ class Compiled:
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_int64)
         kind(self.engine.get_function_address(f"loop_{name}"))(*pointers, len(result) // WIDTH)
         return result[:count]
+
+
+def engine_of(text: str) -> llvm.ExecutionEngine:
+    """Compiled code of a module's text."""
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    target = llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(), features=llvm.get_host_cpu_features().flatten(), opt=1
+    )
+    module = llvm.parse_assembly(text)
+    module.verify()
+    engine = llvm.create_mcjit_compiler(module, target)
+    engine.finalize_object()
+    return engine
 
 
 def _loop(name: str) -> str:

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.codegen.compiled import Compiled
 from heliograph.codegen.vector_math import FUNCTIONS, SCALAR
+from tests.codegen.compiled import Compiled
 
 LONG = np.longdouble
 SPECIAL = np.array(

@@ -6,7 +6,17 @@ from typing import Any, NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen import branches, calls, elementwise, loops, matrices, random_bits, rows, shapes, views  # noqa: F401  (they fill the rules)
+from heliograph.codegen import (  # noqa: F401  (they fill the rules)
+    branches,
+    calls,
+    elementwise,
+    loops,
+    matrices,
+    random_bits,
+    rows,
+    shapes,
+    views,
+)
 from heliograph.codegen.graph import Buffer, Graph, Guard, Key, Loop, Node, Store
 from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
 from heliograph.codegen.memory import InMemory

@@ -11,8 +11,8 @@ of one degree more than needed).
 from collections.abc import Callable, Iterable
 
 from heliograph.codegen import vector_error as error
-from heliograph.codegen import vector_trigonometry as trigonometry
 from heliograph.codegen import vector_exponential as exponential
+from heliograph.codegen import vector_trigonometry as trigonometry
 from heliograph.codegen.vector_text import Vector, function
 
 FUNCTIONS: dict[str, tuple[Callable[..., Vector], int]] = {

@@ -7,8 +7,9 @@ number. An operation is taken as it is written: no contraction, no reordering; `
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
-Operand = "Vector | float | int | bool"
+Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of it
 
 
 @dataclass

@@ -2,8 +2,8 @@
 
 import math
 
-from heliograph.codegen.vector_text import Vector, copy_sign, fma, polynomial, select, sqrt
 from heliograph.codegen.vector_exponential import _nearest
+from heliograph.codegen.vector_text import Vector, copy_sign, fma, polynomial, select, sqrt
 
 HALF_PI = 1.57079632679489661923, 6.12323399573676603587e-17, -1.4973849048591833e-33  # pi / 2 as a sum
 LARGEST = 2.0**20  # up to which the sum above is long enough; beyond, the scalar library is called
