@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.graph import Buffer, Node, Store
+from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store
 from heliograph.codegen.llvm_operations import BITS
 from heliograph.codegen.llvm_text import Slots, Writer, products_of
 from heliograph.codegen.lowering import Lowering, Value
@@ -96,25 +96,21 @@ def written(program: Program, differing: Iterable[bool], width: int, fuse: bool,
     shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0)
     slots = Slots(shared)
     pointers = [*program.inputs, *tables, *outputs]
-    blocks = Writer(width, {x for x in items if x in spread or _is_stored(x, spread)}, products, spread, slots)
+    differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
+    mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
+    blocks = Writer(width, mine, products, spread, slots)
     text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone)
     text = _with_functions(text, blocks)
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
     once = None
     if roots:
-        needs = needed(roots)
-        writer = Writer(1, {x for x in needs if x not in spread and not _is_stored(x, spread)}, products, set(), slots)
+        writer = Writer(1, needed(roots), products, set(), slots)
         once = _with_functions(_once(writer, program, pointers, in_shared), writer)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
     operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
     return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations)
-
-
-def _is_stored(item: Any, spread: set[Any]) -> bool:
-    """Whether a store is to memory that differs between runs."""
-    return isinstance(item, Store) and item.buffer.owner[0] in spread
 
 
 def sorted_items(items: Iterable[Any]) -> list[Any]:

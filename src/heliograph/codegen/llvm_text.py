@@ -79,6 +79,8 @@ class Writer:
         for scope in reversed(self.scopes):
             if node in scope:
                 return scope[node]
+        if node in self.mine and node.op != "counter":
+            raise RuntimeError(f"{node} is used before it is computed")
         name = self.scopes[-1][node] = self._everywhere(self.scalar(node), node.type)
         return name
 
