@@ -67,13 +67,13 @@ def scalars(value: Value) -> list[Node]:
     return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
 
 
-def needed(roots: Iterable[Node | Buffer]) -> set[Any]:
-    """What these numbers need: nodes, and the loops, guards, buffers and stores that make them."""
+def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda item: True) -> set[Any]:
+    """What these numbers need: nodes, and the loops, guards, buffers and stores that make them; only `among` some."""
     found: set[Any] = set()
     waiting: list[Any] = list(roots)
     while waiting:
         item = waiting.pop()
-        if item not in found:
+        if item not in found and among(item):
             found.add(item)
             waiting += _needs(item)
     return found
