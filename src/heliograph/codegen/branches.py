@@ -11,9 +11,11 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.elementwise import select
 from heliograph.codegen.graph import Block, Guard, Key, Node
+from heliograph.codegen.loops import size_of
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of
 
-DEAR = 100  # nodes: a branch that has fewer is computed in any case
+DEAR = 100  # nodes: a branch that has fewer is computed in any case,
+SHARE = 4  # and one that is so many times smaller than the dearest, which often has its numbers within
 
 
 def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
@@ -25,12 +27,14 @@ def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     if len(branches) == 1:
         return lowering.inline(branches[0], inputs[1:])
     conditions = _conditions(lowering, which, len(branches))
-    results = [
-        _branch(lowering, condition, branch, inputs[1:]) for condition, branch in zip(conditions, branches, strict=True)
-    ]
-    chosen = results[-1]
-    for condition, case in reversed(list(zip(conditions[:-1], results[:-1], strict=True))):
-        chosen = [_where(lowering, condition, a, b) for a, b in zip(case, chosen, strict=True)]
+    sizes = [size_of(branch.jaxpr) for branch in branches]
+    results: dict[int, list[np.ndarray]] = {}
+    for k in sorted(range(len(branches)), key=lambda k: sizes[k]):
+        cheap = SHARE * sizes[k] <= max(sizes)
+        results[k] = _branch(lowering, conditions[k], branches[k], inputs[1:], cheap)
+    chosen = results[len(branches) - 1]
+    for k in reversed(range(len(branches) - 1)):
+        chosen = [_where(lowering, conditions[k], a, b) for a, b in zip(results[k], chosen, strict=True)]
     return chosen
 
 
@@ -46,7 +50,7 @@ def _conditions(lowering: Lowering, which: Node, count: int) -> list[Node]:
     return [below[0], *between, graph.node("not", "bool", below[-1])]
 
 
-def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value]) -> list[np.ndarray]:
+def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value], cheap: bool) -> list[np.ndarray]:
     """A branch's results: in the open block where it has few nodes, else in a guarded one."""
     graph, outer = lowering.graph, lowering.graph.current
     graph.current = block = Block(outer, pinned=True)
@@ -54,7 +58,7 @@ def _branch(lowering: Lowering, condition: Node, branch: Any, inputs: list[Value
         results = [lowering.nodes(x) for x in lowering.inline(branch, inputs)]
     finally:
         graph.current = outer
-    if _size(block) <= DEAR:
+    if cheap or _size(block) <= DEAR:
         _dissolve(block, outer)
         return results
     guard = Guard(block, condition)

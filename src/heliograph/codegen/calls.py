@@ -1,13 +1,14 @@
 """Rules of programs inside programs: functions that are called, and branches."""
 
-from typing import Any
-
 import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.graph import Node, Unsupported
+from heliograph.codegen.loops import in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value
+from heliograph.codegen.memory import InMemory
+from heliograph.codegen.shapes import FEW
 
 CALLS = (
     "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
@@ -26,23 +27,46 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """A kernel traced for one run; where it is mapped, over nodes say, once for each of these, which are last axes."""
-    params, several = equation.params, equation.params["runs"]
-    nodes = [lowering.nodes(x) for x in inputs]
-    ndim = [x.ndim - len(several) for x in nodes]
-    avals: list[Any] = [v.aval for v in equation.invars]
-    examples = [jax.ShapeDtypeStruct(a.shape[:n], a.dtype) for a, n in zip(avals, ndim, strict=True)]
+    """A kernel over runs, traced for one run; of several runs inside one, such as modes, one after another."""
+    params = equation.params
+    runs = params["runs"]
+    shapes = [tuple(v.aval.shape) for v in equation.outvars]  # type: ignore[attr-defined]
+    if not runs:
+        results = _one(lowering, equation, inputs)
+        return [
+            x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in zip(results, shapes, strict=True)
+        ]
+    if len(runs) > 1:
+        raise Unsupported("a kernel over runs of runs")
+    if runs[0] <= FEW:
+        each = [_one(lowering, equation, [_run(x, k) for x in inputs]) for k in range(runs[0])]
+        return [np.stack([lowering.nodes(x) for x in results], axis=-1) for results in zip(*each, strict=True)]
+    rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
+
+    def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        results = _one(lowering, equation, [_run(x, place) if isinstance(x, InMemory) else x for x in rows])
+        return [], [lowering.nodes(x) for x in results]
+
+    stacked = repeated(lowering, runs[0], [], turn)[1]
+    return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
+
+
+def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    params = equation.params
+    numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
+    examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True)]
     tree, function = params["tree"], params["kernel"].function
     inner = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))(*examples)
-    results = [np.empty((*shape, *several), dtype=object) for shape, _ in params["told"]]
-    for place in np.ndindex(*several):
-        given = []
-        for x, n in zip(nodes, ndim, strict=True):
-            there = tuple(i if size > 1 else 0 for i, size in zip(place, x.shape[n:], strict=True))
-            given.append(np.asarray(x[(..., *there)], dtype=object))
-        for result, value in zip(results, lowering.inline(inner, given), strict=True):
-            result[(..., *place)] = lowering.nodes(value)
-    return results
+    return lowering.inline(inner, inputs)
+
+
+def _run(x: Value, place: Node | int) -> Value:
+    """One run's part of an argument whose last axis are the runs, or one number for all of them."""
+    if isinstance(x, InMemory):
+        last = x.view([x.shape[-1], *x.shape[:-1]], [x.strides[-1], *x.strides[:-1]])
+        return last.row(0 if x.shape[-1] == 1 else place)
+    flat = x.reshape(-1, x.shape[-1])
+    return flat[:, min(int(place), x.shape[-1] - 1)].reshape(x.shape[:-1])  # type: ignore[arg-type]
 
 
 def _platform_index(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

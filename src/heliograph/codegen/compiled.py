@@ -106,7 +106,7 @@ def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence
 
 def best_width() -> int:
     """Runs of a block: two of the processor's vectors."""
-    return 16 if features()[3] else 8
+    return 8
 
 
 def pointers_to(arrays: Sequence[np.ndarray]) -> np.ndarray:

@@ -90,12 +90,18 @@ class Buffer:
     that fills it. One that lies `inside` another starts at a place of it.
     """
 
-    __slots__ = ("block", "inside", "kind", "shape", "stores", "table", "type")
+    __slots__ = ("block", "inside", "kind", "parts", "shape", "stores", "table", "type")
 
     def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
         self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
         self.stores: list[Store] = []
         self.inside: tuple[Buffer, int] | None = None
+        self.parts: list[Buffer] = []
+
+    def take_in(self, part: "Buffer", start: int) -> None:
+        """Have another buffer lie in this one from a place on."""
+        part.inside = self, start
+        self.parts.append(part)
 
     @property
     def owner(self) -> "tuple[Buffer, int]":

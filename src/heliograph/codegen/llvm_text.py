@@ -183,7 +183,8 @@ class Writer:
         """Parameters are what the turn before made of them; a counted loop takes one turn at least."""
         self.count += 1
         name, before = f"loop{self.count}", self.label
-        moving = [k for k, p in enumerate(loop.parameters) if p in self.mine]
+        pairs = zip(loop.parameters, loop.results, strict=True)
+        moving = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
         starts = [self.operand(loop.initial[k]) for k in moving]
         self.line(f"br label %{name}")
         self.start(name)

@@ -78,6 +78,8 @@ class InMemory:
 
     def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
         """The same numbers in another shape, None where they do not lie so."""
+        if not self.size:
+            return self.view(shape, (0,) * len(shape))
         axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
         strides: list[int] = []
         place, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on

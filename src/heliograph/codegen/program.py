@@ -83,7 +83,7 @@ def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda
 def _needs(item: Any) -> list[Any]:
     if isinstance(item, Buffer):
         within = [] if item.inside is None else [item.inside[0]]
-        return [*item.stores, *within]
+        return [*item.stores, *item.parts, *within]
     around = [] if item.block.owner is None else [item.block.owner]
     return around + _arguments(item)
 

@@ -121,7 +121,7 @@ def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
     for x in inputs:
         if isinstance(x, InMemory) and _is_alone(x, graph.current):
-            x.buffer.inside = buffer, start
+            buffer.take_in(x.buffer, start)
         else:
             _copy(lowering, x, buffer, start)
         start += x.shape[0] * size
@@ -142,7 +142,7 @@ def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
             graph.store(buffer, node, start + place, (), ())
         return
     stacked = repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1]
-    stacked[0].buffer.inside = buffer, start
+    buffer.take_in(stacked[0].buffer, start)
 
 
 VIEWS: dict[str, View] = {
