@@ -14,6 +14,7 @@ from heliograph.codegen.memory import InMemory, contiguous
 from heliograph.codegen.program import Program, needed
 from heliograph.codegen.random_bits import hash_function
 from heliograph.codegen.spread import varying
+from heliograph.codegen.summed import Summed, adder
 from heliograph.codegen.transposed import mover
 from heliograph.codegen.vector_math import functions
 
@@ -69,10 +70,17 @@ def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
     return InMemory.whole(buffer)
 
 
-def written(program: Program, differing: Iterable[bool], width: int, fuse: bool, alone: bool = False) -> Code:
+def written(
+    program: Program,
+    differing: Iterable[bool],
+    width: int,
+    fuse: bool,
+    alone: bool = False,
+    summed: Summed | None = None,
+) -> Code:
     """The text of a program whose inputs differ between runs, or do not.
 
-    `alone`: one run, whose arrays are used in place.
+    `alone`: one run, whose arrays are used in place. `summed`: outputs that are summed over runs.
 
     Raises:
         Unsupported: an operation that has no text.
@@ -99,7 +107,7 @@ def written(program: Program, differing: Iterable[bool], width: int, fuse: bool,
     differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
     mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
     blocks = Writer(width, mine, products, spread, slots)
-    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone)
+    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
     text = _with_functions(text, blocks)
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
@@ -139,6 +147,7 @@ def _blocks(
     in_scratch: dict[Buffer, int],
     in_shared: dict[Buffer, int],
     alone: bool,
+    summed: Summed | None,
 ) -> str:
     """Blocks `begin` to `end` of W runs: inputs transposed, computed, outputs transposed back."""
     names = _pointers(writer, pointers, in_shared)
@@ -162,8 +171,12 @@ def _blocks(
     for buffer in taken:
         move("take", buffer)
     writer.block(program.graph.top)
+    added = [] if summed is None else [b for b, s in zip(outputs, summed.outputs, strict=True) if s]
     for buffer in given:
-        move("give", buffer)
+        if buffer not in added:
+            move("give", buffer)
+    if summed is not None:
+        _add(writer, summed, names, program.inputs[summed.number], [b for b in given if b in added])
     writer.line("br label %done")
     writer.start("done")
     writer.line("%next = add i64 %number, 1")
@@ -171,8 +184,20 @@ def _blocks(
     writer.line("br i1 %more, label %block, label %exit")
     writer.start("exit")
     body = "\n".join(writer.lines)
-    texts = [mover(bits, writer.width, inwards) for bits, inwards in sorted(movers)]
+    texts = [] if summed is None else [adder(writer.width, summed.batches)]
+    texts += [mover(bits, writer.width, inwards) for bits, inwards in sorted(movers)]
     return "\n".join([*texts, f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"])
+
+
+def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
+    """Add a block's outputs to the sums over runs."""
+    place = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
+    run = writer.add(f"load i32, ptr {place}, align 4")
+    batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
+    count = writer.add("sub i64 %runs, %first")
+    for buffer in outputs:
+        pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
+        writer.line(f"call void @add64({pair}, i64 {buffer.size}, i64 {batch}, i64 {count})")
 
 
 def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
