@@ -21,6 +21,7 @@ TYPES: dict[str, Type] = {
     "uint32": "u32",
     "uint64": "u64",
 }
+MOST = 100_000  # nodes made, constants and what is dropped again among them
 Number = float | int | bool
 
 
@@ -211,6 +212,8 @@ class Graph:
     def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
         """A node that equals no other, in no block's list yet."""
         self.serial += 1
+        if self.serial > MOST:
+            raise Unsupported(f"a program of more than {MOST} operations")
         return Node(op, type, args, block, value, self.serial)
 
     def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:

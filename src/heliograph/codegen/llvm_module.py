@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store
+from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.llvm_operations import BITS
 from heliograph.codegen.llvm_text import Slots, Writer, products_of
 from heliograph.codegen.lowering import Lowering, Value
@@ -18,6 +18,7 @@ from heliograph.codegen.summed import Summed, adder
 from heliograph.codegen.transposed import mover
 from heliograph.codegen.vector_math import functions
 
+LONGEST = 20_000  # operations: beyond, straight lines take LLVM longer than XLA's loops
 LINE = 64  # bytes: where vectors of any width may start
 
 
@@ -88,6 +89,9 @@ def written(
     outputs = output_buffers(program)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = needed(outputs)
+    operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
+    if operations > LONGEST:
+        raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
     spread = varying(outputs, lanes)
     if alone:
         spread = items | set(program.inputs)
@@ -117,7 +121,6 @@ def written(
         once = _with_functions(_once(writer, program, pointers, in_shared), writer)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
     return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations)
 
 
