@@ -133,33 +133,52 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     """With known indices: the same gather of the places of all entries."""
     x, indices = inputs
     at = known_integers(indices)
-    if at is None:
-        return [_gathered_row(lowering, equation, x, indices)]
+    return [_by_cases(lowering, equation, x, indices) if at is None else _gathered(lowering, equation, x, at)]
+
+
+def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndarray) -> np.ndarray:
     with jax.enable_x64(True):
         places = jnp.arange(x.size).reshape(x.shape)
         params = equation.params | {"fill_value": -1}
         found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))
     flat = x.ravel()
-    if np.any(found < 0) or np.any(found >= x.size):
+    beyond = (found < 0) | (found >= x.size)
+    if np.any(beyond):
         missing = equation.params["fill_value"]
-        beyond = lowering.known(np.full((), np.nan if missing is None else missing, equation.outvars[0].aval.dtype))
-        flat = np.append(flat, beyond)
-        found = np.where((found < 0) | (found >= x.size), x.size, found)
-    return [flat[found]]
+        aval: Any = equation.outvars[0].aval
+        flat = np.append(flat, lowering.known(np.full((), np.nan if missing is None else missing, aval.dtype)))
+        found = np.where(beyond, x.size, found)
+    result: np.ndarray = flat[found]
+    return result
 
 
-def _gathered_row(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With one index that data decide, of whole rows along one axis: x[..., i, ...]."""
-    numbers = equation.params["dimension_numbers"]
-    sizes = equation.params["slice_sizes"]
-    axes = numbers.start_index_map
-    if indices.size != 1 or len(axes) != 1 or numbers.operand_batching_dims:
-        raise Unsupported("gather at places that data decide")
-    axis = axes[0]
-    others = [a for a in range(x.ndim) if a != axis]
-    if any(sizes[a] != x.shape[a] for a in others):
-        raise Unsupported("gather of parts of rows at places that data decide")
-    return window(lowering.graph, x, axis, indices.ravel()[0], sizes[axis]).reshape(result_shape(equation))
+def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """With indices (..., axis) that data decide: what is gathered for each number that those of an axis may be.
+
+    Each entry is chosen by the index of its own row alone, so that rows of many nodes are no more cases than one.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[place]
+    count = x.shape[axis] - sizes[axis] + 1
+    if count > FEW:
+        raise Unsupported(f"gather at one of {count} places that data decide")
+    cases = []
+    for number in range(count):
+        one = indices.copy()
+        for row in np.ndindex(*indices.shape[:-1]):
+            node = indices[(*row, place)]
+            if node.op != "constant":
+                one[(*row, place)] = lowering.graph.constant(number, node.type)
+        cases.append(_gather(lowering, equation, [x, one])[0])
+    result = cases[-1].copy()
+    for entry in np.ndindex(*result.shape):
+        row = tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+        which = indices[(*row, place)]
+        if which.op != "constant":
+            here = [np.array(case[entry], dtype=object) for case in cases]
+            result[entry] = chosen(lowering.graph, which, here)[()]
+    return result
 
 
 def _scatter(op: str | None) -> Rule:

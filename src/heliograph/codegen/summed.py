@@ -26,7 +26,8 @@ def adder(width: int, batches: int) -> str:
     """`void @add64(ptr sums, ptr lanes, i64 size, i64 batch, i64 count)`: lanes from `count` on are left out."""
     vector, bits = f"<{width} x double>", f"<{width} x i1>"
     numbers = ", ".join(f"i64 {lane}" for lane in range(width))
-    return f"""define internal void @add64(ptr noalias %sums, ptr noalias %lanes, i64 %size, i64 %batch, i64 %count) noinline nounwind {{
+    arguments = "ptr noalias %sums, ptr noalias %lanes, i64 %size, i64 %batch, i64 %count"
+    return f"""define internal void @add64({arguments}) noinline nounwind {{
 entry:
   %c0 = insertelement <{width} x i64> poison, i64 %count, i64 0
   %c = shufflevector <{width} x i64> %c0, <{width} x i64> poison, <{width} x i32> zeroinitializer
