@@ -9,6 +9,7 @@ from jax.extend.core import ClosedJaxpr
 from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     branches,
     calls,
+    eigen,
     elementwise,
     loops,
     matrices,

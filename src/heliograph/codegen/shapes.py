@@ -133,33 +133,40 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
     """With known indices: the same gather of the places of all entries."""
     x, indices = inputs
     at = known_integers(indices)
-    if at is None:
-        return [_gathered_row(lowering, equation, x, indices)]
+    return [_by_cases(lowering, equation, x, indices) if at is None else _gathered(lowering, equation, x, at)]
+
+
+def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndarray) -> np.ndarray:
     with jax.enable_x64(True):
         places = jnp.arange(x.size).reshape(x.shape)
         params = equation.params | {"fill_value": -1}
         found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))
     flat = x.ravel()
-    if np.any(found < 0) or np.any(found >= x.size):
+    beyond = (found < 0) | (found >= x.size)
+    if np.any(beyond):
         missing = equation.params["fill_value"]
-        beyond = lowering.known(np.full((), np.nan if missing is None else missing, equation.outvars[0].aval.dtype))
-        flat = np.append(flat, beyond)
-        found = np.where((found < 0) | (found >= x.size), x.size, found)
-    return [flat[found]]
+        aval: Any = equation.outvars[0].aval
+        flat = np.append(flat, lowering.known(np.full((), np.nan if missing is None else missing, aval.dtype)))
+        found = np.where(beyond, x.size, found)
+    result: np.ndarray = flat[found]
+    return result
 
 
-def _gathered_row(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With one index that data decide, of whole rows along one axis: x[..., i, ...]."""
-    numbers = equation.params["dimension_numbers"]
-    sizes = equation.params["slice_sizes"]
-    axes = numbers.start_index_map
-    if indices.size != 1 or len(axes) != 1 or numbers.operand_batching_dims:
-        raise Unsupported("gather at places that data decide")
-    axis = axes[0]
-    others = [a for a in range(x.ndim) if a != axis]
-    if any(sizes[a] != x.shape[a] for a in others):
-        raise Unsupported("gather of parts of rows at places that data decide")
-    return window(lowering.graph, x, axis, indices.ravel()[0], sizes[axis]).reshape(result_shape(equation))
+def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """With an index that data decide: what it gathers for each number that it may be, and a choice between these."""
+    flat: list[Node] = indices.ravel().tolist()
+    number = next(n for n in flat if n.op != "constant")
+    axes = equation.params["dimension_numbers"].start_index_map
+    used = {axes[k % len(axes)] for k, n in enumerate(flat) if n is number}
+    count = max(x.shape[a] - equation.params["slice_sizes"][a] + 1 for a in used)
+    if count > FEW:
+        raise Unsupported(f"gather at one of {count} places that data decide")
+    cases = []
+    for k in range(count):
+        known = lowering.graph.constant(k, number.type)
+        one = array_of([known if n is number else n for n in flat], indices.shape)
+        cases.append(_gather(lowering, equation, [x, one])[0])
+    return chosen(lowering.graph, number, cases)
 
 
 def _scatter(op: str | None) -> Rule:
