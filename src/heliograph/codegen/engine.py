@@ -27,16 +27,16 @@ ENGINES = ("native", "xla")
 
 
 class Choice(NamedTuple):
-    """The code of a function, or why XLA computes it; `values` are the arrays that the function itself holds."""
+    """The code of a function, or why XLA computes it; `arrays` are its arguments' and those that it holds itself."""
 
     code: Compiled | None
     why: str
-    values: tuple[Any, ...] = ()
+    arrays: tuple[Any, ...] = ()
 
-    def __call__(self, *arguments: PyTree) -> PyTree:
-        """The function's results for all runs."""
+    def results(self) -> PyTree:
+        """Run the code on the arrays."""
         assert self.code is not None
-        return self.code(*self.values, *jax.tree.leaves(arguments))
+        return self.code(*self.arrays)
 
 
 def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
@@ -48,15 +48,14 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     Raises:
         ValueError: an engine that is none.
     """
-    one = [jax.tree.map(lambda x: np.asarray(x)[0], a) for a in arguments]
-    choice = chosen(function, one, [True] * len(one))
+    choice = chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments))
     return f"xla: {choice.why}" if choice.code is None else f"native: {choice.code.code.operations} operations"
 
 
-def chosen(function: Callable[..., PyTree], examples: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
+def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
     """The code of a function of one run for arguments like these, made once; or why there is none.
 
-    Each argument differs between runs, with a leading axis, or is the same in all.
+    Each argument differs between runs, and its arrays have a leading axis of runs, or is the same in all.
 
     Raises:
         ValueError: an engine that is none, or native code asked for of a program that it does not take.
@@ -64,7 +63,7 @@ def chosen(function: Callable[..., PyTree], examples: Sequence[PyTree], differs:
     engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
-    choice = _available() or _cached(function, examples, differs)
+    choice = _available() or _cached(function, arguments, differs)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
@@ -110,41 +109,47 @@ def _available() -> Choice | None:
     return None
 
 
-def _cached(function: Callable[..., PyTree], examples: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
-    """A function may be an object that holds arrays: they are arguments, the same in all runs."""
-    parts, form = jax.tree.flatten(function)
-    held = tuple(isinstance(x, np.ndarray | jax.Array) for x in parts)
-    values = tuple(np.asarray(x) for x, h in zip(parts, held, strict=True) if h)
-    fixed = tuple(None if h else x for x, h in zip(parts, held, strict=True))
-    leaves, tree = jax.tree.flatten(list(examples))
-    each = tuple(d for e, d in zip(examples, differs, strict=True) for _ in jax.tree.leaves(e))
+def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
+    """Code for the structure of a function and its arguments, which may be objects that hold arrays."""
+    leaves, form = jax.tree.flatten((function, *arguments))
+    apart = [False] * len(jax.tree.leaves(function))
+    apart += [d for a, d in zip(arguments, differs, strict=True) for _ in jax.tree.leaves(a)]
+    is_array = [isinstance(x, np.ndarray | jax.Array) for x in leaves]
+    arrays = tuple(x for x, a in zip(leaves, is_array, strict=True) if a)
+    kinds = tuple(
+        _Array(x.shape[1:] if d else x.shape, x.dtype, d) if a else x
+        for x, a, d in zip(leaves, is_array, apart, strict=True)
+    )
     try:
-        code, why = _made(form, fixed, held, tree, tuple(map(_kind, (*values, *leaves))), each)
+        code, why = _made(form, kinds)
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         return Choice(None, f"the function holds what cannot be told from another: {error}")
-    return Choice(code, why, values)
+    return Choice(code, why, arrays)
 
 
-def _kind(value: Any) -> tuple[tuple[int, ...], np.dtype]:
-    return np.shape(value), np.asarray(value).dtype
+class _Array(NamedTuple):
+    """One run's array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    differs: bool
 
 
 @lru_cache(COMPILED)
-def _made(
-    form: Any, fixed: tuple[Any, ...], held: tuple[bool, ...], tree: Any, kinds: tuple[Any, ...], each: tuple[bool, ...]
-) -> tuple[Compiled | None, str]:
-    """Code for one structure and one set of shapes."""
-    count = sum(held)
+def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
+    """Code for one structure, and the shapes and types of its arrays."""
+    arrays = [k for k in kinds if isinstance(k, _Array)]
 
-    def call(*leaves: Any) -> PyTree:
-        values = iter(leaves[:count])
-        function = jax.tree.unflatten(form, [next(values) if h else x for x, h in zip(fixed, held, strict=True)])
-        return function(*jax.tree.unflatten(tree, leaves[count:]))
+    def call(*values: Any) -> PyTree:
+        each = iter(values)
+        leaves = [next(each) if isinstance(k, _Array) else k for k in kinds]
+        function, *arguments = jax.tree.unflatten(form, leaves)
+        return function(*arguments)
 
     try:
-        program = lower(call, *(jax.ShapeDtypeStruct(*kind) for kind in kinds))
-        return Compiled(program, [False] * count + list(each)), ""
+        program = lower(call, *(jax.ShapeDtypeStruct(k.shape, k.dtype) for k in arrays))
+        return Compiled(program, [k.differs for k in arrays]), ""
     except Unsupported as found:
         return None, str(found)

@@ -12,6 +12,7 @@ from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of
 from heliograph.codegen.memory import InMemory
 
 WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out
+KERNEL = 300  # numbers that a kernel over runs is taken to compute
 Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
 
 
@@ -171,6 +172,7 @@ def size_of(jaxpr: Any) -> int:
     for equation in jaxpr.eqns:
         inner = [size_of(getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
         turns = equation.params["length"] if equation.primitive.name == "scan" else 1
+        inner += [KERNEL] if equation.primitive.name == "runs_last" else []
         total += turns * sum(inner) + sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
     return total
 

@@ -10,6 +10,7 @@ from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     arrived,
     branches,
     calls,
+    eigen,
     elementwise,
     loops,
     matrices,

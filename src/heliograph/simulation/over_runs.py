@@ -33,8 +33,8 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     values = [_numbers(a) for a in arrays]
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
-    choice = chosen(function, [a[0] for a in values], [True] * len(values))
-    return choice(*values) if choice.code is not None else _by_xla(function, values, width)
+    choice = chosen(function, values, [True] * len(values))
+    return choice.results() if choice.code is not None else _by_xla(function, values, width)
 
 
 def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
@@ -62,11 +63,15 @@ def run(
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
         }
-        found = to_numpy(_run_filters(filters, part and part.smoother(filters), grouped, u, arrivals))
+        arguments = filters, part and part.smoother(filters), grouped, u, arrivals
+        choice = chosen(_run_filters, arguments, [False] * len(arguments))
+        if choice.code is None:
+            found = to_numpy(_by_xla(*arguments))
+        else:
+            found = jax.tree.map(lambda leaf: leaf[0], choice.results())
     return found_record(network, part, found, clock)
 
 
-@quickly_compiled
 def _run_filters(
     filters: AllFilters, later: Smoother | None, z: tuple[np.ndarray, ...], u: np.ndarray, arrivals: dict[str, Drawn]
 ) -> PyTree:
@@ -77,3 +82,6 @@ def _run_filters(
     rows = jnp.arange(len(u)), u, z, arrivals
     found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
     return found if later is None else one_run(later.both, found)
+
+
+_by_xla = quickly_compiled(_run_filters)
