@@ -42,8 +42,9 @@ class Begun:
         self.memory = aligned(program.code.shared)
         self.shared: list[np.ndarray | None] = [None] * len(program.common)
         if program.once is not None:
-            results: list[np.ndarray] = [np.empty(0)] * len(program.common)
-            program.once.run(self._pointers(np.zeros(1, np.uint32), results).ctypes.data, 0, 0, 1, 1)
+            number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
+            pointers = self._pointers(number, results)
+            program.once.run(pointers.ctypes.data, 0, 0, 1, 1)
         for n, (buffer, place) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
             if program.common[n]:
                 kind = np.dtype(DTYPES[buffer.type])

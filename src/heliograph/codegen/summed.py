@@ -1,7 +1,7 @@
 """Text of LLVM IR that adds a block's results [entry][lane] to sums over runs [entry][batch].
 
 Run r goes to batch r mod BATCHES. A row of sums is W - 1 longer than there are batches, so that the W consecutive runs
-of a block never turn back to its beginning; what stands beyond its end is added to its beginning last of all (`folded`).
+of a block never turn back to its beginning; what stands beyond its end is added to its beginning at last (`folded`).
 """
 
 from typing import NamedTuple
@@ -10,7 +10,7 @@ import numpy as np
 
 
 class Summed(NamedTuple):
-    """Which outputs are summed over runs, leaf by leaf; into how many batches; which input is the run's number (u32)."""
+    """Which outputs are summed, leaf by leaf; into how many batches; which input is the run's number (u32)."""
 
     outputs: tuple[bool, ...]
     batches: int

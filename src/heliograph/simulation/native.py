@@ -4,18 +4,18 @@ The program is made once for networks that differ in numbers alone: their arrays
 share. Zeros and ones in them are known, for what they spare.
 """
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache, reduce
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from heliograph.codegen.accumulated import Accumulated, Begun
+from heliograph.codegen.compiled import threads
 from heliograph.codegen.graph import Buffer, Unsupported
 from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
 from heliograph.codegen.memory import LONG, InMemory
@@ -37,10 +37,6 @@ class Native(NamedTuple):
     begun: Begun
     tree: Any
 
-    def lane(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
-        """Add consecutive runs to a lane's sums; what is collected of each, None in place of what all runs share."""
-        return self.begun.add(runs, sums)
-
 
 def native(world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any]) -> Native:
     """The native code of a network's runs, of which a reducer keeps what its `of_step` says.
@@ -53,7 +49,7 @@ def native(world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractRe
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
     leaves, tree = jax.tree.flatten((world, inputs, reducer))
-    held = tuple(not isinstance(leaf, np.ndarray | jax.Array | np.generic | float | int) for leaf in leaves)
+    held = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if h else None for leaf, h in zip(leaves, held, strict=True))
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
     try:
@@ -194,17 +190,15 @@ class NativeLanes:
     def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
         """Simulate `blocks` blocks from number `start` on; what is collected of their runs, in order, leaf by leaf."""
         numbers = np.arange(start, start + blocks)
-        lanes = [numbers[numbers % LANES == lane] for lane in range(LANES)]
-        runs = [self._runs(mine) for mine in lanes]
+        dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
+        used = [lane for lane, runs in dealt.items() if len(runs)]
 
         def go(lane: int) -> list[np.ndarray | None]:
-            if self.sums[lane] is None:
-                self.sums[lane] = self.code.begun.zeros()
-            return self.code.lane(runs[lane], self.sums[lane] or [])
+            sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
+            return self.code.begun.add(dealt[lane], sums)
 
-        with ThreadPoolExecutor(min(LANES, os.cpu_count() or 1)) as pool:
-            found = list(pool.map(go, range(min(blocks, LANES))))
-        order = np.argsort(np.concatenate(runs[: len(found)]), kind="stable")
+        found = list(threads().map(go, used))
+        order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
         return [None if each[0] is None else np.concatenate(each)[order] for each in zip(*found, strict=True)]
 
     def _runs(self, blocks: np.ndarray) -> np.ndarray:
