@@ -1,5 +1,7 @@
 """Rules of programs inside programs: functions that are called, and branches."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
@@ -28,28 +30,30 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """A kernel over runs, traced for one run; of several runs inside one, such as modes, one after another."""
-    return _over(lowering, equation, inputs, equation.params["runs"])
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    runs = equation.params["runs"]
+    shapes = [a.shape[: a.ndim - len(runs)] for a in avals]
+    return _over(lowering, equation, inputs, runs, shapes)
 
 
-def _over(lowering: Lowering, equation: JaxprEqn, inputs: list[Value], runs: tuple[int, ...]) -> list[Value]:
-    """Of so many axes of runs, the last one first."""
+def _over(
+    lowering: Lowering, equation: JaxprEqn, inputs: list[Value], runs: tuple[int, ...], shapes: list[tuple[int, ...]]
+) -> list[Value]:
+    """The last axis of runs first: few written out, many in a loop."""
     if not runs:
-        results = _one(lowering, equation, inputs)
-        shapes = [shape for shape, _ in equation.params["told"]]
-        return [
-            x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in zip(results, shapes, strict=True)
-        ]
-    *outer, last = runs
-    if last <= FEW:
-        each = [_over(lowering, equation, [_run(x, k) for x in inputs], tuple(outer)) for k in range(last)]
+        results = zip(_one(lowering, equation, inputs), shapes, strict=True)
+        return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
+    count, rest = runs[-1], runs[:-1]
+    if count <= FEW:
+        each = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
         return [np.stack([lowering.nodes(x) for x in results], axis=-1) for results in zip(*each, strict=True)]
     rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        given = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
-        return [], [lowering.nodes(x) for x in _over(lowering, equation, given, tuple(outer))]
+        one = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
+        return [], [lowering.nodes(x) for x in _over(lowering, equation, one, rest, shapes)]
 
-    stacked = repeated(lowering, last, [], turn)[1]
+    stacked = repeated(lowering, count, [], turn)[1]
     return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
 
 
