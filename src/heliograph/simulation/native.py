@@ -130,19 +130,12 @@ def _program(
 def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array) -> OfStep:
     """What is kept of a run: stacked over time, but for what was ever so at some step."""
 
-    def step(carry: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[PyTree, PyTree]]:
-        state, before = carry
+    def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
         state, found = world.step(state, key, row)
-        kept = reducer.of_step(found)
-        ever = jax.tree.map(jnp.logical_or, before, kept.ever)
-        return (state, ever), (kept.sums, kept.collected)
+        return state, reducer.of_step(found)
 
-    state, steps = world.init(key), (jnp.arange(len(inputs)), inputs)
-    first = jax.tree.map(lambda leaf: leaf[0], steps)
-    shape = jax.eval_shape(lambda s: reducer.of_step(world.step(s, key, first)[1]).ever, state)
-    never = jax.tree.map(lambda s: jnp.zeros(s.shape, dtype=bool), shape)
-    (_, ever), (sums, collected) = jax.lax.scan(step, (state, never), steps)
-    return OfStep(sums, ever, collected)
+    _, kept = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
+    return kept._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), kept.ever))
 
 
 def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
