@@ -69,7 +69,7 @@ def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) 
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
-        first = clamped(lowering, lowering.nodes(start)[()], x.shape[axis] - sizes[axis])
+        first = clamped(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
