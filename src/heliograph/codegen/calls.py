@@ -8,7 +8,7 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.graph import Node
 from heliograph.codegen.loops import in_memory, repeated
-from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, like
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.shapes import FEW
 
@@ -60,10 +60,14 @@ def _over(
 def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
     numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
-    examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True)]
+    kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True))
     tree, function = params["tree"], params["kernel"].function
-    inner = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))(*examples)
-    return lowering.inline(inner, inputs)
+    key = (function, tree, kinds)
+    if key not in lowering.kernels:
+        lowering.kernels[key] = jax.make_jaxpr(
+            lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+        )(*(like(*kind) for kind in kinds))
+    return lowering.inline(lowering.kernels[key], inputs)
 
 
 def _run(x: Value, place: Node | int) -> Value:

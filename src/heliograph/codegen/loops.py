@@ -144,6 +144,11 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
     return InMemory.whole(buffer)
 
 
+def copied(lowering: Lowering, x: InMemory) -> InMemory:
+    """The same long array in new memory of its own."""
+    return repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1][0]
+
+
 def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Turns as long as some run's condition holds; a run whose condition does not keeps its numbers."""
     params, graph, outer = equation.params, lowering.graph, lowering.graph.current
@@ -155,7 +160,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
     graph.current = body
     now = _like(carry, loop.parameters)
-    loop.condition = active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])[()]
+    loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
     body.items.append(Check(loop))
     results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
     moved = [n for x in results for n in words(x)]

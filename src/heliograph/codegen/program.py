@@ -13,6 +13,7 @@ from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     eigen,
     elementwise,
     loops,
+    lu,
     matrices,
     random_bits,
     rows,
