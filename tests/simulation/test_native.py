@@ -67,7 +67,7 @@ def with_memory() -> hg.Network:
 
 def shadowed() -> hg.Network:
     channels = {"a": link(name="road"), "b": link(name="road"), "in turn": in_turn("turn")}
-    filters = {"open": hg.filters.open_loop_filter(ALONE, 1)}
+    filters = {"open": hg.filters.open_loop_filter(ALONE)}
     return hg.Network(ALONE, {name: hg.Node(GAIN, channel, filters) for name, channel in channels.items()})
 
 

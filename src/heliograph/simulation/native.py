@@ -5,7 +5,7 @@ share. Zeros and ones in them are known, for what they spare.
 """
 
 from collections.abc import Sequence
-from functools import lru_cache, reduce
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,14 +15,12 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr
 
 from heliograph.codegen.accumulated import Accumulated, Begun
-from heliograph.codegen.compiled import threads
-from heliograph.codegen.graph import Buffer, Unsupported
+from heliograph.codegen.graph import Buffer, Type, Unsupported
 from heliograph.codegen.lowering import Lowering, array_of, keys_of, traced
 from heliograph.codegen.memory import LONG, InMemory
 from heliograph.codegen.program import Program
-from heliograph.codegen.summed import Summed, folded
+from heliograph.codegen.summed import Summed
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.reducer import AbstractReducer, OfStep
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.world import World
@@ -78,7 +76,7 @@ class _Known:
     @classmethod
     def of(cls, array: np.ndarray) -> "_Known":
         """Of an array."""
-        known = np.isin(array, PLAIN) if _is_given(array) else np.ones(array.shape, dtype=bool)
+        known = np.isin(array, PLAIN) if array.dtype.kind == "f" else np.full(array.shape, not _is_given(array))
         if array.size > LONG and _is_given(array):
             known[...] = False
         values = np.where(known, array, 0).astype(array.dtype)
@@ -91,8 +89,8 @@ class _Known:
 
 
 def _is_given(array: np.ndarray) -> bool:
-    """Whether an array's numbers are arguments of a program: those of integers decide what it is."""
-    return array.dtype.kind == "f"
+    """Whether an array's numbers are arguments of a program: reals, and names' checksums. Other integers decide it."""
+    return array.dtype.kind == "f" or array.dtype == np.uint32
 
 
 @lru_cache(PROGRAMS)
@@ -147,78 +145,19 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
     inputs, values = [words], [keys_of(InMemory.whole(words).nodes(graph))]
     for one in known:
         fixed, numbers = one.numbers()
-        if numbers.dtype.kind != "f":
+        if not _is_given(numbers):
             values.append(lowering.known(numbers))
             continue
-        buffer = Buffer("input", "f64", one.shape, graph.top)
+        type: Type = "f64" if numbers.dtype.kind == "f" else "u32"
+        buffer = Buffer("input", type, one.shape, graph.top)
         inputs.append(buffer)
         if numbers.size > LONG:
             values.append(InMemory.whole(buffer))
         else:
             entries = zip(fixed.ravel().tolist(), numbers.ravel().tolist(), range(numbers.size), strict=True)
             values.append(
-                array_of([graph.constant(x, "f64") if f else graph.load(buffer, i) for f, x, i in entries], one.shape)
+                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], one.shape)
             )
     values.append(InMemory.whole(number))
     outputs = lowering.inline(made, values)
     return Program(graph, [*inputs, number], outputs, None)
-
-
-class NativeLanes:
-    """Blocks of runs dealt to lanes, each with sums of its own: as `Lanes`, computed by native code.
-
-    Block j goes to lane j mod LANES whatever the number of cores, and each lane adds its blocks in order, so that
-    neither chunks nor cores change a bit of a result.
-    """
-
-    def __init__(self, code: Native, first_run: int, stop: int):
-        self.code, self.first_run, self.stop = code, first_run, stop
-        self.sums: list[list[np.ndarray] | None] = [None] * LANES
-
-    def blocks_of(self, runs: int) -> int:
-        """Blocks of a chunk that holds this many runs at least: fewer than there are lanes, or a multiple of them."""
-        blocks = -(-runs // BLOCK)
-        return blocks if blocks < LANES else LANES * -(-blocks // LANES)
-
-    def advance(self, start: int, blocks: int) -> list[np.ndarray | None]:
-        """Simulate `blocks` blocks from number `start` on; what is collected of their runs, in order, leaf by leaf."""
-        numbers = np.arange(start, start + blocks)
-        dealt = {lane: self._runs(numbers[numbers % LANES == lane]) for lane in range(LANES)}
-        used = [lane for lane, runs in dealt.items() if len(runs)]
-
-        def go(lane: int) -> list[np.ndarray | None]:
-            sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
-            return self.code.begun.add(dealt[lane], sums)
-
-        found = list(threads().map(go, used))
-        order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        return [None if each[0] is None else np.concatenate(each)[order] for each in zip(*found, strict=True)]
-
-    def _runs(self, blocks: np.ndarray) -> np.ndarray:
-        runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
-        return runs[runs < self.stop]
-
-    def total(self, reducer: AbstractReducer[Any]) -> PyTree:
-        """The reducer's carry after all runs."""
-        used = [sums for sums in self.sums if sums is not None]
-        totals = iter([folded(reduce(np.add, parts), BATCHES) for parts in zip(*used, strict=True)])
-        code = self.code.begun
-        summed = code.program.summed.outputs
-        leaves, common = [], []
-        for one, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
-            value = next(totals) if is_summed else None
-            leaves.append(one if shared else value)
-            common.append(shared)
-        count = np.bincount(np.arange(self.first_run, self.stop) % BATCHES, minlength=BATCHES).astype(float)
-        sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
-        return reducer.summed(sums, same, count)
-
-    def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
-        """What was collected of all runs, (run, ...); a view of one where they share it."""
-        leaves: list[Any] = []
-        for one, *each in zip(self.code.begun.shared, *parts, strict=True):
-            if one is not None:
-                leaves.append(np.broadcast_to(one, (self.stop - self.first_run, *one.shape)))
-            else:
-                leaves.append(None if each[0] is None else np.concatenate(each) if len(each) > 1 else each[0])
-        return jax.tree.unflatten(self.code.tree, leaves).collected

@@ -1,6 +1,6 @@
 """What is kept of simulated runs: reduced block by block inside the compiled scan."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Generic, NamedTuple, TypeVar
 
@@ -66,6 +66,10 @@ class AbstractReducer(Module, Generic[Result]):
         """Make the result; collected parts are joined along the run axis, without padding."""
         raise NotImplementedError
 
+    def joined(self, results: Sequence[Result], network: Network) -> Result:
+        """The result of a network from those of its parts, each of some of its nodes with the same plant and runs."""
+        raise NotImplementedError
+
     def beside(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
         """The result with the one made of smoothed estimates, whose claims these are, beside it.
 
@@ -94,6 +98,16 @@ class Trajectories(AbstractReducer[Record]):
         """Make the record; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
+
+    def joined(self, results: Sequence[Record], network: Network) -> Record:
+        """All nodes, in the network's order."""
+        measurements = {name: z for one in results for name, z in one.measurements.items()}
+        estimates = {name: filters for one in results for name, filters in one.estimates.items()}
+        return replace(
+            results[0],
+            measurements={name: measurements[name] for name in network.names},
+            estimates={name: estimates[name] for name in network.names},
+        )
 
     def beside(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
         """As `Record.smoothed`, for the last steps if there are fewer."""

@@ -1,7 +1,6 @@
 """Monte Carlo: the world and every filter in it, simulated run by run in blocks."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import Literal, get_args, overload
 
@@ -12,7 +11,6 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from heliograph.codegen.engine import attempted
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
@@ -21,7 +19,7 @@ from heliograph.simulation.air import air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.given import inputs_of, key_of
 from heliograph.simulation.lanes import BLOCK, Lanes, one_processor
-from heliograph.simulation.native import Native, NativeLanes, native
+from heliograph.simulation.native_runs import natively
 from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.record import Record
 from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories
@@ -114,14 +112,12 @@ def monte_carlo(
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
-    filters = AllFilters(network, part and part.kinds)
-    world = World(network.plant, air_of(network), filters)
-    code = None
     if part is None and not single and one_processor():
-        code = attempted(lambda: native(world, u, base, reducer))
-    if code is not None:
-        return reducer.finish(*_kept_natively(code, reducer, first_run, runs, chunk, progress), network)
-    world = replace(world, filters=plan(filters, u) if plans(filters) else filters)
+        made = natively(network, u, base, reducer, first_run, runs, chunk, progress)
+        if made is not None:
+            return made
+    filters = AllFilters(network, part and part.kinds)
+    world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
     both: Beside[PyTree] = Beside(reducer)
     keeper = reducer if part is None else both
     job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
@@ -144,20 +140,6 @@ class _Job(Module):
     stop: np.ndarray
     reducer: AbstractReducer[PyTree]
     single: bool = eqx.field(static=True)
-
-
-def _kept_natively(
-    code: Native, reducer: AbstractReducer[PyTree], first_run: int, runs: int, chunk: int, progress: Progress | None
-) -> tuple[PyTree, PyTree]:
-    """The same by native code."""
-    lanes = NativeLanes(code, first_run, first_run + runs)
-    blocks = lanes.blocks_of(min(chunk, runs))
-    parts = []
-    for start in range(0, -(-runs // BLOCK), blocks):
-        parts.append(lanes.advance(start, blocks))
-        if progress is not None:
-            progress(min((start + blocks) * BLOCK, runs), runs)
-    return lanes.total(reducer), lanes.joined(parts)
 
 
 def _kept(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:

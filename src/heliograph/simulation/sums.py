@@ -170,6 +170,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
             result[FUSED][name] = replace(fused, uplink=means)
         return result
 
+    def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
+        """All nodes, in the network's order."""
+        found = {name: filters for one in results for name, filters in one.items()}
+        return StatisticsByName({name: found[name] for name in network.names}, network.states)
+
     def beside(
         self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
