@@ -164,7 +164,7 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
     axis = numbers.start_index_map[place]
     count = x.shape[axis] - sizes[axis] + 1
     if count > FEW:
-        raise Unsupported(f"gather at one of {count} places that data decide")
+        return _from_memory(lowering, equation, x, indices, place)
     cases = []
     for number in range(count):
         one = indices.copy()
@@ -180,6 +180,35 @@ def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np
         if which.op != "constant":
             here = [np.array(case[entry], dtype=object) for case in cases]
             result[entry] = chosen(lowering.graph, which, here)[()]
+    return result
+
+
+def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, place: int) -> np.ndarray:
+    """The same of many places: each entry is loaded from as far on as its row's index says."""
+    from heliograph.codegen.loops import in_memory
+    from heliograph.codegen.views import clamped
+
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axis = numbers.start_index_map[place]
+    begin = indices.copy()
+    for row in np.ndindex(*indices.shape[:-1]):
+        node = indices[(*row, place)]
+        if node.op != "constant":
+            begin[(*row, place)] = lowering.graph.constant(0, node.type)
+    at = known_integers(begin)
+    if at is None:
+        raise Unsupported("gather at two places that data decide")
+    starts = _gathered(lowering, equation, np.arange(x.size, dtype=object).reshape(x.shape), at)
+    buffer = in_memory(lowering, x).buffer
+    stride = int(np.prod(x.shape[axis + 1 :], dtype=int))
+    result = np.empty(starts.shape, dtype=object)
+    for entry in np.ndindex(*result.shape):
+        row = tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+        first = clamped(lowering, indices[(*row, place)], x.shape[axis] - sizes[axis])
+        if isinstance(first, int):
+            result[entry] = x.ravel()[starts[entry]]
+        else:
+            result[entry] = lowering.graph.load(buffer, starts[entry], (stride,), (first,))
     return result
 
 

@@ -110,14 +110,15 @@ def _program(
         world, inputs, reducer = jax.tree.unflatten(tree, whole)
         found = _run(world, jnp.asarray(inputs), reducer, jax.random.fold_in(key, number))
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (found.sums, found.ever))
-        results, structure = jax.tree.flatten(OfStep(*summed, found.collected))
+        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], found.collected))
         form[:] = [structure, len(jax.tree.leaves(summed))]
         return results
 
+    struct: Any = jax.ShapeDtypeStruct
     with jax.enable_x64(True):
-        shapes = [jax.ShapeDtypeStruct(k.shape, np.dtype(k.kind)) for k in known]
+        shapes: list[Any] = [struct(k.shape, np.dtype(k.kind)) for k in known]
         key = jax.eval_shape(lambda: jax.random.key(0))
-        made, _ = traced(run, key, *shapes, jax.ShapeDtypeStruct((), jnp.uint32))
+        made, _ = traced(run, key, *shapes, struct((), jnp.uint32))
         program = _lowered(made, known)
     structure, count = form
     numbers = len(program.inputs) - 1
@@ -142,7 +143,8 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
     graph = lowering.graph
     words = Buffer("input", "u32", (2,), graph.top)
     number = Buffer("input", "u32", (), graph.top)
-    inputs, values = [words], [keys_of(InMemory.whole(words).nodes(graph))]
+    inputs = [words]
+    values: list[Any] = [keys_of(InMemory.whole(words).nodes(graph))]
     for one in known:
         fixed, numbers = one.numbers()
         if not _is_given(numbers):

@@ -113,7 +113,8 @@ def monte_carlo(
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
     if part is None and not single and one_processor():
-        made = natively(network, u, base, reducer, first_run, runs, chunk, progress)
+        any_reducer: AbstractReducer[PyTree] = reducer
+        made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress)
         if made is not None:
             return made
     filters = AllFilters(network, part and part.kinds)

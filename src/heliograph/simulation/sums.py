@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -137,14 +138,17 @@ class Statistics(AbstractReducer[StatisticsByName]):
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         into = np.concatenate([places[i] for i in order])
         steps, _, pairs, _ = found["pairs"].shape
-        mine = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
-        others = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
+        each: Any = count
+        mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
+        others: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
+        own: Any = np.concatenate(mine, axis=1)
+        common_to_all: Any = np.concatenate(others, axis=1)
         return Sums(
-            count=count,
+            count=each,
             pairs=found["pairs"][:, into],
             nees=found["nees"][:, into],
-            claimed=np.concatenate(mine, axis=1),
-            shared=np.concatenate(others, axis=1),
+            claimed=own,
+            shared=common_to_all,
             failed=np.sum(found["failed"], axis=-1)[:, :, into],
             failed_runs=np.sum(ever, axis=-1)[:, None, into],
             uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), found["uplinks"]),
