@@ -3,13 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.graph import Graph, Node, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, known_integers, result_shape
+from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape
 
 FEW = 16  # places that a number found in the data may choose among, one comparison each
 
@@ -131,79 +129,6 @@ def _updated(
     return result
 
 
-def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """With known indices: the same gather of the places of all entries."""
-    x, indices = inputs
-    at = known_integers(indices)
-    return [_by_cases(lowering, equation, x, indices) if at is None else _gathered(lowering, equation, x, at)]
-
-
-def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    with jax.enable_x64(True):
-        places = jnp.arange(x.size).reshape(x.shape)
-        params = equation.params | {"fill_value": -1}
-        found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))  # type: ignore[no-untyped-call]
-    flat = x.ravel()
-    beyond = (found < 0) | (found >= x.size)
-    if np.any(beyond):
-        missing = equation.params["fill_value"]
-        aval: Any = equation.outvars[0].aval
-        flat = np.append(flat, lowering.known(np.full((), np.nan if missing is None else missing, aval.dtype)))
-        found = np.where(beyond, x.size, found)
-    result: np.ndarray = flat[found]
-    return result
-
-
-def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With an index that data decide: what it gathers for each number that it may be, and a choice between these."""
-    flat: list[Node] = indices.ravel().tolist()
-    numbers = equation.params["dimension_numbers"]
-    axes, sizes = numbers.start_index_map, equation.params["slice_sizes"]
-    trailing = numbers.offset_dims == tuple(range(indices.ndim - 1, len(result_shape(equation))))
-    if axes == numbers.collapsed_slice_dims == (0,) and trailing and tuple(sizes[1:]) == x.shape[1:]:
-        rows = [window(lowering.graph, x, 0, n, 1).reshape(-1) for n in flat]  # whole rows, each by its own number
-        return np.concatenate(rows).reshape(result_shape(equation))
-    number = next(n for n in flat if n.op != "constant")
-    used = {axes[k % len(axes)] for k, n in enumerate(flat) if n is number}
-    count = max(x.shape[a] - sizes[a] + 1 for a in used)
-    if count > FEW:
-        raise Unsupported(f"gather at one of {count} places that data decide")
-    cases = []
-    for k in range(count):
-        known = lowering.graph.constant(k, number.type)
-        one = array_of([known if n is number else n for n in flat], indices.shape)
-        cases.append(_gather(lowering, equation, [x, one])[0])
-    return chosen(lowering.graph, number, cases)
-
-
-def _scatter(op: str | None) -> Rule:
-    """With known indices: the same scatter of the places of all updates."""
-
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        x, indices, updates = inputs
-        at = known_integers(indices)
-        if at is None:
-            raise Unsupported(f"{equation.primitive.name} at places that data decide")
-        params = equation.params
-        result, flat = x.copy(), updates.ravel()
-        with jax.enable_x64(True):
-            places = jnp.arange(1, updates.size + 1).reshape(updates.shape)
-            found = np.asarray(
-                jax.lax.scatter(
-                    jnp.zeros(x.shape, places.dtype), jnp.asarray(at), places, params["dimension_numbers"],
-                    unique_indices=True, mode=params["mode"],
-                )
-            )  # fmt: skip
-        for index in zip(*np.nonzero(found), strict=True):
-            new = flat[found[index] - 1]
-            result[index] = new if op is None else lowering.graph.node(op, new.type, x[index], new)
-        if op is not None and np.count_nonzero(found) < updates.size:
-            raise Unsupported(f"{equation.primitive.name} of several updates of one entry")
-        return [result]
-
-    return rule
-
-
 RULES |= {
     "broadcast_in_dim": _moved(_broadcast_in_dim),
     "reshape": _moved(lambda x, params, shape: x.reshape(shape)),
@@ -213,7 +138,5 @@ RULES |= {
     "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack, "pad": _pad,
-    "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "gather": _gather,
-    "scatter": _scatter(None), "scatter-add": _scatter("add"), "scatter_add": _scatter("add"),
-    "scatter-mul": _scatter("mul"),
+    "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip
