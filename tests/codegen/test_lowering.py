@@ -50,6 +50,23 @@ def test_operations_give_the_numbers_of_jax(function):
     agree(function, X)
 
 
+ROWS = jnp.array([0, 0, 2])
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: (x[:, [2, 0, 9, -1]], x[[0, 1, 2], [1, 3, 2]], x[[2, 1], :, [0, 4]], x[:, [1, 2], [3, 4]]),
+        lambda x: (x.at[1, :, [2, 3]].set(7.0), x.at[ROWS].add(x[ROWS]), x.at[ROWS + 3].mul(2.0, mode="drop")),
+        lambda x: (jnp.take(x, jnp.array([1, 7]), axis=2), jnp.take_along_axis(x, 0 * x[:, :2].astype(int) + 1, 1)),
+        lambda x: (jax.vmap(lambda a, i: a[i])(x, ROWS + 2), jax.vmap(lambda a, i: a.at[i].set(0.0))(x, ROWS)),
+    ],
+)
+def test_what_is_gathered_and_scattered_is_what_jax_does(function):
+    """Repeated places, places beyond the edges, and indices that go with a batch."""
+    agree(function, np.random.default_rng(5).normal(size=(3, 4, 5)))
+
+
 def test_factors_and_triangular_systems():
     agree(lambda s, x: (jnp.linalg.cholesky(s), jax.scipy.linalg.solve_triangular(s, x, lower=True)), S, X)
     agree(lambda s, x: jax.scipy.linalg.solve_triangular(s, x, trans=1, lower=True), S, X)

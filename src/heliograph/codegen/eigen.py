@@ -1,12 +1,13 @@
 """The rule of eigenvalues and eigenvectors of a small symmetric matrix: rotations until nothing is left beside them."""
 
+from functools import cache
 from itertools import combinations
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import JaxprEqn
+from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
@@ -82,8 +83,13 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if len(shape) != 2 or shape[0] > LARGEST or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    program = jax.make_jaxpr(eigh)(like(shape, avals[0].dtype))
-    return lowering.inline(program, inputs)
+    return lowering.inline(_program(shape[0]), inputs)
+
+
+@cache
+def _program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(eigh)(like((n, n), np.float64))
 
 
 IN_MEMORY |= {"eigh": _eigh}

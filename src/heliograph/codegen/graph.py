@@ -21,7 +21,7 @@ TYPES: dict[str, Type] = {
     "uint32": "u32",
     "uint64": "u64",
 }
-MOST = 100_000  # nodes made, constants and what is dropped again among them
+MOST = 400_000  # nodes made, constants and what is dropped again among them
 Number = float | int | bool
 
 

@@ -20,7 +20,7 @@ from heliograph.codegen.summed import Summed, row_length
 from heliograph.codegen.transposed import mover
 from heliograph.codegen.vector_math import functions
 
-LONGEST = 20_000  # operations: beyond, straight lines take LLVM longer than XLA's loops
+LONGEST = 60_000  # operations: beyond, LLVM takes longer than XLA
 LINE = 64  # bytes: where vectors of any width may start
 
 

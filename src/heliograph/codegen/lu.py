@@ -1,10 +1,12 @@
 """The rule of factors of a small regular matrix, A = P L U, with rows exchanged by what the data are."""
 
+from functools import cache
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import JaxprEqn
+import numpy as np
+from jax.extend.core import ClosedJaxpr, JaxprEqn
 
 from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
@@ -42,7 +44,13 @@ def _lu(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Val
     shape = avals[0].shape
     if len(shape) != 2 or shape[0] != shape[1] or shape[0] > LARGEST:
         raise Unsupported(f"factors of a matrix of shape {shape}")
-    return lowering.inline(jax.make_jaxpr(lu)(like(shape, avals[0].dtype)), inputs)
+    return lowering.inline(_program(shape[0]), inputs)
+
+
+@cache
+def _program(n: int) -> ClosedJaxpr:
+    with jax.enable_x64(True):
+        return jax.make_jaxpr(lu)(like((n, n), np.float64))
 
 
 def _linear_solve(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -12,6 +12,7 @@ from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     calls,
     eigen,
     elementwise,
+    indexing,
     loops,
     lu,
     matrices,

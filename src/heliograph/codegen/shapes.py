@@ -3,13 +3,11 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.graph import Graph, Node, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, known_integers, result_shape
+from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape
 
 FEW = 16  # places that a number found in the data may choose among, one comparison each
 
@@ -131,115 +129,6 @@ def _updated(
     return result
 
 
-def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    """With known indices: the same gather of the places of all entries."""
-    x, indices = inputs
-    at = known_integers(indices)
-    return [_by_cases(lowering, equation, x, indices) if at is None else _gathered(lowering, equation, x, at)]
-
-
-def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndarray) -> np.ndarray:
-    with jax.enable_x64(True):
-        places = jnp.arange(x.size).reshape(x.shape)
-        params = equation.params | {"fill_value": -1}
-        found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))  # type: ignore[no-untyped-call]
-    flat = x.ravel()
-    beyond = (found < 0) | (found >= x.size)
-    if np.any(beyond):
-        missing = equation.params["fill_value"]
-        aval: Any = equation.outvars[0].aval
-        flat = np.append(flat, lowering.known(np.full((), np.nan if missing is None else missing, aval.dtype)))
-        found = np.where(beyond, x.size, found)
-    result: np.ndarray = flat[found]
-    return result
-
-
-def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With indices (..., axis) that data decide: what is gathered for each number that those of an axis may be.
-
-    Each entry is chosen by the index of its own row alone, so that rows of many nodes are no more cases than one.
-    """
-    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
-    axis = numbers.start_index_map[place]
-    count = x.shape[axis] - sizes[axis] + 1
-    if count > FEW:
-        return _from_memory(lowering, equation, x, indices, place)
-    cases = []
-    for number in range(count):
-        one = indices.copy()
-        for row in np.ndindex(*indices.shape[:-1]):
-            node = indices[(*row, place)]
-            if node.op != "constant":
-                one[(*row, place)] = lowering.graph.constant(number, node.type)
-        cases.append(_gather(lowering, equation, [x, one])[0])
-    result = cases[-1].copy()
-    for entry in np.ndindex(*result.shape):
-        row = tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
-        which = indices[(*row, place)]
-        if which.op != "constant":
-            here = [np.array(case[entry], dtype=object) for case in cases]
-            result[entry] = chosen(lowering.graph, which, here)[()]
-    return result
-
-
-def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, place: int) -> np.ndarray:
-    """The same of many places: each entry is loaded from as far on as its row's index says."""
-    from heliograph.codegen.loops import in_memory
-    from heliograph.codegen.views import clamped
-
-    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
-    axis = numbers.start_index_map[place]
-    begin = indices.copy()
-    for row in np.ndindex(*indices.shape[:-1]):
-        node = indices[(*row, place)]
-        if node.op != "constant":
-            begin[(*row, place)] = lowering.graph.constant(0, node.type)
-    at = known_integers(begin)
-    if at is None:
-        raise Unsupported("gather at two places that data decide")
-    starts = _gathered(lowering, equation, np.arange(x.size, dtype=object).reshape(x.shape), at)
-    buffer = in_memory(lowering, x).buffer
-    stride = int(np.prod(x.shape[axis + 1 :], dtype=int))
-    result = np.empty(starts.shape, dtype=object)
-    for entry in np.ndindex(*result.shape):
-        row = tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
-        first = clamped(lowering, indices[(*row, place)], x.shape[axis] - sizes[axis])
-        if isinstance(first, int):
-            result[entry] = x.ravel()[starts[entry]]
-        else:
-            result[entry] = lowering.graph.load(buffer, starts[entry], (stride,), (first,))
-    return result
-
-
-def _scatter(op: str | None) -> Rule:
-    """With known indices: the same scatter of the places of all updates."""
-
-    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-        x, indices, updates = inputs
-        at = known_integers(indices)
-        if at is None:
-            raise Unsupported(f"{equation.primitive.name} at places that data decide")
-        params = equation.params
-        result, flat = x.copy(), updates.ravel()
-        with jax.enable_x64(True):
-            places = jnp.arange(1, updates.size + 1).reshape(updates.shape)
-            found = np.asarray(
-                jax.lax.scatter(
-                    jnp.zeros(x.shape, places.dtype), jnp.asarray(at), places, params["dimension_numbers"],
-                    unique_indices=True, mode=params["mode"],
-                )
-            )  # fmt: skip
-        for index in zip(*np.nonzero(found), strict=True):
-            new = flat[found[index] - 1]
-            result[index] = new if op is None else lowering.graph.node(op, new.type, x[index], new)
-        if op is not None and np.count_nonzero(found) < updates.size:
-            raise Unsupported(f"{equation.primitive.name} of several updates of one entry")
-        return [result]
-
-    return rule
-
-
 RULES |= {
     "broadcast_in_dim": _moved(_broadcast_in_dim),
     "reshape": _moved(lambda x, params, shape: x.reshape(shape)),
@@ -249,7 +138,5 @@ RULES |= {
     "rev": _moved(lambda x, params, shape: np.flip(x, params["dimensions"])),
     "tile": _moved(lambda x, params, shape: np.tile(x, params["reps"])),
     "slice": _moved(_slice), "split": _split, "concatenate": _concatenate, "stack": _stack, "pad": _pad,
-    "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice, "gather": _gather,
-    "scatter": _scatter(None), "scatter-add": _scatter("add"), "scatter_add": _scatter("add"),
-    "scatter-mul": _scatter("mul"),
+    "iota": _iota, "dynamic_slice": _dynamic_slice, "dynamic_update_slice": _dynamic_update_slice,
 }  # fmt: skip
