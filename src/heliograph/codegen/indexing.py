@@ -112,7 +112,7 @@ def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices:
         if isinstance(first, int):
             result[entry] = x.ravel()[starts[entry]]
         else:
-            result[entry] = lowering.graph.load(buffer, starts[entry], (stride,), (first,))
+            result[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
     return result
 
 
