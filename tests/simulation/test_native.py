@@ -22,8 +22,8 @@ from tests.simulation.test_shadows import SENSOR as GAIN
 from tests.simulation.test_shadows import in_turn, link
 from tests.simulation.test_simulate import INPUTS, NETWORK
 
-# Near its least value a trace changes with the square of the weight, which is known to the root of rounding over the
-# root of the trace's curvature: that is small where nodes know nearly the same. Covariances agree to 1e-12 all the same.
+# Near its least value a trace changes with the square of the weight, which is known to the root of rounding over that of
+# the trace's curvature: it is small where nodes know nearly the same. Covariances agree to 1e-12 all the same.
 FLAT = 1e-4
 HORIZON, RUNS = 6, 70  # more than two blocks of runs, the last of them not full
 LINEAR = hg.LinearPlant([[0.95, 0.1], [0.0, 0.9]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))

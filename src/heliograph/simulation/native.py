@@ -51,11 +51,14 @@ def native(world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractRe
     fixed = tuple(leaf if h else None for leaf, h in zip(leaves, held, strict=True))
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
     try:
-        program, form = _program(tree, held, fixed, tuple(map(_Known.of, arrays)))
+        made = _made(tree, held, fixed, tuple(map(_Known.of, arrays)), bool(jax.threefry_partitionable.value))
     except TypeError as error:
         if "unhashable" not in str(error):
             raise
         raise Unsupported("a network that holds what cannot be told from another") from None
+    if isinstance(made, Unsupported):
+        raise Unsupported(made.operation, made.place)
+    program, form = made
     words = np.asarray(jax.random.key_data(key))
     return Native(program.begin([words, *(a for a in arrays if _is_given(a))]), form)
 
@@ -94,6 +97,16 @@ def _is_given(array: np.ndarray) -> bool:
 
 
 @lru_cache(PROGRAMS)
+def _made(
+    tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
+) -> tuple[Accumulated, Any] | Unsupported:
+    """`_program`, or why there is none: either is found once. `counting`: JAX's way to count draws, which decides it."""
+    try:
+        return _program(tree, held, fixed, known)
+    except Unsupported as found:
+        return found
+
+
 def _program(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...]
 ) -> tuple[Accumulated, Any]:
