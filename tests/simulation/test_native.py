@@ -22,8 +22,8 @@ from tests.simulation.test_shadows import SENSOR as GAIN
 from tests.simulation.test_shadows import in_turn, link
 from tests.simulation.test_simulate import INPUTS, NETWORK
 
-# Near its least value a trace changes with the square of the weight, which is known to the root of rounding over that of
-# the trace's curvature: it is small where nodes know nearly the same. Covariances agree to 1e-12 all the same.
+# Near its least value a trace changes with the square of the weight, which is known to the root of rounding over that
+# of the trace's curvature: small where nodes know nearly the same. Covariances agree to 1e-12 all the same.
 FLAT = 1e-4
 HORIZON, RUNS = 6, 70  # more than two blocks of runs, the last of them not full
 LINEAR = hg.LinearPlant([[0.95, 0.1], [0.0, 0.9]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
@@ -127,6 +127,26 @@ def test_statistics_are_those_of_xla(networked, monkeypatch):
                 np.testing.assert_allclose(a, b, rtol=digits, atol=digits * np.nanmax(np.abs(b), initial=1e-300))
             assert one.failed_runs == true.failed_runs
             np.testing.assert_array_equal(one.failed, true.failed)
+
+
+def test_smoothed_estimates_are_those_of_xla(monkeypatch):
+    """Of nodes whose links lose nothing, and of one whose do; trajectories and their sums."""
+    interval = hg.smoothing.FixedInterval()
+    relay = hg.hop(hg.Rayleigh(0.8), 0.05)
+    filters = {"linear": hg.linear_filter(LINEAR, POSITION, relay)}
+    nodes = {"a": hg.Node(POSITION, relay, filters), "b": hg.Node(POSITION, hg.erasure(relay, 0.8), filters)}
+    network = hg.Network(LINEAR, nodes)
+    found, expected = (by(e, monkeypatch, network, HORIZON, RUNS, 5, smooth=interval) for e in ("native", "xla"))
+    sums, true_sums = (
+        by(e, monkeypatch, network, HORIZON, RUNS, 5, hg.Statistics(), smooth=interval) for e in ("native", "xla")
+    )
+    for node in nodes:
+        one, true = found.smoothed.estimates[node]["linear"], expected.smoothed.estimates[node]["linear"]
+        np.testing.assert_allclose(one.mean, true.mean, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(one.covariance, true.covariance, rtol=0, atol=1e-12)
+        for part in ("outer", "covariance", "nees"):
+            a, b = (getattr(s.smoothed[node]["linear"], part) for s in (sums, true_sums))
+            np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12 * np.abs(b).max())
 
 
 def test_a_run_depends_on_no_other(monkeypatch):

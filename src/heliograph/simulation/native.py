@@ -22,6 +22,7 @@ from heliograph.codegen.program import Program
 from heliograph.codegen.summed import Summed
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.reducer import AbstractReducer, OfStep
+from heliograph.simulation.smoothed import Smoother, one_run
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.world import World
 
@@ -36,8 +37,16 @@ class Native(NamedTuple):
     tree: Any
 
 
-def native(world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any]) -> Native:
+def native(
+    world: World,
+    inputs: np.ndarray,
+    key: jax.Array,
+    reducer: AbstractReducer[Any],
+    later: Smoother | None = None,
+) -> Native:
     """The native code of a network's runs, of which a reducer keeps what its `of_step` says.
+
+    With `later`, what is kept is a pair: of filtered and of smoothed estimates; and sums of surprise.
 
     Raises:
         Unsupported: a program that native code does not take.
@@ -46,7 +55,7 @@ def native(world: World, inputs: np.ndarray, key: jax.Array, reducer: AbstractRe
         raise Unsupported(f"{type(reducer).__name__}, which has no of_step")
     if str(key.dtype) != "key<fry>":
         raise Unsupported(f"keys of type {key.dtype}")
-    leaves, tree = jax.tree.flatten((world, inputs, reducer))
+    leaves, tree = jax.tree.flatten((world, later, inputs, reducer))
     held = tuple(not eqx.is_array(leaf) for leaf in leaves)
     fixed = tuple(leaf if h else None for leaf, h in zip(leaves, held, strict=True))
     arrays = [np.asarray(leaf) for leaf, h in zip(leaves, held, strict=True) if not h]
@@ -100,7 +109,7 @@ def _is_given(array: np.ndarray) -> bool:
 def _made(
     tree: Any, held: tuple[bool, ...], fixed: tuple[Any, ...], known: tuple[_Known, ...], counting: bool
 ) -> tuple[Accumulated, Any] | Unsupported:
-    """`_program`, or why there is none: either is found once. `counting`: JAX's way to count draws, which decides it."""
+    """`_program`, or why there is none: either is found once. It hangs on JAX's way to count draws, `counting`."""
     try:
         return _program(tree, held, fixed, known)
     except Unsupported as found:
@@ -120,8 +129,9 @@ def _program(
         *arrays, number = leaves
         each = iter(arrays)
         whole = [value if h else next(each) for value, h in zip(fixed, held, strict=True)]
-        world, inputs, reducer = jax.tree.unflatten(tree, whole)
-        found = _run(world, jnp.asarray(inputs), reducer, jax.random.fold_in(key, number))
+        world, later, inputs, reducer = jax.tree.unflatten(tree, whole)
+        run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
+        found = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
         summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (found.sums, found.ever))
         results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], found.collected))
         form[:] = [structure, len(jax.tree.leaves(summed))]
@@ -148,6 +158,28 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
 
     _, kept = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
     return kept._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), kept.ever))
+
+
+def _smoothed(
+    world: World, later: Smoother, inputs: jax.Array, reducer: AbstractReducer[Any], key: jax.Array
+) -> OfStep:
+    """What is kept of a run's filtered and smoothed estimates, each step by step, and its sums of surprise."""
+
+    def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        return world.step(state, key, row)
+
+    def kept(found: PyTree) -> OfStep:
+        _, each = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), found)
+        return each._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), each.ever))
+
+    _, found = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
+    both = one_run(later.both, found)
+    filtered, smoothed = kept(both["filtered"]), kept(both["smoothed"])
+    return OfStep(
+        (filtered.sums, smoothed.sums, both["surprise"]),
+        (filtered.ever, smoothed.ever),
+        (filtered.collected, smoothed.collected),
+    )
 
 
 def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:

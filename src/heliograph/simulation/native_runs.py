@@ -16,6 +16,7 @@ from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.native import Native, native
 from heliograph.simulation.network import Network
 from heliograph.simulation.reducer import AbstractReducer, Result
+from heliograph.simulation.smoothed import Beside, Part
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
@@ -33,11 +34,19 @@ def natively(
     runs: int,
     chunk: int,
     progress: Progress | None,
+    part: Part | None = None,
 ) -> Result | None:
-    """What a reducer makes of a network's runs; None where native code does not take the network or the reducer.
+    """What a reducer makes of a network's runs, of which `part` is smoothed.
 
-    Draws depend on names alone, and so do nodes that share nothing but the plant: they are simulated in parts.
+    None where native code does not take the network or the reducer. Draws depend on names alone, and so do nodes that
+    share nothing but the plant: they are simulated a few at a time.
     """
+    if part is not None:
+        both: Beside[Result] = Beside(reducer)
+        code = attempted(lambda: _code(network, inputs, key, reducer, part))
+        if code is None:
+            return None
+        return both.finished(*_kept(code, both, first_run, runs, chunk, progress), network, part)
     apart = network.relays is None and network.common is None and not network.fused
     if len(network.names) <= NODES or not apart or type(reducer).joined is AbstractReducer.joined:
         code = attempted(lambda: _code(network, inputs, key, reducer))
@@ -45,8 +54,8 @@ def natively(
             None if code is None else reducer.finish(*_kept(code, reducer, first_run, runs, chunk, progress), network)
         )
     results, parts = [], list(_parts(network))
-    for number, part in enumerate(parts):
-        code = attempted(lambda: _code(part, inputs, key, reducer))  # noqa: B023
+    for number, some in enumerate(parts):
+        code = attempted(lambda: _code(some, inputs, key, reducer))  # noqa: B023
         if code is None:
             return None
 
@@ -54,7 +63,7 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(reducer.finish(*_kept(code, reducer, first_run, runs, chunk, shown), part))
+        results.append(reducer.finish(*_kept(code, reducer, first_run, runs, chunk, shown), some))
     return reducer.joined(results, network)
 
 
@@ -65,8 +74,11 @@ def _parts(network: Network) -> Iterator[Network]:
             yield Network(network.plant, {name: network.nodes[name] for name in names[start : start + NODES]})
 
 
-def _code(network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any]) -> Native:
-    return native(World(network.plant, air_of(network), AllFilters(network)), inputs, key, reducer)
+def _code(
+    network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], part: Part | None = None
+) -> Native:
+    filters = AllFilters(network, part and part.kinds)
+    return native(World(network.plant, air_of(network), filters), inputs, key, reducer, part and part.smoother(filters))
 
 
 def _kept(

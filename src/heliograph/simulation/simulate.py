@@ -112,9 +112,9 @@ def monte_carlo(
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
-    if part is None and not single and one_processor():
+    if not single and one_processor():
         any_reducer: AbstractReducer[PyTree] = reducer
-        made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress)
+        made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
         if made is not None:
             return made
     filters = AllFilters(network, part and part.kinds)
