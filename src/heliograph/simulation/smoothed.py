@@ -207,7 +207,8 @@ class Beside(AbstractReducer[Result]):
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
         """Both, of pairs; and surprise."""
         filtered, smoothed = (
-            self.reducer.summed(*(OfStep(s.sums[i], s.ever[i]) for s in (sums, common)), count=count) for i in (0, 1)
+            self.reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count)
+            for i in (0, 1)
         )
         surprise = jax.tree.map(
             lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
