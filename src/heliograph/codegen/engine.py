@@ -7,7 +7,7 @@ import os
 import warnings
 from collections.abc import Callable, Sequence
 from functools import cache, lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import numpy as np
@@ -19,6 +19,8 @@ from heliograph.codegen.machine import target
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
+
+Code = TypeVar("Code")
 
 SETTING = "HELIOGRAPH_ENGINE"
 COMPILED = 256  # functions whose code is held at once
@@ -59,15 +61,42 @@ def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs
     Raises:
         ValueError: an engine that is none, or native code asked for of a program that it does not take.
     """
-    engine = os.environ.get(SETTING, "")
-    if engine not in ("", *ENGINES):
-        raise fail(SETTING, " or ".join(ENGINES), engine)
+    engine = setting()
     if engine == "xla":
         return Choice(None, f"{SETTING} is set to it")
     choice = _available() or _cached(function, arguments, differs)
     if choice.code is None and engine == "native":
         raise fail("native code", "a program of operations that it takes", choice.why)
     return choice
+
+
+def setting() -> str:
+    """The engine that is forced, "" where none is.
+
+    Raises:
+        ValueError: an engine that is none.
+    """
+    engine = os.environ.get(SETTING, "")
+    if engine not in ("", *ENGINES):
+        raise fail(SETTING, " or ".join(ENGINES), engine)
+    return engine
+
+
+def attempted(make: Callable[[], Code]) -> Code | None:
+    """Native code as it is made, None where XLA is to compute instead.
+
+    Raises:
+        ValueError: an engine that is none, or native code asked for of a program that it does not take.
+    """
+    engine = setting()
+    if engine == "xla" or _available() is not None:
+        return None
+    try:
+        return make()
+    except Unsupported as found:
+        if engine == "native":
+            raise fail("native code", "a program of operations that it takes", str(found)) from None
+        return None
 
 
 @cache

@@ -196,7 +196,9 @@ def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node
 
 def _compare(op: str) -> Callable[..., Node | None]:
     def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
-        """Of a flag that was made a number, or of a flag and a known one: the flag itself."""
+        """Of a flag that was made a number, or of a flag and a known one: the flag itself; of a number and itself."""
+        if a is b and (a.type != "f64" or a in graph.numbers or is_finite(a)):
+            return graph.constant(op == "eq", "bool")
         if a.op == "constant":
             a, b = b, a
         if b.op != "constant":

@@ -179,6 +179,7 @@ class Graph:
         self.top = Block(None)
         self.current = self.top
         self.serial = 0
+        self.numbers: set[Node] = set()  # known not to be NaN
 
     def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
         """The node of an operation: a known number, an older node that says the same, or a new one."""

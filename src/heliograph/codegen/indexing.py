@@ -7,10 +7,10 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 from jax.lax import GatherScatterMode
 
-from heliograph.codegen.graph import Node, Unsupported
-from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, known_integers, result_shape
+from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.lowering import RULES, Lowering, Rule, known_integers
 from heliograph.codegen.memory import contiguous
-from heliograph.codegen.shapes import FEW, chosen, window
+from heliograph.codegen.shapes import FEW, chosen
 
 
 def _places(
@@ -75,25 +75,32 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) ->
 
 
 def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """With an index that data decide: what it gathers for each number that it may be, and a choice between these."""
-    flat: list[Node] = indices.ravel().tolist()
-    numbers = equation.params["dimension_numbers"]
-    axes, sizes = numbers.start_index_map, equation.params["slice_sizes"]
-    trailing = numbers.offset_dims == tuple(range(indices.ndim - 1, len(result_shape(equation))))
-    if axes == numbers.collapsed_slice_dims == (0,) and trailing and tuple(sizes[1:]) == x.shape[1:]:
-        rows = [window(lowering.graph, x, 0, n, 1).reshape(-1) for n in flat]  # whole rows, each by its own number
-        return np.concatenate(rows).reshape(result_shape(equation))
-    number = next(n for n in flat if n.op != "constant")
-    used = {axes[k % len(axes)] for k, n in enumerate(flat) if n is number}
-    count = max(x.shape[a] - sizes[a] + 1 for a in used)
+    """With indices (..., axis) that data decide: what is gathered for each number that those of an axis may be.
+
+    Each entry is chosen by the index of its own row alone, so that rows of many nodes are no more cases than one.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[place]
+    count = x.shape[axis] - sizes[axis] + 1
     if count > FEW:
         raise Unsupported(f"gather at one of {count} places that data decide")
     cases = []
-    for k in range(count):
-        known = lowering.graph.constant(k, number.type)
-        one = array_of([known if n is number else n for n in flat], indices.shape)
+    for number in range(count):
+        one = indices.copy()
+        for row in np.ndindex(*indices.shape[:-1]):
+            node = indices[(*row, place)]
+            if node.op != "constant":
+                one[(*row, place)] = lowering.graph.constant(number, node.type)
         cases.append(_gather(lowering, equation, [x, one])[0])
-    return chosen(lowering.graph, number, cases)
+    result = cases[-1].copy()
+    for entry in np.ndindex(*result.shape):
+        row = tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+        which = indices[(*row, place)]
+        if which.op != "constant":
+            here = [np.array(case[entry], dtype=object) for case in cases]
+            result[entry] = chosen(lowering.graph, which, here)[()]
+    return result
 
 
 def _scatter(op: str | None) -> Rule:

@@ -16,6 +16,7 @@ from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.program import Program, needed
 from heliograph.codegen.random_bits import hash_function
 from heliograph.codegen.spread import varying
+from heliograph.codegen.summed import Summed, row_length
 from heliograph.codegen.transposed import mover
 from heliograph.codegen.vector_math import functions
 
@@ -78,11 +79,18 @@ def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
 
 
 def written(
-    program: Program, differing: Iterable[bool], width: int, fuse: bool, alone: bool = False, last: Collection[int] = ()
+    program: Program,
+    differing: Iterable[bool],
+    width: int,
+    fuse: bool,
+    alone: bool = False,
+    last: Collection[int] = (),
+    summed: Summed | None = None,
 ) -> Code:
     """The text of a program whose inputs differ between runs, or do not.
 
     `alone`: one run, whose arrays are used in place; results of the numbers `last` may lie where arguments did.
+    `summed`: outputs that are summed over runs.
 
     Raises:
         Unsupported: an operation that has no text.
@@ -101,8 +109,14 @@ def written(
     common = [b not in spread for b in outputs]
     spread -= set(tables)
     owners = {x.owner[0] for x in items if isinstance(x, Buffer)}
+    added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
+    _check_sums(items, added)
     scratch, in_scratch = _places(
-        [b for b in owners if b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))],
+        [
+            b
+            for b in owners - added
+            if b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
+        ],
         width,
         0,
     )
@@ -112,7 +126,7 @@ def written(
     differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
     mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
     blocks = Writer(width, mine, products, spread, slots)
-    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone)
+    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
     text = _with_functions(text, blocks)
     roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
     roots += [b for b, c in zip(outputs, common, strict=True) if c]
@@ -123,6 +137,13 @@ def written(
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
     return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, _work(mine))
+
+
+def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
+    """Sums are written to alone: a number that is used again lies elsewhere too."""
+    read = {x.value[0].owner[0] for x in items if isinstance(x, Node) and x.op == "load"}
+    if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
+        raise Unsupported("a sum over runs of numbers that are used again")
 
 
 def sorted_items(items: Iterable[Any]) -> list[Any]:
@@ -156,6 +177,7 @@ def _blocks(
     in_scratch: dict[Buffer, int],
     in_shared: dict[Buffer, int],
     alone: bool,
+    summed: Summed | None,
 ) -> str:
     """Blocks `begin` to `end` of W runs: inputs transposed, computed, outputs transposed back."""
     names = _pointers(writer, pointers, in_shared)
@@ -178,9 +200,13 @@ def _blocks(
     given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
     for buffer in taken:
         move("take", buffer)
+    if summed is not None:
+        added = [b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in writer.spread]
+        _add(writer, summed, names, program.inputs[summed.number], added)
     writer.block(program.graph.top)
     for buffer in given:
-        move("give", buffer)
+        if buffer not in writer.sums:
+            move("give", buffer)
     writer.line("br label %done")
     writer.start("done")
     writer.line("%next = add i64 %number, 1")
@@ -190,6 +216,24 @@ def _blocks(
     body = "\n".join(writer.lines)
     texts = [mover(bits, writer.width, inwards) for bits, inwards in sorted(movers)]
     return "\n".join([*texts, f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"])
+
+
+def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
+    """Have the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
+    width = writer.width
+    place = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
+    run = writer.add(f"load i32, ptr {place}, align 4")
+    batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
+    count = writer.add("sub i64 %runs, %first")
+    first = writer.add(f"insertelement <{width} x i64> poison, i64 {count}, i64 0")
+    every = writer.add(
+        f"shufflevector <{width} x i64> {first}, <{width} x i64> poison, <{width} x i32> zeroinitializer"
+    )
+    numbers = ", ".join(f"i64 {lane}" for lane in range(width))
+    writer.counted = writer.add(f"icmp ult <{width} x i64> <{numbers}>, {every}")
+    for buffer in outputs:
+        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {batch}")
+        writer.sums[buffer] = row_length(width, summed.batches)
 
 
 def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:

@@ -25,6 +25,8 @@ class Writer:
         self.called: set[str] = set()
         self.read: set[Buffer] = set()  # buffers that all runs share
         self.bases: dict[Buffer, str] = {}
+        self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
+        self.counted = ""  # the lanes that count
 
     def add(self, text: str) -> str:
         """A fresh name for what the text computes."""
@@ -174,7 +176,12 @@ class Writer:
 
     def _store(self, store: Store) -> None:
         name, own = self.operand(store.node), vector(store.node.type, self.width)
-        address = self._address(store.buffer, store.offset, store.strides, store.indices, self.width)
+        lanes = self.sums.get(store.buffer, self.width)
+        address = self._address(store.buffer, store.offset, store.strides, store.indices, lanes)
+        if store.buffer in self.sums:
+            before = self.add(f"load {own}, ptr {address}, align 8")
+            counted = self.add(f"select <{self.width} x i1> {self.counted}, {own} {name}, {own} zeroinitializer")
+            name = self.add(f"fadd {own} {before}, {counted}")
         if store.node.type == "bool":
             name, own = self.add(f"zext {own} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
         self.line(f"store {own} {name}, ptr {address}, align {BITS[store.node.type] // 8}")

@@ -7,6 +7,7 @@ import jax
 from jax.extend.core import ClosedJaxpr
 
 from heliograph.codegen import (  # noqa: F401  (they fill the rules)
+    arrived,
     branches,
     calls,
     eigen,
