@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.codegen import engine
 from heliograph.codegen.compiled import Alone, Compiled, compile
 from heliograph.codegen.engine import engine_of
 from heliograph.codegen.program import lower
@@ -209,3 +210,16 @@ def test_a_user_can_ask_for_the_engine_and_force_one(monkeypatch):
     monkeypatch.setenv("HELIOGRAPH_ENGINE", "gpu")
     with pytest.raises(ValueError, match="HELIOGRAPH_ENGINE: expected native or xla, got gpu"):
         engine_of(svd, x)
+
+
+def test_a_machine_without_native_code_says_so_once_and_computes_by_xla(monkeypatch):
+    def unknown():
+        raise RuntimeError("no target for this processor")
+
+    x = RANDOM.normal(size=(3, 2, 2))
+    monkeypatch.setattr(engine, "target", unknown)
+    engine._available.cache_clear()
+    with pytest.warns(UserWarning, match="native code: expected a processor that LLVM knows, got no target"):
+        assert engine_of(lambda x: x @ x, x) == "xla: LLVM does not know this processor"
+    np.testing.assert_allclose(hg.simulation.over_runs(lambda x: x @ x, x), x @ x)
+    engine._available.cache_clear()

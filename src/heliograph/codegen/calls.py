@@ -9,8 +9,9 @@ from jax.extend.core import JaxprEqn
 from heliograph.codegen.graph import Node
 from heliograph.codegen.loops import in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, like
-from heliograph.codegen.memory import InMemory
+from heliograph.codegen.memory import LONG, InMemory
 from heliograph.codegen.shapes import FEW
+from heliograph.codegen.views import joined
 
 CALLS = (
     "jit", "pjit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr",
@@ -46,7 +47,7 @@ def _over(
     count, rest = runs[-1], runs[:-1]
     if count <= FEW:
         each = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
-        return [np.stack([lowering.nodes(x) for x in results], axis=-1) for results in zip(*each, strict=True)]
+        return [_together(lowering, list(results)) for results in zip(*each, strict=True)]
     rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
@@ -55,6 +56,17 @@ def _over(
 
     stacked = repeated(lowering, count, [], turn)[1]
     return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
+
+
+def _together(lowering: Lowering, results: list[Value]) -> Value:
+    """A result of few runs with the runs last: in memory where it is long."""
+    x = results[0]
+    if not isinstance(x, InMemory) or x.size <= LONG:
+        return np.stack([lowering.nodes(x) for x in results], axis=-1)
+    if len(results) == 1:
+        return x.view((*x.shape, 1), (*x.strides, 0))
+    whole = joined(lowering, results, (len(results), *x.shape))
+    return whole.view([*whole.shape[1:], len(results)], [*whole.strides[1:], whole.strides[0]])
 
 
 def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -110,7 +110,7 @@ def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence
 
 
 def best_width() -> int:
-    """Runs of a block: two of the processor's vectors."""
+    """Runs of a block: one vector of the widest processors, two of others; more only spill."""
     return 8
 
 

@@ -20,11 +20,11 @@ def target() -> llvm.Target:
 
 
 @cache
-def features() -> tuple[str, str, bool, bool]:
-    """This processor's name and features for LLVM; whether it fuses products and sums, and has vectors of 64 bytes."""
+def features() -> tuple[str, str, bool]:
+    """This processor's name and features for LLVM, and whether it fuses products and sums."""
     found = llvm.get_host_cpu_features()
     arm = "aarch64" in target().triple or "arm64" in target().triple
-    return llvm.get_host_cpu_name(), found.flatten(), bool(found.get("fma")) or arm, bool(found.get("avx512f"))
+    return llvm.get_host_cpu_name(), found.flatten(), bool(found.get("fma")) or arm
 
 
 class Machine:

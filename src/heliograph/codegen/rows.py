@@ -13,7 +13,7 @@ from heliograph.codegen.elementwise import ELEMENTWISE
 from heliograph.codegen.graph import Node, Unsupported
 from heliograph.codegen.loops import in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
-from heliograph.codegen.memory import LONG, InMemory
+from heliograph.codegen.memory import LONG, MANY, InMemory
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -22,8 +22,15 @@ OF_ENTRIES = (
 
 
 def is_long(inputs: list[Value]) -> bool:
-    """Whether nodes for all entries of some argument would be too many."""
-    return any(isinstance(x, InMemory) and x.size > LONG for x in inputs)
+    """Whether nodes for all entries of some argument would be too many; of tables alone they are numbers."""
+    longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
+    known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
+    return longest > MANY or (longest > LONG and not (known and _are_known(inputs)))
+
+
+def _are_known(inputs: list[Value]) -> bool:
+    arrays = (x for x in inputs if not isinstance(x, InMemory))
+    return all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
 
 
 def _of_entries(name: str) -> Rule:

@@ -8,7 +8,7 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.elementwise import PASSED_ON
 from heliograph.codegen.graph import Buffer, Key, Node
-from heliograph.codegen.loops import copied, in_memory
+from heliograph.codegen.loops import copied, in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.shapes import FEW
@@ -126,20 +126,32 @@ def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """Along the first axis into new memory: a part that fills its own memory is written there at once."""
-    shape = result_shape(equation)
-    if equation.params["dimension"] != 0 or int(np.prod(shape, dtype=int)) <= LONG:
+    """Along the first axis into new memory, along another one row after another."""
+    shape, axis = result_shape(equation), equation.params["dimension"]
+    if int(np.prod(shape, dtype=int)) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
         return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
-    graph, size = lowering.graph, int(np.prod(shape[1:], dtype=int))
-    type = next(x for x in inputs if isinstance(x, InMemory)).type
+    if axis != 0:
+        parts = [in_memory(lowering, x) for x in inputs]
+
+        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [], [np.concatenate([lowering.nodes(x.row(place)) for x in parts], axis=axis - 1)]
+
+        return list(repeated(lowering, shape[0], [], turn)[1])
+    return [joined(lowering, inputs, shape)]
+
+
+def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
+    """Arrays one after another as one array in memory: one that fills its own memory is written there at once."""
+    graph = lowering.graph
+    type = next(x for x in parts if isinstance(x, InMemory)).type
     buffer, start = Buffer("scratch", type, shape, graph.current), 0
-    for x in inputs:
+    for x in parts:
         if isinstance(x, InMemory) and _is_alone(x, graph.current):
             buffer.take_in(x.buffer, start)
         else:
             _copy(lowering, x, buffer, start)
-        start += x.shape[0] * size
-    return [InMemory.whole(buffer)]
+        start += x.size
+    return InMemory.whole(buffer)
 
 
 def _is_alone(x: InMemory, block: Any) -> bool:
