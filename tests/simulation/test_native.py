@@ -180,6 +180,21 @@ def code(network: hg.Network, seed: int = 0):
         return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories())
 
 
+def test_many_nodes_are_what_each_is_alone(monkeypatch):
+    """A few at a time: each node's numbers are those of a network of its own."""
+    monkeypatch.setenv(SETTING, "native")
+    relay = hg.hop(hg.Rayleigh(0.8), 0.05)
+    nodes = {f"n{i}": hg.Node(POSITION, relay, {"linear": hg.linear_filter(LINEAR, POSITION, relay)}) for i in range(6)}
+    nodes["last"] = hg.Node(POSITION, hg.erasure(relay, 0.5), nodes["n0"].filters)
+    whole, sums = (hg.monte_carlo(hg.Network(LINEAR, nodes), HORIZON, 40, 2, keep) for keep in (None, hg.Statistics()))
+    assert list(whole.measurements) == list(nodes) and list(sums) == list(nodes)
+    for name in ("n0", "n5", "last"):
+        alone = hg.monte_carlo(hg.Network(LINEAR, {name: nodes[name]}), HORIZON, 40, 2)
+        np.testing.assert_allclose(whole.measurements[name], alone.measurements[name], rtol=0, atol=1e-14)
+        for f, estimate in alone.estimates[name].items():
+            np.testing.assert_allclose(whole.estimates[name][f].mean, estimate.mean, rtol=0, atol=1e-13)
+
+
 def test_networks_of_one_structure_share_a_program():
     other = hg.Network(LINEAR, {name: hg.Node(POSITION, hg.hop(1.0, noise), {}) for name, noise in (("a", 0.1),)})
     again = hg.Network(LINEAR, {name: hg.Node(POSITION, hg.hop(1.0, noise), {}) for name, noise in (("a", 0.2),)})

@@ -10,11 +10,13 @@ import numpy as np
 from heliograph.codegen.compiled import threads
 from heliograph.codegen.engine import attempted
 from heliograph.codegen.summed import folded
+from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.air import air_of
 from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.native import Native, native
 from heliograph.simulation.network import Network
+from heliograph.simulation.node import Node
 from heliograph.simulation.reducer import AbstractReducer, Result
 from heliograph.simulation.smoothed import Beside, Part
 from heliograph.simulation.statistics import BATCHES
@@ -47,8 +49,7 @@ def natively(
         if code is None:
             return None
         return both.finished(*_kept(code, both, first_run, runs, chunk, progress), network, part)
-    apart = network.relays is None and network.common is None and not network.fused
-    if len(network.names) <= NODES or not apart or type(reducer).joined is AbstractReducer.joined:
+    if len(network.names) <= NODES or not _is_apart(network) or type(reducer).joined is AbstractReducer.joined:
         code = attempted(lambda: _code(network, inputs, key, reducer))
         return (
             None if code is None else reducer.finish(*_kept(code, reducer, first_run, runs, chunk, progress), network)
@@ -65,6 +66,12 @@ def natively(
 
         results.append(reducer.finish(*_kept(code, reducer, first_run, runs, chunk, shown), some))
     return reducer.joined(results, network)
+
+
+def _is_apart(network: Network) -> bool:
+    """Whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory of a channel."""
+    own = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
+    return len(own) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in own)
 
 
 def _parts(network: Network) -> Iterator[Network]:

@@ -108,11 +108,10 @@ class Statistics(AbstractReducer[StatisticsByName]):
         claimed = [jnp.moveaxis(jnp.asarray(part.covariance).reshape(-1, n, n), 0, -1) for part in parts]
         errors = [truth[:, None] - mean for mean in means]
         nees = [squared_distance(b, e, truth[:, None]) for b, e in zip(claimed, errors, strict=True)]
-        finite = jnp.concatenate([jnp.all(jnp.isfinite(e), axis=0) for e in errors])
-        distance = jnp.concatenate(nees)
+        joined, distance = jnp.concatenate(errors, axis=1), jnp.concatenate(nees)
+        finite = jnp.all(jnp.isfinite(joined), axis=0)
         bad = jnp.stack([~finite, jnp.isnan(distance)])
         rows, columns = np.triu_indices(n)
-        joined = jnp.concatenate(errors, axis=1)
         sums = {
             "pairs": jnp.stack([joined[i] * joined[j] for i, j in zip(rows, columns, strict=True)], axis=-1),
             "nees": distance,
