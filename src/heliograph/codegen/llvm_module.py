@@ -9,12 +9,14 @@ import numpy as np
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.llvm_operations import BITS
-from heliograph.codegen.llvm_text import Slots, Writer, loops_of, products_of
+from heliograph.codegen.llvm_text import Writer
 from heliograph.codegen.loops import copied
 from heliograph.codegen.lowering import Lowering
 from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.products import products_of
 from heliograph.codegen.program import Program, needed
 from heliograph.codegen.random_bits import hash_function
+from heliograph.codegen.slots import Slots, loops_of
 from heliograph.codegen.spread import varying
 from heliograph.codegen.summed import Summed, row_length
 from heliograph.codegen.transposed import mover

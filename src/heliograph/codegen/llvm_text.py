@@ -1,10 +1,12 @@
 """A program as text of LLVM IR: one function that computes blocks of W runs, and one for what all runs share."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from heliograph.codegen.graph import Block, Buffer, Check, Guard, Loop, Node, Store, Type
 from heliograph.codegen.llvm_operations import BITS, CALLED, LLVM, fused, operation, splat, vector
+from heliograph.codegen.products import fusable
+from heliograph.codegen.slots import Slots
 
 Scope = dict[Any, str]
 
@@ -16,7 +18,7 @@ class Writer:
     share, and another function computed, `shared` says where it lies.
     """
 
-    def __init__(self, width: int, mine: set[Any], products: set[Node], spread: set[Any], slots: "Slots"):
+    def __init__(self, width: int, mine: set[Any], products: set[Node], spread: set[Any], slots: Slots):
         self.width, self.mine, self.products, self.spread, self.slots = width, mine, products, spread, slots
         self.lines: list[str] = []
         self.scopes: list[Scope] = [{}]
@@ -164,12 +166,13 @@ class Writer:
         if lanes > 1:
             numbers = ", ".join(f"i64 {lane}" for lane in range(self.width))
             place = self.add(f"add {wide} {place}, <{numbers}>")
-        bits = BITS[node.type]
-        pointers = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, {wide} {place}")
-        suffix = f"v{self.width}i{bits}.v{self.width}p0"
-        masked = f"<{self.width} x ptr> align {bits // 8} {pointers}, <{self.width} x i1> splat (i1 true)"
-        values = f"<{self.width} x i{bits}>"
-        loaded = self.add(f"call {values} @llvm.masked.gather.{suffix}({masked}, {values} poison)")
+        bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
+        loaded = "poison"
+        for lane in range(self.width):
+            at = self.add(f"extractelement {wide} {place}, i64 {lane}")
+            address = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, i64 {at}")
+            one = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {one}, i64 {lane}")
         if node.type == "bool":
             return self.add(f"icmp ne {values} {loaded}, zeroinitializer")
         return self.add(f"bitcast {values} {loaded} to {own}") if node.type == "f64" else loaded
@@ -266,97 +269,3 @@ class Writer:
         for k, value in zip(used, values, strict=True):
             own = vector(guard.results[k].type, self.width)
             self._keep(guard.results[k], self.add(f"phi {own} [{value}, %{after}], [zeroinitializer, %{before}]"))
-
-
-def fusable(node: Node, products: set[Node]) -> Node | None:
-    """The product that is computed with a sum or difference as one operation."""
-    if node.op not in ("add", "sub") or node.type != "f64":
-        return None
-    found = [a for a in node.args if a in products and a.value is node]
-    return found[0] if found else None
-
-
-class Slots:
-    """Where numbers that all runs share, which one function computes and the other uses, lie in memory.
-
-    One in a loop has a place for each turn.
-    """
-
-    def __init__(self, size: int):
-        self.size = size  # bytes
-        self.places: dict[Node, int] = {}
-        self.base = ""
-
-    def place(self, node: Node) -> int:
-        """Where a number lies; it is given a place when it is first used."""
-        if node not in self.places:
-            self.places[node] = self.size
-            turns = 1
-            for loop in loops_of(node):
-                turns *= loop.length or 1
-            self.size += 8 * turns
-        return self.places[node]
-
-    def load(self, writer: Writer, node: Node) -> str:
-        """A shared number, a scalar."""
-        address = self._address(writer, node)
-        loaded = writer.add(f"load i{BITS[node.type]}, ptr {address}, align 8")
-        if node.type == "bool":
-            return writer.add(f"trunc i8 {loaded} to i1")
-        return writer.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
-
-    def store(self, writer: Writer, node: Node, name: str) -> None:
-        """Write it where it is computed, if the other function uses it."""
-        if node not in self.places or writer.width != 1:
-            return
-        own = vector(node.type, 1)
-        address = self._address(writer, node)
-        if node.type == "bool":
-            name, own = writer.add(f"zext {own} {name} to <1 x i8>"), "<1 x i8>"
-        writer.line(f"store {own} {name}, ptr {address}, align 1")
-
-    def _address(self, writer: Writer, node: Node) -> str:
-        place, stride, index = self.place(node), 8, ""
-        for loop in loops_of(node):
-            assert loop.counter is not None
-            part = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
-            index = writer.add(f"add i64 {index}, {part}") if index else part
-            stride *= loop.length or 1
-        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {place}")
-        return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
-
-
-def loops_of(node: Node) -> list[Loop]:
-    """The loops around a node, innermost first."""
-    return [b.owner for b in node.block.inwards() if isinstance(b.owner, Loop)]
-
-
-def products_of(items: Iterable[Any]) -> set[Node]:
-    """Products that are used once, by a sum or difference: marks each with its user, of two the later one."""
-    users: dict[Node, list[Any]] = {}
-    for item in items:
-        for used in uses(item):
-            users.setdefault(used, []).append(item)
-    found: set[Node] = set()
-    taken: set[Node] = set()
-    for node in sorted((n for n in users if n.op == "mul" and n.type == "f64"), key=lambda n: -n.serial):
-        user = users[node][0]
-        single = len(users[node]) == 1 and isinstance(user, Node) and user.op in ("add", "sub")
-        if single and user.args[0] is not user.args[1] and user.block is node.block and user not in taken:
-            node.value = user
-            found.add(node)
-            taken.add(user)
-    return found
-
-
-def uses(item: Any) -> list[Node]:
-    """The nodes that an item of a program uses itself."""
-    if isinstance(item, Node):
-        return list(item.args)
-    if isinstance(item, Store):
-        return [item.node, *item.indices]
-    if isinstance(item, Guard):
-        return [item.condition, *item.values]
-    if isinstance(item, Loop):
-        return [*item.initial, *item.following, *([] if item.condition is None else [item.condition])]
-    return []
