@@ -1,4 +1,4 @@
-"""What all runs share is computed once, and what is drawn ahead are the same draws."""
+"""Under XLA, what all runs share is computed once."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,6 @@ import heliograph as hg
 from heliograph.files.recording import read_recording
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
-from heliograph.simulation import by_run
 from heliograph.simulation.by_run import trajectories
 from tests.relays.relay_problems import example
 
@@ -37,9 +36,7 @@ def one_run(key):
     return {name: np.array([t[name] for t in kept]) for name in kept[0]}
 
 
-@pytest.mark.parametrize("ahead", [1, 1000, 2**18])
-def test_every_run_is_the_one_that_a_loop_makes(monkeypatch, ahead):
-    monkeypatch.setattr(by_run, "AHEAD", ahead)
+def test_every_run_is_the_one_that_a_loop_makes():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(3), 5)
         found = trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
@@ -95,3 +92,37 @@ def test_columns_of_what_relays_heard_may_be_left_out():
     assert sorted(record.estimates) == ["receiver", "relay_1"] and record.time[-1] == 3.0
     with pytest.raises(ValueError, match=r"one column 'receiver.y0'"):
         read_recording({"time": np.arange(4.0), "relay_1.y0": z}, network)
+
+
+class Counted(hg.random_affine.AbstractNoise):
+    """Poisson counts about their mean: loops that hold keys, in single precision."""
+
+    rate: float
+
+    @property
+    def dimension(self):
+        return 1
+
+    @property
+    def mean(self):
+        return np.zeros(1)
+
+    @property
+    def covariance(self):
+        return np.array([[self.rate]])
+
+    def sample(self, key):
+        return jax.random.poisson(key, self.rate, (1,)) - self.rate
+
+    def moment(self, powers):
+        return {1: 0.0, 2: self.rate, 3: self.rate}[powers[0]]
+
+
+def test_a_noise_of_counts_is_simulated():
+    plant = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
+    sensor = hg.LinearSensor([[1.0]], Counted(4.0))
+    node = hg.Node(sensor, hg.perfect(1), {"kalman": hg.kalman_filter(plant, sensor)})
+    record = hg.monte_carlo(hg.Network(plant, {"a": node}), 20, 64, 0)
+    heard = record.measurements["a"][:, :, 0] - np.asarray(record.truth)[:, :, 0]
+    np.testing.assert_allclose(heard + 4.0, np.round(heard + 4.0), atol=1e-12)  # whole numbers, to rounding
+    assert abs(heard.mean()) < 4 * 2 / np.sqrt(heard.size)  # four standard errors, the deviation being 2

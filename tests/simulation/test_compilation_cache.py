@@ -9,6 +9,7 @@ import jax
 import pytest
 
 import heliograph as hg
+from heliograph.codegen.engine import SETTING
 
 PROGRAM = """
 import sys, heliograph
@@ -27,7 +28,8 @@ print(heard.count("/jax/compilation_cache/cache_hits"), heard.count("/jax/compil
 
 
 def clean():
-    return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
+    """Of a process whose simulations XLA compiles."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | {SETTING: "xla"}
 
 
 def test_a_second_process_compiles_nothing(tmp_path):

@@ -11,7 +11,7 @@ from heliograph.numerics.small_matrix import squared_distance
 from heliograph.numerics.types import PyTree
 from heliograph.simulation.by_name import by_name, measurements_of
 from heliograph.simulation.network import Network
-from heliograph.simulation.reducer import AbstractReducer
+from heliograph.simulation.reducer import AbstractReducer, OfStep
 
 
 class Errors(AbstractReducer[dict[str, PyTree]]):
@@ -40,6 +40,12 @@ class Errors(AbstractReducer[dict[str, PyTree]]):
         if self.world:
             kept |= {name: batch[name] for name in ("truth", "measurements")}
         return carry, kept
+
+    def of_step(self, step: PyTree) -> OfStep:
+        """The same of a block of one run and one step."""
+        block = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None, None], step)
+        _, kept = self.reduce((), block, jnp.zeros(1), jnp.ones(1, dtype=bool))
+        return OfStep(collected=jax.tree.map(lambda leaf: leaf[0, 0], kept))
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> dict[str, PyTree]:
         """What was collected, by name."""

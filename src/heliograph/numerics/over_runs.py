@@ -4,7 +4,6 @@ A kernel is an operation of its own in what JAX traces: a level of vmap adds an 
 that its arithmetic is traced for one matrix, whose shapes are those of its results, and once more for all, as compiled.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial, wraps
 from typing import Any, ParamSpec, Protocol, TypeVar
@@ -12,7 +11,7 @@ from typing import Any, ParamSpec, Protocol, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import JaxprEqn, Primitive
+from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from heliograph.numerics.types import PyTree
@@ -161,36 +160,6 @@ def _alone(kernel: Callable[..., PyTree]) -> Callable[..., PyTree]:
         )
 
     return call
-
-
-def is_kernel(operation: JaxprEqn) -> bool:
-    """Whether an operation of a traced program is a kernel over runs."""
-    return bool(operation.primitive is _kernel)
-
-
-def likeness(operation: JaxprEqn) -> Any:
-    """What two kernels have in common that differ in their numbers and in how many runs they have."""
-    params, axes = operation.params, len(operation.params["runs"])
-    avals: list[Any] = [v.aval for v in operation.invars]
-    shapes = tuple((a.shape[: a.ndim - axes], a.dtype) for a in avals)
-    return shapes, *(params[name] for name in ("kernel", "tree", "told", "x64"))
-
-
-def side_by_side(several: Sequence[Sequence[Any]], params: Sequence[dict[str, Any]]) -> list[list[jax.Array]]:
-    """The results of like kernels, computed by one that has the runs of all."""
-    runs = [one["runs"] for one in params]
-    sizes = [math.prod(each) for each in runs]
-
-    def joined(parts: Sequence[Any]) -> jax.Array:
-        whole = zip((jnp.asarray(part) for part in parts), runs, sizes, strict=True)
-        flat = [(x, x.shape[: x.ndim - len(each)], each, size) for x, each, size in whole]
-        return jnp.concatenate([jnp.broadcast_to(x, (*own, *e)).reshape(*own, n) for x, own, e, n in flat], axis=-1)
-
-    results = _kernel.bind(
-        *(joined(parts) for parts in zip(*several, strict=True)), **{**params[0], "runs": (sum(sizes),)}
-    )
-    split = [jnp.split(x, np.cumsum(sizes)[:-1], axis=-1) for x in results]
-    return [[x[i].reshape(*x[i].shape[:-1], *each) for x in split] for i, each in enumerate(runs)]
 
 
 class Pick(Protocol):

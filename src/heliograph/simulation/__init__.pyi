@@ -20,6 +20,7 @@ from .over_runs import (
 )
 from .reducer import (
     AbstractReducer as AbstractReducer,
+    OfStep as OfStep,
     Trajectories as Trajectories,
 )
 from .stepping import (

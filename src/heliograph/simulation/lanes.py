@@ -24,6 +24,11 @@ WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs and a carry -> carry, what is kept
 
 
+def one_processor() -> bool:
+    """Whether JAX sees nothing but a processor."""
+    return len(jax.devices()) == 1 and jax.default_backend() == "cpu"
+
+
 class Lanes:
     """The carries of all lanes, and how to advance them over the blocks of a chunk.
 

@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 
+from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_count, fail, shown
 from heliograph.numerics.compiler import fully_optimised
 from heliograph.numerics.float64 import to_numpy
@@ -19,8 +20,9 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
 
     The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
-    and its shapes, so define it once. NumPy arrays come back. `width` runs are computed side by side, and each core
-    takes its share of the runs.
+    and its shapes, so define it once. NumPy arrays come back, and each core takes its share of the runs. Native code
+    computes them, or XLA, `width` runs side by side, what native code does not take (`heliograph.codegen.engine_of`
+    says which).
 
     Raises:
         ValueError: no arrays, or arrays with different numbers of runs.
@@ -31,6 +33,12 @@ def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WID
     values = [_numbers(a) for a in arrays]
     if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
         raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
+    choice = chosen(function, values, [True] * len(values))
+    return choice.results() if choice.code is not None else _by_xla(function, values, width)
+
+
+def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
+    """The same as a program of XLA, `width` runs side by side."""
     runs, cores = len(values[0]), os.cpu_count() or 1
     width = min(width, runs)
     share = -(-runs // (width * cores))  # blocks of each core

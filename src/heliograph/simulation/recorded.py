@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
@@ -98,24 +99,31 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
     def grouped() -> tuple[np.ndarray, ...]:
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
-    found = to_numpy(_run_filters(*rest, grouped(), False))
+    found = _filtered(*rest, grouped(), False)
     if not any_implausible(found):
         said = doubts(network, found, {})
     else:
-        found = to_numpy(_run_filters(*rest, grouped(), True))
+        found = _filtered(*rest, grouped(), True)
         refused = refused_rows(network, found)
         said = doubts(network, found, refused)
         for name, rows in refused.items():
             z[name] = z[name].copy()
             z[name][list(rows)] = np.nan
-        again = to_numpy(_run_filters(*rest, grouped(), False))
-        found = to_numpy(_run_filters(*rest, grouped(), True)) if any_implausible(again) else again
+        again = _filtered(*rest, grouped(), False)
+        found = _filtered(*rest, grouped(), True) if any_implausible(again) else again
     for line in said:
         warnings.warn(line, stacklevel=3)
     return {name: part for name, part in found.items() if not name.startswith("judged")}
 
 
-@quickly_compiled
+def _filtered(*arguments: PyTree) -> PyTree:
+    """Results of `_run_filters` as NumPy arrays, by native code where that takes the filters."""
+    choice = chosen(_run_filters, arguments, [False] * len(arguments))
+    if choice.code is None:
+        return to_numpy(_by_xla(*arguments))
+    return jax.tree.map(lambda leaf: leaf[0], choice.results())
+
+
 def _run_filters(
     filters: AllFilters, later: Smoother | None, u: np.ndarray, arrivals: dict[str, Drawn], z: tuple[np.ndarray, ...],
     without: bool,
@@ -132,3 +140,6 @@ def _run_filters(
     found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
     judged = {name: found.pop(name) for name in ("judged", "judged_centrally")}
     return (found if later is None else one_run(later.both, found)) | judged
+
+
+_by_xla = quickly_compiled(_run_filters)

@@ -1,8 +1,8 @@
 """What is kept of simulated runs: reduced block by block inside the compiled scan."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Generic, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,17 @@ from heliograph.simulation.network import Network
 from heliograph.simulation.record import Record
 
 Result = TypeVar("Result")
+
+
+class OfStep(NamedTuple):
+    """What is kept of one step of one run: what is summed over runs, in which runs it was ever so, what is collected.
+
+    Numbers, truths, anything; each step's results are stacked, and of `ever` there is one for all steps.
+    """
+
+    sums: PyTree = ()
+    ever: PyTree = ()
+    collected: PyTree = ()
 
 
 @readable
@@ -37,8 +48,26 @@ class AbstractReducer(Module, Generic[Result]):
         """Next carry and collected part of a block, inside the compiled scan; runs that are not valid are padding."""
         raise NotImplementedError
 
+    def of_step(self, step: PyTree) -> OfStep:
+        """What is kept of one step of one run, for native code, which has no blocks.
+
+        `step` is as a block without its axes of runs and time. A reducer that has none is computed by XLA.
+        """
+        raise NotImplementedError
+
+    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
+        """The carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
+
+        `common` says of each part whether it is the same in all runs: it stands in the sums as of one run, (time, ...).
+        """
+        return ()
+
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
         """Make the result; collected parts are joined along the run axis, without padding."""
+        raise NotImplementedError
+
+    def joined(self, results: Sequence[Result], network: Network) -> Result:
+        """The result of a network from those of its parts, each of some of its nodes with the same plant and runs."""
         raise NotImplementedError
 
     def beside(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
@@ -61,10 +90,24 @@ class Trajectories(AbstractReducer[Record]):
         """Collect the block; each run gets its copy of what they share."""
         return carry, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), batch)
 
+    def of_step(self, step: PyTree) -> OfStep:
+        """All of it."""
+        return OfStep(collected=step)
+
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Record:
         """Make the record; its time is the step, starting at 1."""
         time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
         return trajectories_record(network, collected, time)
+
+    def joined(self, results: Sequence[Record], network: Network) -> Record:
+        """All nodes, in the network's order."""
+        measurements = {name: z for one in results for name, z in one.measurements.items()}
+        estimates = {name: filters for one in results for name, filters in one.estimates.items()}
+        return replace(
+            results[0],
+            measurements={name: measurements[name] for name in network.names},
+            estimates={name: estimates[name] for name in network.names},
+        )
 
     def beside(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
         """As `Record.smoothed`, for the last steps if there are fewer."""

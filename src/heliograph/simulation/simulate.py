@@ -18,7 +18,8 @@ from heliograph.numerics.module import Module
 from heliograph.simulation.air import air_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.given import inputs_of, key_of
-from heliograph.simulation.lanes import BLOCK, Lanes
+from heliograph.simulation.lanes import BLOCK, Lanes, one_processor
+from heliograph.simulation.native_runs import natively
 from heliograph.simulation.network import Network, lowered
 from heliograph.simulation.record import Record
 from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories
@@ -111,6 +112,11 @@ def monte_carlo(
         raise fail("precision", f"one of {', '.join(get_args(Precision))}", shown(precision))
     single = precision == "float32"
     part = None if smooth is None else smoothed_part(network, smooth, horizon)
+    if not single and one_processor():
+        any_reducer: AbstractReducer[PyTree] = reducer
+        made: Record | Result | None = natively(network, u, base, any_reducer, first_run, runs, chunk, progress, part)
+        if made is not None:
+            return made
     filters = AllFilters(network, part and part.kinds)
     world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
     both: Beside[PyTree] = Beside(reducer)

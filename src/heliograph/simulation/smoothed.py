@@ -23,7 +23,7 @@ from heliograph.simulation.by_run import each_run
 from heliograph.simulation.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
 from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories, trajectories_record
+from heliograph.simulation.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.consistency import surprise_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -203,6 +203,17 @@ class Beside(AbstractReducer[Result]):
 
         surprise = jax.tree.map(added, surprise, batch["surprise"])
         return (filtered, smoothed, surprise), (kept, kept_later)
+
+    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
+        """Both, of pairs; and surprise."""
+        filtered, smoothed = (
+            self.reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count)
+            for i in (0, 1)
+        )
+        surprise = jax.tree.map(
+            lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
+        )
+        return filtered, smoothed, surprise
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
         """The filtered one alone; `finished` makes both."""

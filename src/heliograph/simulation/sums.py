@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from operator import itemgetter
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,7 +21,7 @@ from heliograph.simulation.by_name import by_name, uplinks_by_name
 from heliograph.simulation.lanes import BLOCK
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer
+from heliograph.simulation.reducer import AbstractReducer, OfStep
 from heliograph.simulation.statistics import BATCHES, ErrorStatistics
 from heliograph.simulation.statistics_by_name import StatisticsByName
 from heliograph.simulation.uplinks import Uplink
@@ -98,6 +99,62 @@ class Statistics(AbstractReducer[StatisticsByName]):
             uplinks=jax.tree.map(lambda s, x: s + jnp.tensordot(counted, x, axes=1), carry.uplinks, sent),
         ), ()
 
+    def of_step(self, step: PyTree) -> OfStep:
+        """Products of errors, e' B^-1 e, claimed covariances, and where there is no estimate."""
+        truth = jnp.asarray(step["truth"])
+        parts = [*step["estimates"], *(step["fused"][name] for name in sorted(step["fused"]))]
+        n = len(truth)
+        means = [jnp.asarray(part.mean).reshape(-1, n).T for part in parts]
+        claimed = [jnp.moveaxis(jnp.asarray(part.covariance).reshape(-1, n, n), 0, -1) for part in parts]
+        errors = [truth[:, None] - mean for mean in means]
+        nees = [squared_distance(b, e, truth[:, None]) for b, e in zip(claimed, errors, strict=True)]
+        joined, distance = jnp.concatenate(errors, axis=1), jnp.concatenate(nees)
+        finite = jnp.all(jnp.isfinite(joined), axis=0)
+        bad = jnp.stack([~finite, jnp.isnan(distance)])
+        rows, columns = np.triu_indices(n)
+        sums = {
+            "pairs": jnp.stack([joined[i] * joined[j] for i, j in zip(rows, columns, strict=True)], axis=-1),
+            "nees": distance,
+            "claimed": tuple(
+                jnp.stack([b[i, j] for i, j in zip(rows, columns, strict=True)], axis=-1) for b in claimed
+            ),
+            "failed": bad,
+            "uplinks": step["uplinks"],
+        }
+        return OfStep(sums, bad)
+
+    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
+        """The same sums, with the covariances that all runs share last."""
+        shared = common.sums["claimed"]
+        found, ever = jax.tree.map(
+            lambda leaf, same: leaf[..., None] * count if same else leaf,
+            (sums.sums | {"claimed": ()}, sums.ever),
+            (common.sums | {"claimed": ()}, common.ever),
+        )
+        claimed = sums.sums["claimed"]
+        order = tuple(sorted(range(len(shared)), key=shared.__getitem__))
+        sizes = [part.shape[1] for part in claimed]
+        places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
+        into = np.concatenate([places[i] for i in order])
+        steps, _, pairs, _ = found["pairs"].shape
+        each: Any = count
+        mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
+        others: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
+        own: Any = np.concatenate(mine, axis=1)
+        common_to_all: Any = np.concatenate(others, axis=1)
+        return Sums(
+            count=each,
+            pairs=found["pairs"][:, into],
+            nees=found["nees"][:, into],
+            claimed=own,
+            shared=common_to_all,
+            failed=np.sum(found["failed"], axis=-1)[:, :, into],
+            failed_runs=np.sum(ever, axis=-1)[:, None, into],
+            uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), found["uplinks"]),
+            order=order,
+            own=shared.count(False),
+        )
+
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
         """Statistics by node and filter."""
         count, parts = _split(carry, [(len(f), len(network.groups[g])) for g, f in network.kinds])
@@ -115,6 +172,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
             means = Uplink(uplink.nodes, uplink.saturated / fused.runs, uplink.symbols / fused.runs)
             result[FUSED][name] = replace(fused, uplink=means)
         return result
+
+    def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
+        """All nodes, in the network's order."""
+        found = {name: filters for one in results for name, filters in one.items()}
+        return StatisticsByName({name: found[name] for name in network.names}, network.states)
 
     def beside(
         self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]

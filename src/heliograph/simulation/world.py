@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from heliograph.codegen.arrived import arrived
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
@@ -32,6 +33,7 @@ class World(Module):
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
         air, z = self.air.hear(air, x, u, key, k)
+        z = tuple(arrived(one) if whole else one for one, whole in zip(z, self.filters.complete, strict=True))
         drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
         states, found = self.filters.step(states, z, u, k, drawn)
         after = x, self.air.told(air, found["estimates"]), states

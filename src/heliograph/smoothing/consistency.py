@@ -1,8 +1,8 @@
 """Whether a filter is consistent, by its own innovations: smoothing one that is not makes it worse."""
 
 import warnings
+from itertools import pairwise
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,11 +18,12 @@ EXCESS = 1.05  # times what is expected: less does little harm
 @in_float64
 def surprise_sums(steps: AbstractRetained) -> Float[Array, "5"]:
     """Of the blocks of one run, with surprise s = sum e' S^-1 e and h components: sums of s, h, s^2, s h, h^2."""
-    time = len(steps.mean)
-    block = np.arange(time) * min(BLOCKS, time) // time
     if steps.surprise is None or steps.heard is None:
         return jnp.zeros(5)
-    s, h = (jax.ops.segment_sum(part, block, min(BLOCKS, time)) for part in (steps.surprise, steps.heard))
+    time = len(steps.mean)
+    count = min(BLOCKS, time)
+    edges = [-(-time * i // count) for i in range(count + 1)]
+    s, h = (jnp.stack([jnp.sum(part[a:b]) for a, b in pairwise(edges)]) for part in (steps.surprise, steps.heard))
     return jnp.stack([jnp.sum(part) for part in (s, h, s * s, s * h, h * h)])
 
 

@@ -1,0 +1,88 @@
+"""A compiled program over consecutive runs: some results summed over them, others given run by run."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.codegen.compiled import aligned, best_width, pointers_to
+from heliograph.codegen.folding import DTYPES
+from heliograph.codegen.llvm_module import written
+from heliograph.codegen.machine import Machine, features
+from heliograph.codegen.program import Program
+from heliograph.codegen.summed import Summed, row_length
+
+
+class Accumulated:
+    """Code of a program whose one argument that differs between runs is the run's number.
+
+    `common` says of each result, leaf by leaf, whether all runs share it, and `summed` whether it is summed.
+    """
+
+    def __init__(self, program: Program, summed: Summed):
+        differs = [n == summed.number for n in range(len(program.inputs))]
+        self.width, self.summed, self.inputs = best_width(), summed, program.inputs
+        self.code = written(program, differs, self.width, features()[2], summed=summed)
+        self.common = self.code.common
+        self.blocks = Machine(self.code.blocks)
+        self.once = None if self.code.once is None else Machine(self.code.once)
+
+    def begin(self, arguments: Sequence[Any]) -> "Begun":
+        """What all runs share, computed from the arguments but for the run's number."""
+        return Begun(self, arguments)
+
+
+class Begun:
+    """A program with its arguments; `shared` holds the results that all runs share, None in place of others."""
+
+    def __init__(self, program: Accumulated, arguments: Sequence[Any]):
+        self.program = program
+        others = (b for n, b in enumerate(program.inputs) if n != program.summed.number)
+        self.arguments = [np.ascontiguousarray(x, dtype=DTYPES[b.type]) for x, b in zip(arguments, others, strict=True)]
+        self.memory = aligned(program.code.shared)
+        self.shared: list[np.ndarray | None] = [None] * len(program.common)
+        if program.once is not None:
+            number, results = np.zeros(1, np.uint32), [np.empty(0)] * len(program.common)
+            pointers = self._pointers(number, results)
+            program.once.run(pointers.ctypes.data, 0, 0, 1, 1)
+        for n, (buffer, place) in enumerate(zip(program.code.outputs, program.code.places, strict=True)):
+            if program.common[n]:
+                kind = np.dtype(DTYPES[buffer.type])
+                held = self.memory[place : place + buffer.size * kind.itemsize]
+                self.shared[n] = held.view(kind).reshape(buffer.shape).copy()
+
+    def zeros(self) -> list[np.ndarray]:
+        """Sums over no runs, of each result that is summed: (..., batch), rows as `folded` takes them."""
+        length = row_length(self.program.width, self.program.summed.batches)
+        return [np.zeros((*b.shape, length)) for b, s in self._outputs() if s]
+
+    def add(self, runs: np.ndarray, sums: Sequence[np.ndarray]) -> list[np.ndarray | None]:
+        """Add runs to the sums; the other results of each, (run, ...), None in place of what is shared or summed.
+
+        Runs come in blocks of consecutive ones, each as many as fit the code's width several times.
+        """
+        numbers = np.ascontiguousarray(runs, dtype=np.uint32)
+        totals = iter(sums)
+        results: list[np.ndarray] = []
+        given: list[np.ndarray | None] = []
+        for (buffer, summed), common in zip(self._outputs(), self.program.common, strict=True):
+            if summed:
+                results.append(next(totals))
+            else:
+                shape = (0,) if common else (len(numbers), *buffer.shape)
+                results.append(np.empty(shape, DTYPES[buffer.type]))
+            given.append(None if summed or common else results[-1])
+        if len(numbers) and not all(self.program.common):
+            scratch = aligned(self.program.code.scratch)
+            pointers = self._pointers(numbers, results)
+            blocks = -(-len(numbers) // self.program.width)
+            self.program.blocks.run(pointers.ctypes.data, scratch.ctypes.data, 0, blocks, len(numbers))
+        return given
+
+    def _outputs(self) -> list[tuple[Any, bool]]:
+        return list(zip(self.program.code.outputs, self.program.summed.outputs, strict=True))
+
+    def _pointers(self, numbers: np.ndarray, results: Sequence[np.ndarray]) -> np.ndarray:
+        place = self.program.summed.number
+        inputs = [*self.arguments[:place], numbers, *self.arguments[place:]]
+        return pointers_to([*inputs, *self.program.code.tables, *results, self.memory])

@@ -1,0 +1,137 @@
+"""A function of one run, compiled for many: called on arrays with a leading axis of runs, on all cores."""
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from types import MappingProxyType
+from typing import Any
+
+import jax
+import numpy as np
+
+from heliograph.codegen.folding import DTYPES
+from heliograph.codegen.llvm_module import LINE, Code, written
+from heliograph.codegen.machine import Machine, features
+from heliograph.codegen.program import Program, lower
+from heliograph.numerics.types import PyTree
+
+LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
+SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
+
+
+class Compiled:
+    """Code for blocks of `width` runs.
+
+    `differs` says of each argument, leaf by leaf, whether each run has its own, along a leading axis, or all runs share
+    it. A result is the same bits whatever the width and the number of cores.
+    """
+
+    def __init__(self, program: Program, differs: Sequence[bool], width: int | None = None):
+        self.width = width or best_width()
+        self.differs = list(differs)
+        self.types = [DTYPES[b.type] for b in program.inputs]
+        self.shapes = [b.shape for b in program.inputs]
+        self.tree = program.tree
+        self.code: Code = written(program, self.differs, self.width, features()[2])
+        self.blocks = Machine(self.code.blocks)
+        self.once = None if self.code.once is None else Machine(self.code.once)
+
+    def __call__(self, *leaves: Any, cores: int | None = None) -> PyTree:
+        """The results of all runs, with a leading axis of runs."""
+        arrays = [np.ascontiguousarray(x, dtype=t) for x, t in zip(leaves, self.types, strict=True)]
+        runs = next((len(x) for x, d in zip(arrays, self.differs, strict=True) if d), 1)
+        code = self.code
+        outputs = [np.empty((runs, *b.shape), DTYPES[b.type]) for b in code.outputs]
+        shared = aligned(code.shared)
+        pointers = pointers_to([*arrays, *code.tables, *outputs, shared])
+        if self.once is not None:
+            self.once.run(pointers.ctypes.data, 0, 0, 1, 1)
+            self._copy_common(outputs, shared)
+        if not all(code.common):
+            self._run(pointers, runs, cores or cpu_count())
+        return jax.tree.unflatten(self.tree, outputs)
+
+    def _run(self, pointers: np.ndarray, runs: int, cores: int) -> None:
+        blocks = -(-runs // self.width)
+        if cores == 1 or blocks * self.code.work < LITTLE:
+            self._blocks(pointers, 0, blocks, runs)
+            return
+        share = -(-blocks // (cores * SHARES))
+        starts = range(0, blocks, share)
+        list(threads().map(lambda start: self._blocks(pointers, start, min(start + share, blocks), runs), starts))
+
+    def _blocks(self, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
+        """By this thread."""
+        scratch = aligned(self.code.scratch)
+        self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
+
+    def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
+        for array, common, place, buffer in zip(
+            outputs, self.code.common, self.code.places, self.code.outputs, strict=True
+        ):
+            if common:
+                size = buffer.size * array.itemsize
+                array[...] = shared[place : place + size].view(array.dtype).reshape(buffer.shape)
+
+
+class Alone:
+    """Code for one run: memory of its own for arguments and results, which a call reads and writes in place.
+
+    `in_place` says which results, leaf by leaf, take the place of which arguments, such as a filter's state.
+    """
+
+    def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
+        code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
+        self.code, self.machine, self.tree = code, Machine(code.blocks), program.tree
+        self.inputs = [np.zeros(b.shape, DTYPES[b.type]) for b in program.inputs]
+        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in code.outputs]
+        self.outputs = [self.inputs[in_place[k]] if k in in_place else x for k, x in enumerate(fresh)]
+        self.scratch = aligned(code.scratch)
+        self.pointers = pointers_to([*self.inputs, *code.tables, *self.outputs, aligned(code.shared)])
+        self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
+
+    def __call__(self) -> None:
+        """Compute `outputs` of `inputs`."""
+        run, pointers, scratch = self._call
+        run(pointers, scratch, 0, 1, 1)
+
+
+def compile(function: Callable[..., PyTree], *examples: PyTree, shared: Sequence[int] = ()) -> Compiled:
+    """Compile a function of one run's arguments, of the shapes of these, for many runs.
+
+    The arguments whose numbers stand in `shared` are the same in all runs and have no axis of runs.
+
+    Raises:
+        Unsupported: an operation that is not compiled here; the caller runs it another way.
+    """
+    differs = [n not in shared for n, example in enumerate(examples) for _ in jax.tree.leaves(example)]
+    return Compiled(lower(function, *examples), differs)
+
+
+def best_width() -> int:
+    """Runs of a block: one vector of the widest processors, two of others; more only spill."""
+    return 8
+
+
+def pointers_to(arrays: Sequence[np.ndarray]) -> np.ndarray:
+    """Their addresses in memory."""
+    return np.array([x.__array_interface__["data"][0] for x in arrays], dtype=np.uint64)
+
+
+def aligned(size: int) -> np.ndarray:
+    """Memory of so many bytes whose address is a multiple of a line's."""
+    whole = np.zeros(size + LINE, np.uint8)
+    start = -whole.ctypes.data % LINE
+    return whole[start : start + size]
+
+
+def cpu_count() -> int:
+    """Cores of this machine."""
+    return os.cpu_count() or 1
+
+
+@cache
+def threads() -> ThreadPoolExecutor:
+    """One for each core, of the whole process."""
+    return ThreadPoolExecutor(cpu_count())

@@ -1,0 +1,156 @@
+"""Which engine computes a function of one run: native code where it takes the program, else XLA.
+
+The environment variable HELIOGRAPH_ENGINE forces one: "native", which refuses what it does not take, or "xla".
+"""
+
+import os
+import warnings
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from heliograph.codegen.compiled import Compiled
+from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.lowering import like
+from heliograph.codegen.machine import target
+from heliograph.codegen.program import lower
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import PyTree
+
+Code = TypeVar("Code")
+
+SETTING = "HELIOGRAPH_ENGINE"
+COMPILED = 256  # functions whose code is held at once
+ENGINES = ("native", "xla")
+
+
+class Choice(NamedTuple):
+    """The code of a function, or why XLA computes it; `arrays` are its arguments' and those that it holds itself."""
+
+    code: Compiled | None
+    why: str
+    arrays: tuple[Any, ...] = ()
+
+    def results(self) -> PyTree:
+        """Run the code on the arrays."""
+        assert self.code is not None
+        return self.code(*self.arrays)
+
+
+def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
+    """Say which engine computes a function of one run over runs of these arguments, and why.
+
+    "native: 1902 operations", or "xla: " and the operation that native code does not take, with its line. The
+    environment variable HELIOGRAPH_ENGINE forces "native" or "xla".
+
+    Raises:
+        ValueError: an engine that is none.
+    """
+    choice = chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments))
+    return f"xla: {choice.why}" if choice.code is None else f"native: {choice.code.code.operations} operations"
+
+
+def chosen(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
+    """The code of a function of one run for arguments like these, made once; or why there is none.
+
+    Each argument differs between runs, and its arrays have a leading axis of runs, or is the same in all.
+
+    Raises:
+        ValueError: an engine that is none, or native code asked for of a program that it does not take.
+    """
+    engine = setting()
+    if engine == "xla":
+        return Choice(None, f"{SETTING} is set to it")
+    choice = _available() or _cached(function, arguments, differs)
+    if choice.code is None and engine == "native":
+        raise fail("native code", "a program of operations that it takes", choice.why)
+    return choice
+
+
+def setting() -> str:
+    """The engine that is forced, "" where none is.
+
+    Raises:
+        ValueError: an engine that is none.
+    """
+    engine = os.environ.get(SETTING, "")
+    if engine not in ("", *ENGINES):
+        raise fail(SETTING, " or ".join(ENGINES), engine)
+    return engine
+
+
+def attempted(make: Callable[[], Code]) -> Code | None:
+    """Native code as it is made, None where XLA is to compute instead.
+
+    Raises:
+        ValueError: an engine that is none, or native code asked for of a program that it does not take.
+    """
+    engine = setting()
+    if engine == "xla" or _available() is not None:
+        return None
+    try:
+        return make()
+    except Unsupported as found:
+        if engine == "native":
+            raise fail("native code", "a program of operations that it takes", str(found)) from None
+        return None
+
+
+@cache
+def _available() -> Choice | None:
+    """None where this machine has native code; it is said once where it has not."""
+    try:
+        target()
+    except RuntimeError as error:
+        warnings.warn(f"native code: expected a processor that LLVM knows, got {error}; XLA computes", stacklevel=4)
+        return Choice(None, "LLVM does not know this processor")
+    return None
+
+
+def _cached(function: Callable[..., PyTree], arguments: Sequence[PyTree], differs: Sequence[bool]) -> Choice:
+    """Code for the structure of a function and its arguments, which may be objects that hold arrays."""
+    leaves, form = jax.tree.flatten((function, *arguments))
+    apart = [False] * len(jax.tree.leaves(function))
+    apart += [d for a, d in zip(arguments, differs, strict=True) for _ in jax.tree.leaves(a)]
+    is_array = [isinstance(x, np.ndarray | jax.Array) for x in leaves]
+    arrays = tuple(x for x, a in zip(leaves, is_array, strict=True) if a)
+    kinds = tuple(
+        _Array(x.shape[1:] if d else x.shape, x.dtype, d) if a else x
+        for x, a, d in zip(leaves, is_array, apart, strict=True)
+    )
+    try:
+        code, why = _made(form, kinds)
+    except TypeError as error:
+        if "unhashable" not in str(error):
+            raise
+        return Choice(None, f"the function holds what cannot be told from another: {error}")
+    return Choice(code, why, arrays)
+
+
+class _Array(NamedTuple):
+    """One run's array."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    differs: bool
+
+
+@lru_cache(COMPILED)
+def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
+    """Code for one structure, and the shapes and types of its arrays."""
+    arrays = [k for k in kinds if isinstance(k, _Array)]
+
+    def call(*values: Any) -> PyTree:
+        each = iter(values)
+        leaves = [next(each) if isinstance(k, _Array) else k for k in kinds]
+        function, *arguments = jax.tree.unflatten(form, leaves)
+        return function(*arguments)
+
+    try:
+        program = lower(call, *(like(k.shape, k.dtype) for k in arrays))
+        return Compiled(program, [k.differs for k in arrays]), ""
+    except Unsupported as found:
+        return None, str(found)

@@ -1,0 +1,226 @@
+"""What is known of a scalar operation before any data: numbers of numbers, neutral elements, one operation for two.
+
+A product with zero is zero only where the other factor is known to be finite: data may be NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from heliograph.codegen.graph import Graph, Node, Type
+
+COMMUTATIVE = frozenset(("add", "mul", "max", "min", "and", "or", "xor", "eq", "ne"))
+DTYPES: dict[str, Any] = {
+    "f64": np.float64,
+    "bool": np.bool_,
+    "i32": np.int32,
+    "i64": np.int64,
+    "u32": np.uint32,
+    "u64": np.uint64,
+}
+
+
+def _shift_left(a: Any, b: Any) -> Any:
+    return np.left_shift(a, b) if b < 8 * a.itemsize else a * 0
+
+
+def _shift_right(a: Any, b: Any) -> Any:
+    return np.right_shift(a, b) if b < 8 * a.itemsize else a * 0
+
+
+def _divided(a: Any, b: Any) -> Any:
+    return np.divide(a, b) if isinstance(a, np.floating) else type(a)(math.trunc(int(a) / int(b)) if b else -1)
+
+
+# Operations whose numbers of known numbers are computed here; others wait for the run.
+EVALUATED: dict[str, Callable[..., Any]] = {
+    "add": np.add, "sub": np.subtract, "mul": np.multiply, "div": _divided, "rem": np.fmod, "neg": np.negative,
+    "abs": np.abs, "sqrt": np.sqrt, "exp": np.exp, "log": np.log, "log1p": np.log1p, "expm1": np.expm1,
+    "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "atan2": np.arctan2, "pow": np.power,
+    "floor": np.floor, "round_even": np.rint, "ceil": np.ceil, "sign": np.sign, "is_finite": np.isfinite,
+    "max": np.maximum, "min": np.minimum,
+    "eq": np.equal, "ne": np.not_equal, "lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal,
+    "and": np.bitwise_and, "or": np.bitwise_or, "xor": np.bitwise_xor, "not": np.invert,
+    "shift_left": _shift_left, "shift_right": _shift_right,
+}  # fmt: skip
+
+
+def folded(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    """A node that is there already, or a simpler one, of the same number; None where nothing is known."""
+    if all(a.op == "constant" for a in args):
+        return _evaluated(graph, op, type, args)
+    rule = SIMPLER.get(op)
+    return None if rule is None else rule(graph, type, *args)
+
+
+def _evaluated(graph: Graph, op: str, type: Type, args: tuple[Node, ...]) -> Node | None:
+    numbers = [DTYPES[a.type](a.value) for a in args]
+    with np.errstate(all="ignore"):
+        if op == "select":
+            return args[1] if numbers[0] else args[2]
+        if op == "convert":
+            value = numbers[0].astype(DTYPES[type])
+        elif op == "bitcast":
+            value = numbers[0].view(DTYPES[type])
+        elif op in EVALUATED:
+            value = EVALUATED[op](*numbers)
+        else:
+            return None
+    return graph.constant(value.item(), type)
+
+
+def _is(node: Node, number: float) -> bool:
+    return bool(node.op == "constant" and node.value == number)
+
+
+def is_finite(node: Node) -> bool:
+    """Whether a number is finite whatever the data."""
+    if node.type != "f64" or (node.op == "constant" and math.isfinite(node.value)):
+        return True
+    return node.op == "convert" or (node.op == "select" and all(is_finite(a) for a in node.args[1:]))
+
+
+def _add(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if _is(a, 0):
+        return b
+    if _is(b, 0):
+        return a
+    if type == "f64" and b.op == "neg":
+        return graph.node("sub", type, a, b.args[0])
+    if type == "f64" and a.op == "neg":
+        return graph.node("sub", type, b, a.args[0])
+    return None
+
+
+def _sub(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if _is(b, 0):
+        return a
+    if type == "f64" and _is(a, 0):
+        return graph.node("neg", type, b)
+    if type == "f64" and b.op == "neg":
+        return graph.node("add", type, a, b.args[0])
+    return None
+
+
+def _mul(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op != "constant":
+        return None
+    if a.value == 1:
+        return b
+    if a.value == 0 and is_finite(b):
+        return a
+    if type == "f64" and a.value == -1:
+        return graph.node("neg", type, b)
+    if a.value == 0.5 and b.op == "add" and b.args[0] is b.args[1]:
+        return b.args[0]
+    if a.value == -0.0 or b.op != "neg":
+        return None
+    return graph.node("mul", type, graph.constant(-a.value, type), b.args[0])
+
+
+def _div(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    """By a power of two as the exact product with its reciprocal."""
+    if type != "f64" or b.op != "constant" or not b.value or not math.isfinite(b.value):
+        return None
+    if abs(math.frexp(b.value)[0]) != 0.5 or not 1e-300 < abs(b.value) < 1e300:
+        return None
+    return graph.node("mul", type, a, graph.constant(1 / b.value, type))
+
+
+def _neg(graph: Graph, type: Type, a: Node) -> Node | None:
+    if a.op == "neg":
+        return a.args[0]
+    return graph.node("sub", type, a.args[1], a.args[0]) if a.op == "sub" and type == "f64" else None
+
+
+def _and(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return b if a.value else a
+    return a if a is b else None
+
+
+def _or(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and type == "bool":
+        return a if a.value else b
+    if a.op == "constant" and a.value == 0:
+        return b
+    return a if a is b else None
+
+
+def _xor(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    if b.op == "constant":
+        a, b = b, a
+    if a.op == "constant" and not a.value:
+        return b
+    return graph.node("not", type, b) if a.op == "constant" and type == "bool" else None
+
+
+def _not(graph: Graph, type: Type, a: Node) -> Node | None:
+    return a.args[0] if a.op == "not" else None
+
+
+def _shift(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    return a if _is(b, 0) else None
+
+
+def _same(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+    return a if a is b else None
+
+
+def _select(graph: Graph, type: Type, condition: Node, a: Node, b: Node) -> Node | None:
+    if a is b:
+        return a
+    if condition.op == "constant":
+        return a if condition.value else b
+    if condition.op == "not":
+        return graph.node("select", type, condition.args[0], b, a)
+    if a.op == "select" and a.args[0] is condition:
+        return graph.node("select", type, condition, a.args[1], b)
+    if b.op == "select" and b.args[0] is condition:
+        return graph.node("select", type, condition, a, b.args[2])
+    if type == "bool" and a.op == "constant" and b.op == "constant":
+        return condition if a.value else graph.node("not", "bool", condition)
+    return None
+
+
+def _compare(op: str) -> Callable[..., Node | None]:
+    def rule(graph: Graph, type: Type, a: Node, b: Node) -> Node | None:
+        """Of a flag that was made a number, or of a flag and a known one: the flag itself; of a number and itself."""
+        if a is b and (a.type != "f64" or a in graph.numbers or is_finite(a)):
+            return graph.constant(op == "eq", "bool")
+        if a.op == "constant":
+            a, b = b, a
+        if b.op != "constant":
+            return None
+        flag = a.args[0] if a.op == "convert" and a.args[0].type == "bool" else a
+        if flag.type != "bool" or b.value not in (0, 1):
+            return None
+        return flag if bool(b.value) == (op == "eq") else graph.node("not", "bool", flag)
+
+    return rule
+
+
+def _convert(graph: Graph, type: Type, a: Node) -> Node | None:
+    if a.type == type:
+        return a
+    if type == "bool":
+        return graph.node("ne", "bool", a, graph.constant(0.0 if a.type == "f64" else 0, a.type))
+    return None
+
+
+SIMPLER: dict[str, Callable[..., Node | None]] = {
+    "add": _add, "sub": _sub, "mul": _mul, "div": _div, "neg": _neg, "and": _and, "or": _or, "xor": _xor, "not": _not,
+    "shift_left": _shift, "shift_right": _shift, "max": _same, "min": _same, "select": _select, "eq": _compare("eq"),
+    "ne": _compare("ne"), "convert": _convert,
+}  # fmt: skip

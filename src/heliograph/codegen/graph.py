@@ -1,0 +1,247 @@
+"""A program of scalar operations: nodes in blocks, loops and guarded blocks between them, arrays in memory.
+
+A node is one number of every run. Equal expressions are one node, known numbers are folded when a node is made
+(`folding`), and a node stands in the outermost block in which all its arguments stand: what a loop does not change is
+computed before it.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from heliograph.codegen.folding import COMMUTATIVE, folded
+
+Type = Literal["f64", "bool", "i32", "i64", "u32", "u64"]
+TYPES: dict[str, Type] = {
+    "float64": "f64",
+    "bool": "bool",
+    "int32": "i32",
+    "int64": "i64",
+    "uint32": "u32",
+    "uint64": "u64",
+}
+MOST = 400_000  # nodes made, constants and what is dropped again among them
+Number = float | int | bool
+
+
+class Unsupported(Exception):  # noqa: N818
+    """A program that is not compiled here: which operation, and where in the program."""
+
+    def __init__(self, operation: str, place: str = ""):
+        super().__init__(f"{operation}{f' at {place}' if place else ''}")
+        self.operation, self.place = operation, place
+
+
+class Node:
+    """One scalar operation of some nodes.
+
+    `value` is what is known of it beforehand: a constant's number, a parameter's or result's (loop, place), a load's
+    (buffer, offset, strides). `serial` counts nodes in the order in which they were made.
+    """
+
+    __slots__ = ("args", "block", "op", "serial", "type", "value")
+
+    def __init__(self, op: str, type: Type, args: tuple["Node", ...], block: "Block", value: Any, serial: int):
+        self.op, self.type, self.args, self.block, self.value, self.serial = op, type, args, block, value, serial
+
+    def __repr__(self) -> str:
+        if self.op == "constant":
+            return str(self.value)
+        return f"%{self.serial}={self.op}({', '.join(f'%{a.serial}' for a in self.args)})"
+
+
+class Key:
+    """A key of random numbers: its two words, of type u32."""
+
+    __slots__ = ("first", "second")
+
+    def __init__(self, first: Node, second: Node):
+        self.first, self.second = first, second
+
+
+class Block:
+    """Operations and statements in their order; nodes of the blocks around it may be used in it.
+
+    `owner`: the loop or guard whose block it is. `pinned`: what is computed here stays here, since it is computed only
+    where a run needs it.
+    """
+
+    __slots__ = ("depth", "items", "owner", "parent", "pinned", "seen")
+
+    def __init__(self, parent: "Block | None", pinned: bool = False):
+        self.parent, self.pinned = parent, pinned
+        self.owner: Loop | Guard | None = None
+        self.depth: int = 0 if parent is None else parent.depth + 1
+        self.items: list[Node | Loop | Guard | Store | Check] = []
+        self.seen: dict[Any, Node] = {}
+
+    def inwards(self) -> Iterator["Block"]:
+        """This block and those around it, outermost last."""
+        block: Block | None = self
+        while block is not None:
+            yield block
+            block = block.parent
+
+
+class Buffer:
+    """Numbers in memory, `size` of each run; a known table has the same ones in all runs.
+
+    `kind`: "input", "scratch" or "table". A buffer that the program itself fills is read after the statement of `block`
+    that fills it. One that lies `inside` another starts at a place of it.
+    """
+
+    __slots__ = ("block", "inside", "kind", "parts", "shape", "stores", "table", "type")
+
+    def __init__(self, kind: str, type: Type, shape: tuple[int, ...], block: Block, table: np.ndarray | None = None):
+        self.kind, self.type, self.shape, self.block, self.table = kind, type, shape, block, table
+        self.stores: list[Store] = []
+        self.inside: tuple[Buffer, int] | None = None
+        self.parts: list[Buffer] = []
+
+    def take_in(self, part: "Buffer", start: int) -> None:
+        """Have another buffer lie in this one from a place on."""
+        part.inside = self, start
+        self.parts.append(part)
+
+    @property
+    def owner(self) -> "tuple[Buffer, int]":
+        """The buffer whose memory this one is, and where in it this one starts."""
+        if self.inside is None:
+            return self, 0
+        whole, start = self.inside[0].owner
+        return whole, start + self.inside[1]
+
+    @property
+    def size(self) -> int:
+        """Numbers of one run."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+class Store:
+    """buffer[offset + sum strides * indices] = node."""
+
+    __slots__ = ("block", "buffer", "indices", "node", "offset", "strides")
+
+    def __init__(
+        self, block: Block, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]
+    ):
+        self.block, self.buffer, self.node, self.offset = block, buffer, node, offset
+        self.strides, self.indices = tuple(strides), tuple(indices)
+
+
+class Loop:
+    """A body that is repeated: `length` times, or while any run's condition holds (then `length` is None).
+
+    `parameters` stand for what is carried, `initial` and `following` for its numbers before and after a turn,
+    `results` for those after the last one. `counter` counts the turns from 0. `block` is where the loop stands.
+    """
+
+    __slots__ = ("block", "body", "condition", "counter", "following", "initial", "length", "parameters", "results")
+
+    def __init__(self, body: Block, length: int | None, initial: Sequence[Node]):
+        self.body, self.length, self.initial = body, length, list(initial)
+        self.block: Block = body.parent  # type: ignore[assignment]
+        body.owner = self
+        self.parameters: list[Node] = []
+        self.following: list[Node] = []
+        self.results: list[Node] = []
+        self.condition: Node | None = None
+        self.counter: Node | None = None
+
+
+class Check:
+    """The place in a loop's body where it ends unless some run's condition holds."""
+
+    __slots__ = ("loop",)
+
+    def __init__(self, loop: Loop):
+        self.loop = loop
+
+
+class Guard:
+    """A body that is computed only where `condition` holds for some run; `results` are its `values`, else zeros."""
+
+    __slots__ = ("block", "body", "condition", "results", "values")
+
+    def __init__(self, body: Block, condition: Node):
+        self.body, self.condition = body, condition
+        self.block: Block = body.parent  # type: ignore[assignment]
+        body.owner = self
+        self.values: list[Node] = []
+        self.results: list[Node] = []
+
+
+class Graph:
+    """A program under construction. Nodes are made in `current`, the innermost block that is open."""
+
+    def __init__(self) -> None:
+        self.top = Block(None)
+        self.current = self.top
+        self.serial = 0
+        self.numbers: set[Node] = set()  # known not to be NaN
+
+    def node(self, op: str, type: Type, *args: Node, value: Any = None) -> Node:
+        """The node of an operation: a known number, an older node that says the same, or a new one."""
+        simpler = folded(self, op, type, args)
+        if simpler is not None:
+            return simpler
+        if op in COMMUTATIVE and args[0].serial > args[1].serial:
+            args = (args[1], args[0])
+        return self.unfolded(op, type, args, value)
+
+    def unfolded(self, op: str, type: Type, args: tuple[Node, ...], value: Any = None) -> Node:
+        """The same as written."""
+        key = (op, type, args, value)
+        for block in self.current.inwards():
+            if key in block.seen:
+                return block.seen[key]
+        place = self._place(max((a.block.depth for a in args), default=0))
+        made = place.seen[key] = self.fresh(op, type, args, place, value)
+        place.items.append(made)
+        return made
+
+    def constant(self, value: Number, type: Type) -> Node:
+        """A known number."""
+        key = (type, value if value != 0 or type != "f64" else str(value))  # two zeros
+        known = self.top.seen.get(key)
+        if known is None:
+            known = self.top.seen[key] = self.fresh("constant", type, (), self.top, value)
+        return known
+
+    def fresh(self, op: str, type: Type, args: tuple[Node, ...], block: Block, value: Any) -> Node:
+        """A node that equals no other, in no block's list yet."""
+        self.serial += 1
+        if self.serial > MOST:
+            raise Unsupported(f"a program of more than {MOST} operations")
+        return Node(op, type, args, block, value, self.serial)
+
+    def load(self, buffer: Buffer, offset: int, strides: Sequence[int] = (), indices: Sequence[Node] = ()) -> Node:
+        """buffer[offset + sum strides * indices], read where the buffer is full."""
+        pairs = [(s, i) for s, i in zip(strides, indices, strict=True) if i.op != "constant"]
+        offset += sum(s * i.value for s, i in zip(strides, indices, strict=True) if i.op == "constant")
+        if buffer.table is not None and not pairs:
+            return self.constant(buffer.table.ravel()[offset].item(), buffer.type)
+        indices = tuple(i for _, i in pairs)
+        value = (buffer, offset, tuple(s for s, _ in pairs))
+        key = ("load", buffer.type, indices, value)
+        for block in self.current.inwards():
+            if key in block.seen:
+                return block.seen[key]
+        place = self._place(max((i.block.depth for i in indices), default=0), buffer.block.depth)
+        made = place.seen[key] = self.fresh("load", buffer.type, indices, place, value)
+        place.items.append(made)
+        return made
+
+    def store(self, buffer: Buffer, node: Node, offset: int, strides: Sequence[int], indices: Sequence[Node]) -> None:
+        """Have the open block write a number."""
+        written = Store(self.current, buffer, node, offset, strides, indices)
+        buffer.stores.append(written)
+        self.current.items.append(written)
+
+    def _place(self, *depths: int) -> Block:
+        """The outermost block, from the open one on, of a depth, unless a pinned one comes before."""
+        place, depth = self.current, max(depths)
+        while place.depth > depth and not place.pinned and place.parent is not None:
+            place = place.parent
+        return place

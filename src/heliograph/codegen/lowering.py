@@ -1,0 +1,145 @@
+"""From a traced function of one run to a graph of scalar operations.
+
+An array of the trace is a NumPy array of nodes (or of keys of random numbers), so that shape operations move
+references and cost nothing; or, where it is long, `InMemory`. What becomes of each operation of JAX stands in `RULES`,
+which the files of rules fill when they are imported.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Var
+
+from heliograph.codegen.graph import TYPES, Buffer, Graph, Key, Node, Type, Unsupported
+from heliograph.codegen.memory import LONG, InMemory
+from heliograph.numerics.types import PyTree
+
+Value = Any  # a NumPy array of nodes or keys, or an array in memory
+Rule = Callable[["Lowering", JaxprEqn, list[Value]], Sequence[Value]]
+
+RULES: dict[str, Rule] = {}  # operation of JAX -> its nodes; arguments are NumPy arrays of nodes
+IN_MEMORY: dict[str, Rule] = {}  # the same of operations that take arrays in memory as they are
+
+
+class Lowering:
+    """Lowers operations one after another into a graph."""
+
+    def __init__(self) -> None:
+        self.graph = Graph()
+        self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
+
+    def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
+        """The results of a traced program for these arguments."""
+        jaxpr: Any = program
+        if isinstance(program, ClosedJaxpr):
+            jaxpr, consts = program.jaxpr, program.consts
+        values: dict[Var, Value] = dict(zip(jaxpr.constvars, map(self.known, consts), strict=True))
+        values |= zip(jaxpr.invars, inputs, strict=True)
+        for equation in jaxpr.eqns:
+            arguments = [self._read(values, v) for v in equation.invars]
+            results = self.equation(equation, arguments)
+            values |= zip(equation.outvars, results, strict=True)
+        return [self._read(values, v) for v in jaxpr.outvars]
+
+    def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
+        """The results of one operation."""
+        name = equation.primitive.name
+        try:
+            if name in IN_MEMORY and (name not in RULES or any(isinstance(x, InMemory) for x in inputs)):
+                return IN_MEMORY[name](self, equation, inputs)
+            if name not in RULES:
+                raise Unsupported(name)
+            return RULES[name](self, equation, [self.nodes(x) for x in inputs])
+        except Unsupported as found:
+            raise (found if found.place else Unsupported(found.operation, place(equation))) from None
+
+    def nodes(self, value: Value) -> np.ndarray:
+        """A value as a NumPy array of nodes."""
+        return value.nodes(self.graph) if isinstance(value, InMemory) else value
+
+    def scalar(self, value: Value) -> Node:
+        """A value of no axes as its node."""
+        node: Node = self.nodes(value).item()
+        return node
+
+    def known(self, number: Any) -> Value:
+        """An array of known numbers: as constants, or as a table in memory where it is long."""
+        if isinstance(number, np.ndarray) and number.dtype == object:
+            return number
+        if isinstance(number, jax.Array) and jax.numpy.issubdtype(number.dtype, jax.dtypes.prng_key):
+            return keys_of(self.known(np.asarray(jax.random.key_data(number))))
+        array = np.asarray(number)
+        type = type_of(array)
+        if array.size > LONG:
+            return InMemory.whole(Buffer("table", type, array.shape, self.graph.top, array))
+        return array_of([self.graph.constant(x, type) for x in array.ravel().tolist()], array.shape)
+
+    def _read(self, values: dict[Var, Value], v: Any) -> Value:
+        return self.known(v.val) if isinstance(v, Literal) else values[v]
+
+
+def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
+    """Nodes in row-major order as an array."""
+    flat = list(nodes)
+    result = np.empty(len(flat), dtype=object)
+    result[:] = flat
+    return result.reshape(shape)
+
+
+def keys_of(words: np.ndarray) -> np.ndarray:
+    """Keys (...) of their words (..., 2)."""
+    flat = words.reshape(-1, 2)
+    return array_of((Key(*pair) for pair in flat), words.shape[:-1])
+
+
+def type_of(value: Any) -> Type:
+    """The type of a number, or of an array's numbers."""
+    name = np.dtype(value.dtype).name
+    if name not in TYPES:
+        raise Unsupported(f"numbers of type {name}")
+    return TYPES[name]
+
+
+def result_type(equation: JaxprEqn, place: int = 0) -> Type:
+    """The type of an operation's result."""
+    return type_of(equation.outvars[place].aval)
+
+
+def result_shape(equation: JaxprEqn, place: int = 0) -> tuple[int, ...]:
+    """The shape of an operation's result."""
+    aval: Any = equation.outvars[place].aval
+    return tuple(aval.shape)
+
+
+def like(shape: Sequence[int], dtype: Any) -> Any:
+    """What JAX traces an array of this shape and type from."""
+    return jax.ShapeDtypeStruct(tuple(shape), dtype)  # type: ignore[no-untyped-call]
+
+
+def known_integers(value: np.ndarray) -> np.ndarray | None:
+    """An array of known integers, None where data decide one of them."""
+    flat: list[Node] = value.ravel().tolist()
+    if any(x.op != "constant" for x in flat):
+        return None
+    return np.array([int(x.value) for x in flat], dtype=np.int64).reshape(value.shape)
+
+
+def place(equation: JaxprEqn) -> str:
+    """The line of a user's or the library's code that an operation comes from."""
+    traceback = equation.source_info.traceback
+    frames: list[Any] = [] if traceback is None else traceback.frames
+    inside = ("/jax/", "/equinox/", "/heliograph/codegen/")
+    outside = [f for f in frames if not any(part in f.file_name for part in inside)]
+    return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""
+
+
+def traced(function: Callable[..., PyTree], *examples: PyTree) -> tuple[ClosedJaxpr, Any]:
+    """A function of one run as a program of JAX in double precision, and the structure of its result."""
+    with jax.enable_x64(True):
+        flat, tree = jax.tree.flatten(examples)
+        program, shape = jax.make_jaxpr(lambda *leaves: function(*jax.tree.unflatten(tree, leaves)), return_shape=True)(
+            *flat
+        )
+    return program, jax.tree.structure(shape)

@@ -1,0 +1,112 @@
+"""Arrays in memory: a view of a buffer with strides, as NumPy's, whose numbers are loaded when they are used."""
+
+from collections.abc import Sequence
+from itertools import product
+
+import numpy as np
+
+from heliograph.codegen.graph import Block, Buffer, Graph, Node, Type, Unsupported
+
+LONG = 64  # numbers: a known array that is longer is a table in memory
+MANY = 4096  # numbers: an array in memory that is longer is not loaded whole
+
+
+class InMemory:
+    """shape, and where entry (i, j, ...) lies: offset + sum strides * (i, j, ...) + sum of moves, (stride, node)."""
+
+    __slots__ = ("buffer", "loaded", "moves", "offset", "shape", "strides")
+
+    def __init__(
+        self,
+        buffer: Buffer,
+        shape: tuple[int, ...],
+        strides: tuple[int, ...],
+        offset: int = 0,
+        moves: tuple[tuple[int, Node], ...] = (),
+    ):
+        self.buffer, self.shape, self.strides, self.offset, self.moves = buffer, shape, strides, offset, moves
+        self.loaded: tuple[Block, np.ndarray] | None = None  # and the block from which it may be used
+
+    @classmethod
+    def whole(cls, buffer: Buffer) -> "InMemory":
+        """All of a buffer."""
+        return cls(buffer, buffer.shape, contiguous(buffer.shape))
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes."""
+        return len(self.shape)
+
+    @property
+    def size(self) -> int:
+        """Number of entries."""
+        return int(np.prod(self.shape, dtype=int))
+
+    @property
+    def type(self) -> Type:
+        """Of its numbers."""
+        return self.buffer.type
+
+    def view(
+        self, shape: Sequence[int], strides: Sequence[int], offset: int = 0, *moves: tuple[int, Node]
+    ) -> "InMemory":
+        """Another view of the same memory, from so much further on."""
+        return InMemory(self.buffer, tuple(shape), tuple(strides), self.offset + offset, (*self.moves, *moves))
+
+    def row(self, index: Node | int) -> "InMemory":
+        """Entry `index` along the first axis."""
+        if isinstance(index, int) or index.op == "constant":
+            known = index if isinstance(index, int) else int(index.value)
+            return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
+        return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
+
+    def nodes(self, graph: Graph) -> np.ndarray:
+        """All of its numbers, loaded."""
+        if self.loaded is None or self.loaded[0] not in graph.current.inwards():
+            if self.size > MANY:
+                raise Unsupported(f"an array of {self.size} numbers at once")
+            self.loaded = graph.current, self._load(graph)
+        return self.loaded[1]
+
+    def _load(self, graph: Graph) -> np.ndarray:
+        strides, indices = [s for s, _ in self.moves], [i for _, i in self.moves]
+        result = np.empty(self.shape, dtype=object)
+        for index in product(*map(range, self.shape)):
+            offset = self.offset + sum(s * i for s, i in zip(self.strides, index, strict=True))
+            result[index] = graph.load(self.buffer, offset, strides, indices)
+        return result
+
+    def reshaped(self, shape: tuple[int, ...]) -> "InMemory | None":
+        """The same numbers in another shape, None where they do not lie so."""
+        if not self.size:
+            return self.view(shape, (0,) * len(shape))
+        axes = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
+        strides: list[int] = []
+        place, left = len(axes) - 1, 1  # of the axis that is dealt out, from the last one on
+        base = 1
+        for n in reversed(shape):
+            if n == 1:
+                strides.append(0)
+                continue
+            if left == 1:
+                if place < 0:
+                    return None
+                left, base = axes[place]
+                place -= 1
+                while left % n and place >= 0 and axes[place][1] == axes[place + 1][0] * axes[place + 1][1]:
+                    left *= axes[place][0]
+                    place -= 1
+            while left < n and place >= 0 and axes[place][1] == base * left:
+                left *= axes[place][0]
+                place -= 1
+            if left % n:
+                return None
+            strides.append(base)
+            left, base = left // n, base * n
+        return self.view(shape, strides[::-1]) if left == 1 and place < 0 else None
+
+
+def contiguous(shape: Sequence[int]) -> tuple[int, ...]:
+    """Strides of an array whose last axis is innermost."""
+    strides = np.cumprod([1, *shape[:0:-1]])[::-1]
+    return tuple(int(s) for s in strides[: len(shape)])

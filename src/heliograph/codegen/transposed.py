@@ -1,0 +1,110 @@
+"""Text of LLVM IR that moves arrays [run][entry] to [entry][lane] for a block of runs, and back.
+
+Of 64-bit numbers eight runs by eight entries at a time, as vectors; of others one number after another.
+"""
+
+from collections.abc import Callable
+
+EIGHT = 8
+
+
+class Lines:
+    """Text with fresh names."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.count = 0
+
+    def add(self, text: str) -> str:
+        """A new name for what the text computes."""
+        self.count += 1
+        self.lines.append(f"  %x{self.count} = {text}")
+        return f"%x{self.count}"
+
+    def loop(self, name: str, begin: str, end: str, step: int, body: Callable[[str], None]) -> None:
+        """for (i = begin; i + step <= end; i += step) body."""
+        before, head, inside, after = f"{name}.before", f"{name}.head", f"{name}.inside", f"{name}.after"
+        self.lines += [f"  br label %{before}", f"{before}:", f"  br label %{head}", f"{head}:"]
+        self.lines.append(f"  %{name}.i = phi i64 [{begin}, %{before}], [%{name}.next, %{inside}]")
+        self.lines.append(f"  %{name}.next = add i64 %{name}.i, {step}")
+        self.lines.append(f"  %{name}.more = icmp sle i64 %{name}.next, {end}")
+        self.lines += [f"  br i1 %{name}.more, label %{inside}, label %{after}", f"{inside}:"]
+        body(f"%{name}.i")
+        self.lines += [f"  br label %{head}", f"{after}:"]
+
+
+def mover(bits: int, width: int, inwards: bool) -> str:
+    """`void @take64(ptr runs, ptr lanes, i64 size, i64 first, i64 last)`, or `give64`, which goes the other way.
+
+    Lane l is run first + l, or the last run where there are fewer: it then repeats what that run does.
+    """
+    text, name = Lines(), f"{'take' if inwards else 'give'}{bits}"
+    bytes_ = bits // 8
+    for group in range(0, width, EIGHT):
+        lanes = min(EIGHT, width - group)
+        rows = []
+        for lane in range(group, group + lanes):
+            place = text.add(f"add i64 %first, {lane}")
+            place = text.add(f"call i64 @llvm.smin.i64(i64 {place}, i64 %last)")
+            start = text.add(f"mul i64 {place}, %size")
+            rows.append(text.add(f"getelementptr i{bits}, ptr %runs, i64 {start}"))
+        start = "0"
+        if lanes == EIGHT and bits == 64:
+            text.loop(f"g{group}", "0", "%size", EIGHT, _eight(text, rows, width, group, inwards))
+            start = text.add(f"and i64 %size, {-EIGHT}")
+        text.loop(f"h{group}", start, "%size", 1, _single(text, rows, width, group, bits, inwards))
+    body = "\n".join(text.lines)
+    arguments = "ptr noalias %runs, ptr noalias %lanes, i64 %size, i64 %first, i64 %last"
+    return f"define internal void @{name}({arguments}) noinline nounwind {{\n{body}\n  ret void\n}} ; {bytes_}\n"
+
+
+def _eight(text: Lines, rows: list[str], width: int, group: int, inwards: bool) -> Callable[[str], None]:
+    """Eight entries of eight lanes."""
+
+    def body(i: str) -> None:
+        vector = "<8 x i64>"
+        in_rows = [text.add(f"getelementptr i64, ptr {row}, i64 {i}") for row in rows]
+        base = text.add(f"mul i64 {i}, {width}")
+        base = text.add(f"getelementptr i64, ptr %lanes, i64 {base}")
+        in_lanes = [text.add(f"getelementptr i64, ptr {base}, i64 {k * width + group}") for k in range(EIGHT)]
+        sources, targets = (in_rows, in_lanes) if inwards else (in_lanes, in_rows)
+        loaded = [text.add(f"load {vector}, ptr {p}, align 8") for p in sources]
+        for half in (4, 2, 1):
+            loaded = _exchanged(text, loaded, half)
+        for p, x in zip(targets, loaded, strict=True):
+            text.lines.append(f"  store {vector} {x}, ptr {p}, align 8")
+
+    return body
+
+
+def _exchanged(text: Lines, rows: list[str], half: int) -> list[str]:
+    """One step of a transposition: off-diagonal squares of this size change places."""
+    result = rows[:]
+    for i in range(EIGHT):
+        if i & half:
+            continue
+        j = i | half
+        low = [k if not k & half else k - half + EIGHT for k in range(EIGHT)]
+        high = [k + half if not k & half else k + EIGHT for k in range(EIGHT)]
+        for place, order in ((i, low), (j, high)):
+            mask = ", ".join(f"i32 {k}" for k in order)
+            pair = f"<8 x i64> {rows[i]}, <8 x i64> {rows[j]}"
+            result[place] = text.add(f"shufflevector {pair}, <8 x i32> <{mask}>")
+    return result
+
+
+def _single(text: Lines, rows: list[str], width: int, group: int, bits: int, inwards: bool) -> Callable[[str], None]:
+    """One entry of each lane."""
+
+    def body(i: str) -> None:
+        base = text.add(f"mul i64 {i}, {width}")
+        base = text.add(f"add i64 {base}, {group}")
+        base = text.add(f"getelementptr i{bits}, ptr %lanes, i64 {base}")
+        for lane, row in enumerate(rows):
+            run = text.add(f"getelementptr i{bits}, ptr {row}, i64 {i}")
+            here = text.add(f"getelementptr i{bits}, ptr {base}, i64 {lane}")
+            source, target = (run, here) if inwards else (here, run)
+            x = text.add(f"load i{bits}, ptr {source}, align {bits // 8}")
+            text.lines.append(f"  store i{bits} {x}, ptr {target}, align {bits // 8}")
+
+    return body

@@ -1,0 +1,207 @@
+"""Formulas on vectors written down as text of LLVM IR: `a * b + c` on `Vector`s appends the operations to a `Body`.
+
+Every function of `vector_math` is one straight line of such operations. Numbers of Python stand for vectors of that
+number. An operation is taken as it is written: no contraction, no reordering; `fma` rounds once.
+"""
+
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+Operand: TypeAlias = "Vector | float"  # a vector, or a number for a vector of it
+
+
+@dataclass
+class Body:
+    """The operations of one function on vectors of `width` numbers, and which intrinsics they call."""
+
+    width: int
+    lines: list[str] = field(default_factory=list)
+    declared: set[str] = field(default_factory=set)
+    block: str = "entry"
+
+    def type(self, scalar: str) -> str:
+        """The type of a vector of these scalars, such as "<8 x double>"."""
+        return f"<{self.width} x {scalar}>"
+
+    def add(self, scalar: str, operation: str) -> "Vector":
+        """The result of an operation, a vector of these scalars."""
+        name = f"%t{len(self.lines)}"
+        self.lines.append(f"{name} = {operation}")
+        return Vector(self, scalar, name)
+
+    def where_any(self, needed: "Vector", costly: Callable[[], "Vector"], value: "Vector") -> "Vector":
+        """`costly` where needed, else the value: a jump past its operations if no number of the vector needs it."""
+        start, mark = self.block, len(self.lines)
+        truth, double = self.type("i1"), self.type("double")
+        reduce = f"@llvm.vector.reduce.or.v{self.width}i1"
+        self.declared.add(f"declare i1 {reduce}({truth})")
+        self.lines.append(f"%some{mark} = call i1 {reduce}({truth} {needed.name})")
+        self.lines.append(f"br i1 %some{mark}, label %costly{mark}, label %end{mark}")
+        self.lines.append(f"costly{mark}:")
+        chosen = select(needed, costly(), value)
+        self.lines.append(f"br label %end{mark}")
+        self.lines.append(f"end{mark}:")
+        self.block = f"end{mark}"
+        return self.add("double", f"phi {double} [{value.name}, %{start}], [{chosen.name}, %costly{mark}]")
+
+    def call(self, intrinsic: str, *args: "Vector") -> "Vector":
+        """The result of an LLVM intrinsic of doubles, such as "fma"."""
+        double = self.type("double")
+        name = f"@llvm.{intrinsic}.v{self.width}f64"
+        self.declared.add(f"declare {double} {name}({', '.join([double] * len(args))})")
+        return self.add("double", f"call {double} {name}({', '.join(f'{double} {a.name}' for a in args)})")
+
+
+@dataclass(frozen=True, eq=False)
+class Vector:
+    """A vector in a body: doubles, 64-bit or 32-bit integers, or truths (scalars "double", "i64", "i32", "i1")."""
+
+    body: Body
+    scalar: str
+    name: str
+
+    @property
+    def type(self) -> str:
+        """The vector's type as LLVM writes it."""
+        return self.body.type(self.scalar)
+
+    def like(self, value: Operand) -> "Vector":
+        """A vector as it is, and a number as a vector of it, of the same type as this one."""
+        return value if isinstance(value, Vector) else constant(self.body, self.scalar, value)
+
+    def _with(self, real: str, whole: str, other: Operand, turned: bool = False) -> "Vector":
+        pair = (self, self.like(other))
+        a, b = reversed(pair) if turned else pair
+        operation = real if self.scalar == "double" else whole
+        return self.body.add(self.scalar, f"{operation} {self.type} {a.name}, {b.name}")
+
+    def __add__(self, other: Operand) -> "Vector":
+        return self._with("fadd", "add", other)
+
+    def __radd__(self, other: Operand) -> "Vector":
+        return self._with("fadd", "add", other, turned=True)
+
+    def __sub__(self, other: Operand) -> "Vector":
+        return self._with("fsub", "sub", other)
+
+    def __rsub__(self, other: Operand) -> "Vector":
+        return self._with("fsub", "sub", other, turned=True)
+
+    def __mul__(self, other: Operand) -> "Vector":
+        return self._with("fmul", "mul", other)
+
+    def __rmul__(self, other: Operand) -> "Vector":
+        return self._with("fmul", "mul", other, turned=True)
+
+    def __truediv__(self, other: Operand) -> "Vector":
+        return self._with("fdiv", "sdiv", other)
+
+    def __rtruediv__(self, other: Operand) -> "Vector":
+        return self._with("fdiv", "sdiv", other, turned=True)
+
+    def __and__(self, other: Operand) -> "Vector":
+        return self._with("and", "and", other)
+
+    def __or__(self, other: Operand) -> "Vector":
+        return self._with("or", "or", other)
+
+    def __xor__(self, other: Operand) -> "Vector":
+        return self._with("xor", "xor", other)
+
+    def __lshift__(self, bits: Operand) -> "Vector":
+        return self._with("shl", "shl", bits)
+
+    def __rshift__(self, bits: Operand) -> "Vector":
+        """Arithmetic shift."""
+        return self._with("ashr", "ashr", bits)
+
+    def __neg__(self) -> "Vector":
+        return self.body.add(self.scalar, f"fneg {self.type} {self.name}")
+
+    def __abs__(self) -> "Vector":
+        return self.body.call("fabs", self)
+
+    def __lt__(self, other: Operand) -> "Vector":
+        return self._compared("olt", "slt", other)
+
+    def __le__(self, other: Operand) -> "Vector":
+        return self._compared("ole", "sle", other)
+
+    def __gt__(self, other: Operand) -> "Vector":
+        return self._compared("ogt", "sgt", other)
+
+    def __ge__(self, other: Operand) -> "Vector":
+        return self._compared("oge", "sge", other)
+
+    def equals(self, other: Operand) -> "Vector":
+        """Where both are equal; false where one is NaN."""
+        return self._compared("oeq", "eq", other)
+
+    def _compared(self, real: str, whole: str, other: Operand) -> "Vector":
+        how = f"fcmp {real}" if self.scalar == "double" else f"icmp {whole}"
+        return self.body.add("i1", f"{how} {self.type} {self.name}, {self.like(other).name}")
+
+    def as_type(self, scalar: str) -> "Vector":
+        """The same bits as numbers of another type."""
+        return self.body.add(scalar, f"bitcast {self.type} {self.name} to {self.body.type(scalar)}")
+
+    def convert(self, how: str, scalar: str) -> "Vector":
+        """The numbers converted by an instruction such as "zext" or "trunc"."""
+        return self.body.add(scalar, f"{how} {self.type} {self.name} to {self.body.type(scalar)}")
+
+
+def constant(body: Body, scalar: str, value: float) -> Vector:
+    """A vector of one number."""
+    if scalar == "double":
+        text = "0x" + struct.pack(">d", value).hex().upper()
+    elif scalar == "i1":
+        text = "true" if value else "false"
+    else:
+        text = str(int(value))
+    return Vector(body, scalar, f"splat ({scalar} {text})")
+
+
+def select(condition: Vector, yes: Operand, no: Operand) -> Vector:
+    """`yes` where the condition holds, else `no`; one of them is a vector, or both are real numbers."""
+    body = condition.body
+    model = next((v for v in (yes, no) if isinstance(v, Vector)), constant(body, "double", 0.0))
+    a, b = model.like(yes), model.like(no)
+    text = f"select {condition.type} {condition.name}, {a.type} {a.name}, {b.type} {b.name}"
+    return body.add(model.scalar, text)
+
+
+def fma(a: Operand, b: Operand, c: Operand) -> Vector:
+    """a b + c, rounded once; one of them is a vector."""
+    model = next(v for v in (a, b, c) if isinstance(v, Vector))
+    return model.body.call("fma", *(model.like(v) for v in (a, b, c)))
+
+
+def sqrt(x: Vector) -> Vector:
+    """The square root, correctly rounded."""
+    return x.body.call("sqrt", x)
+
+
+def copy_sign(magnitude: Vector, sign: Vector) -> Vector:
+    """|magnitude| with the sign of the other, also that of a zero."""
+    return magnitude.body.call("copysign", magnitude, magnitude.like(sign))
+
+
+def polynomial(x: Vector, coefficients: Sequence[Operand]) -> Vector:
+    """c_0 + c_1 x + c_2 x^2 + ... by Horner's rule."""
+    *rest, total = coefficients
+    for c in reversed(rest):
+        total = fma(x, total, c)
+    return x.like(total)
+
+
+def function(name: str, width: int, formula: Callable[..., Vector], arguments: int = 1) -> tuple[str, set[str]]:
+    """The text of an internal function of vectors of doubles, and the declarations it needs."""
+    body = Body(width)
+    double = body.type("double")
+    result = formula(*(Vector(body, "double", f"%x{i}") for i in range(arguments)))
+    lines = "".join(f"  {line}\n" for line in body.lines)
+    signature = ", ".join(f"{double} %x{i}" for i in range(arguments))
+    text = f"define internal {double} @hg_{name}({signature}) #9 {{\nentry:\n{lines}  ret {double} {result.name}\n}}\n"
+    return text, body.declared
