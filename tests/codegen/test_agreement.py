@@ -141,7 +141,14 @@ def test_loops_end_for_each_run_at_its_own_turn():
 def test_arithmetic_on_whole_recordings_is_a_loop_over_their_rows():
     def function(x, y):
         both = jnp.concatenate([x[1:], x[:1]]) * jnp.sin(y)[:, None] - x[::-1]
-        return both, jnp.sum(both, axis=0), x @ jnp.ones((3, 2)), jax.vmap(lambda r: jnp.outer(r, r))(x), both[7, 1]
+        return (
+            both,
+            (2.0 * x).reshape(3, 90),
+            jnp.sum(both, axis=0),
+            x @ jnp.ones((3, 2)),
+            jax.vmap(lambda r: jnp.outer(r, r))(x),
+            both[7, 1],
+        )
 
     x, y = RANDOM.normal(size=(6, 90, 3)), RANDOM.normal(size=(6, 90))
     found = compile(function, x[0], y[0])(x, y)

@@ -67,6 +67,7 @@ def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemor
     whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
     alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
     if whole and alone and value.size == buffer.size:
+        buffer.shape = value.shape
         return value
     return _filled(lowering, lowering.nodes(value)) if value.size <= LONG else copied(lowering, value)
 

@@ -40,6 +40,7 @@ class Lowering:
         for equation in jaxpr.eqns:
             arguments = [self._read(values, v) for v in equation.invars]
             results = self.equation(equation, arguments)
+            _check_shapes(equation, results)
             values |= zip(equation.outvars, results, strict=True)
         return [self._read(values, v) for v in jaxpr.outvars]
 
@@ -78,6 +79,14 @@ class Lowering:
 
     def _read(self, values: dict[Var, Value], v: Any) -> Value:
         return self.known(v.val) if isinstance(v, Literal) else values[v]
+
+
+def _check_shapes(equation: JaxprEqn, results: Sequence[Value]) -> None:
+    """What a rule gives has the shapes that the trace says: a rule that is wrong is found where it is."""
+    for variable, value in zip(equation.outvars, results, strict=True):
+        aval: Any = variable.aval
+        if value.shape != aval.shape:
+            raise RuntimeError(f"{equation.primitive.name} at {place(equation)}: {value.shape} for {aval.shape}")
 
 
 def array_of(nodes: Iterable[Any], shape: tuple[int, ...]) -> np.ndarray:
