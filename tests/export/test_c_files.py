@@ -237,7 +237,7 @@ UNKNOWN = hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
     ("make", "path", "precision", "words"),
     [
         (lambda: hg.filters.particle_filter(LINE, RANGE, HIDDEN, 9), "a.c", "double", "got random_.*particle.py:"),
-        (lambda: SHIFTED, "a.c", "double", r"operations that C has, got conv_general_dilated at .*test_c_files\.py:\d+"),
+        (lambda: SHIFTED, "a.c", "double", r"C has, got conv_general_dilated at .*test_c_files\.py:\d+"),
         (lambda: BEYOND, "a.c", "double", r"operations that C has, got erf_inv at .*test_c_files\.py:\d+"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "a.cpp", "double", "a name that ends in .c"),
         (lambda: hg.linear_filter(LINE, RANGE, FADING), "2a.c", "double", "a name that C takes"),
