@@ -2,7 +2,6 @@
 
 from . import (
     random_affine as random_affine,
-    codegen as codegen,
     model as model,
     linear as linear,
     relays as relays,

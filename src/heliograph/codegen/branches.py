@@ -20,7 +20,7 @@ SHARE = 4  # and one that is so many times smaller than the dearest, which often
 
 def _cond(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     branches = equation.params["branches"]
-    which = lowering.nodes(inputs[0])[()]
+    which = lowering.scalar(inputs[0])
     if which.op == "constant":
         taken = min(max(int(which.value), 0), len(branches) - 1)
         return lowering.inline(branches[taken], inputs[1:])

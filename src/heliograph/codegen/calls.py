@@ -1,12 +1,14 @@
 """Rules of programs inside programs: functions that are called, and branches."""
 
+from typing import Any
+
 import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
-from heliograph.codegen.graph import Node, Unsupported
+from heliograph.codegen.graph import Node
 from heliograph.codegen.loops import in_memory, repeated
-from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Value, like
 from heliograph.codegen.memory import InMemory
 from heliograph.codegen.shapes import FEW
 
@@ -28,33 +30,37 @@ def _custom_vmap_call(lowering: Lowering, equation: JaxprEqn, inputs: list[Value
 
 def _runs_last(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """A kernel over runs, traced for one run; of several runs inside one, such as modes, one after another."""
-    params = equation.params
-    runs = params["runs"]
-    shapes = [tuple(v.aval.shape) for v in equation.outvars]  # type: ignore[attr-defined]
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    runs = equation.params["runs"]
+    shapes = [a.shape[: a.ndim - len(runs)] for a in avals]
+    return _over(lowering, equation, inputs, runs, shapes)
+
+
+def _over(
+    lowering: Lowering, equation: JaxprEqn, inputs: list[Value], runs: tuple[int, ...], shapes: list[tuple[int, ...]]
+) -> list[Value]:
+    """The last axis of runs first: few written out, many in a loop."""
     if not runs:
-        results = _one(lowering, equation, inputs)
-        return [
-            x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in zip(results, shapes, strict=True)
-        ]
-    if len(runs) > 1:
-        raise Unsupported("a kernel over runs of runs")
-    if runs[0] <= FEW:
-        each = [_one(lowering, equation, [_run(x, k) for x in inputs]) for k in range(runs[0])]
+        results = zip(_one(lowering, equation, inputs), shapes, strict=True)
+        return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
+    count, rest = runs[-1], runs[:-1]
+    if count <= FEW:
+        each = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
         return [np.stack([lowering.nodes(x) for x in results], axis=-1) for results in zip(*each, strict=True)]
     rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        results = _one(lowering, equation, [_run(x, place) if isinstance(x, InMemory) else x for x in rows])
-        return [], [lowering.nodes(x) for x in results]
+        one = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
+        return [], [lowering.nodes(x) for x in _over(lowering, equation, one, rest, shapes)]
 
-    stacked = repeated(lowering, runs[0], [], turn)[1]
+    stacked = repeated(lowering, count, [], turn)[1]
     return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
 
 
 def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
     numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
-    examples = [jax.ShapeDtypeStruct(x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True)]
+    examples = [like(x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True)]
     tree, function = params["tree"], params["kernel"].function
     inner = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))(*examples)
     return lowering.inline(inner, inputs)

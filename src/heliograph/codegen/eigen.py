@@ -9,7 +9,7 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.graph import Unsupported
-from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value
+from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, like
 
 LARGEST = 8  # rows: of larger ones the straight line is long, and the library's method faster
 SWEEPS = 30  # at most; a handful is enough, more where sizes differ by many decades
@@ -82,7 +82,7 @@ def _eigh(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     shape = avals[0].shape
     if len(shape) != 2 or shape[0] > LARGEST or equation.params.get("subset_by_index") is not None:
         raise Unsupported(f"eigenvalues of a matrix of {shape[-1]} rows")
-    program = jax.make_jaxpr(eigh)(jax.ShapeDtypeStruct(shape, avals[0].dtype))
+    program = jax.make_jaxpr(eigh)(like(shape, avals[0].dtype))
     return lowering.inline(program, inputs)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.lowering import like
 from heliograph.codegen.machine import target
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail
@@ -120,7 +121,7 @@ def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
         return function(*arguments)
 
     try:
-        program = lower(call, *(jax.ShapeDtypeStruct(k.shape, k.dtype) for k in arrays))
+        program = lower(call, *(like(k.shape, k.dtype) for k in arrays))
         return Compiled(program, [k.differs for k in arrays]), ""
     except Unsupported as found:
         return None, str(found)

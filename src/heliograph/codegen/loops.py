@@ -155,7 +155,7 @@ def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
     loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
     graph.current = body
     now = _like(carry, loop.parameters)
-    loop.condition = active = lowering.nodes(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])[()]
+    loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
     body.items.append(Check(loop))
     results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
     moved = [n for x in results for n in words(x)]

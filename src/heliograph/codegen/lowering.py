@@ -58,6 +58,11 @@ class Lowering:
         """A value as a NumPy array of nodes."""
         return value.nodes(self.graph) if isinstance(value, InMemory) else value
 
+    def scalar(self, value: Value) -> Node:
+        """A value of no axes as its node."""
+        node: Node = self.nodes(value).item()
+        return node
+
     def known(self, number: Any) -> Value:
         """An array of known numbers: as constants, or as a table in memory where it is long."""
         if isinstance(number, np.ndarray) and number.dtype == object:
@@ -107,6 +112,11 @@ def result_shape(equation: JaxprEqn, place: int = 0) -> tuple[int, ...]:
     return tuple(aval.shape)
 
 
+def like(shape: Sequence[int], dtype: Any) -> Any:
+    """What JAX traces an array of this shape and type from."""
+    return jax.ShapeDtypeStruct(tuple(shape), dtype)  # type: ignore[no-untyped-call]
+
+
 def known_integers(value: np.ndarray) -> np.ndarray | None:
     """An array of known integers, None where data decide one of them."""
     flat: list[Node] = value.ravel().tolist()
@@ -118,7 +128,7 @@ def known_integers(value: np.ndarray) -> np.ndarray | None:
 def place(equation: JaxprEqn) -> str:
     """The line of a user's or the library's code that an operation comes from."""
     traceback = equation.source_info.traceback
-    frames = [] if traceback is None else traceback.frames
+    frames: list[Any] = [] if traceback is None else traceback.frames
     inside = ("/jax/", "/equinox/", "/heliograph/codegen/")
     outside = [f for f in frames if not any(part in f.file_name for part in inside)]
     return f"{outside[0].file_name}:{outside[0].line_num}" if outside else ""

@@ -55,9 +55,9 @@ class InMemory:
 
     def row(self, index: Node | int) -> "InMemory":
         """Entry `index` along the first axis."""
-        known = index if isinstance(index, int) else index.value if index.op == "constant" else None
-        if known is not None:
-            return self.view(self.shape[1:], self.strides[1:], self.strides[0] * int(known))
+        if isinstance(index, int) or index.op == "constant":
+            known = index if isinstance(index, int) else int(index.value)
+            return self.view(self.shape[1:], self.strides[1:], self.strides[0] * known)
         return self.view(self.shape[1:], self.strides[1:], 0, (self.strides[0], index))
 
     def nodes(self, graph: Graph) -> np.ndarray:

@@ -12,6 +12,7 @@ from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     eigen,
     elementwise,
     loops,
+    lu,
     matrices,
     random_bits,
     rows,

@@ -6,14 +6,13 @@ What `vmap` made of a step, for each row of a record at once, becomes that step 
 from types import SimpleNamespace
 from typing import Any
 
-import jax
 import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.elementwise import ELEMENTWISE
 from heliograph.codegen.graph import Node, Unsupported
 from heliograph.codegen.loops import in_memory, repeated
-from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
 from heliograph.codegen.memory import LONG, InMemory
 
 OF_ENTRIES = (
@@ -60,7 +59,7 @@ def row_of(lowering: Lowering, x: Value, place: Node, ndim: int) -> Value:
 def like_row(equation: JaxprEqn, **params: Any) -> Any:
     """The same operation of one row."""
     avals: list[Any] = [v.aval for v in equation.outvars]
-    rows = [SimpleNamespace(aval=jax.ShapeDtypeStruct(a.shape[1:], a.dtype)) for a in avals]
+    rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
     return SimpleNamespace(
         primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
         source_info=equation.source_info,
@@ -113,7 +112,7 @@ def _reduction(name: str) -> Rule:
         inner = tuple(a - 1 for a in axes if a)
         shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
         dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
-        row = SimpleNamespace(aval=jax.ShapeDtypeStruct(shape, dtype))
+        row = SimpleNamespace(aval=like(shape, dtype))
         params = equation.params | {"axes": inner}
         one: Any = SimpleNamespace(params=params, outvars=[row])
         pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])

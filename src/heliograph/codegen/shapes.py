@@ -1,6 +1,6 @@
 """Rules of operations that move entries: they rearrange references and make no node."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -72,7 +72,7 @@ def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarr
     """One axis after another, each start clamped so that the slice lies inside."""
     x = inputs[0]
     for axis, (start, size) in enumerate(zip(inputs[1:], equation.params["slice_sizes"], strict=True)):
-        x = window(lowering.graph, x, axis, start[()], size)
+        x = window(lowering.graph, x, axis, lowering.scalar(start), size)
     return [x]
 
 
@@ -103,7 +103,7 @@ def chosen(graph: Graph, which: Node, cases: list[np.ndarray]) -> np.ndarray:
 
 
 def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
-    x, update, starts = inputs[0], inputs[1], [s[()] for s in inputs[2:]]
+    x, update, starts = inputs[0], inputs[1], [lowering.scalar(s) for s in inputs[2:]]
     for axis, start in enumerate(starts):
         last = x.shape[axis] - update.shape[axis]
         if last and start.op != "constant":
@@ -115,7 +115,9 @@ def _dynamic_update_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[n
     return [_updated(lowering, x, update, starts, 0)]
 
 
-def _updated(lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: list[Node | None], here: int) -> np.ndarray:
+def _updated(
+    lowering: Lowering, x: np.ndarray, update: np.ndarray, starts: Sequence[Node | None], here: int
+) -> np.ndarray:
     """With an update at known starts, `here` along the axis that has none."""
     at = []
     for size, whole, start in zip(update.shape, x.shape, starts, strict=True):
@@ -140,7 +142,7 @@ def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndar
     with jax.enable_x64(True):
         places = jnp.arange(x.size).reshape(x.shape)
         params = equation.params | {"fill_value": -1}
-        found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))
+        found = np.asarray(equation.primitive.bind(places, jnp.asarray(at), **params))  # type: ignore[no-untyped-call]
     flat = x.ravel()
     beyond = (found < 0) | (found >= x.size)
     if np.any(beyond):
@@ -155,10 +157,15 @@ def _gathered(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, at: np.ndar
 def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
     """With an index that data decide: what it gathers for each number that it may be, and a choice between these."""
     flat: list[Node] = indices.ravel().tolist()
+    numbers = equation.params["dimension_numbers"]
+    axes, sizes = numbers.start_index_map, equation.params["slice_sizes"]
+    trailing = numbers.offset_dims == tuple(range(indices.ndim - 1, len(result_shape(equation))))
+    if axes == numbers.collapsed_slice_dims == (0,) and trailing and tuple(sizes[1:]) == x.shape[1:]:
+        rows = [window(lowering.graph, x, 0, n, 1).reshape(-1) for n in flat]  # whole rows, each by its own number
+        return np.concatenate(rows).reshape(result_shape(equation))
     number = next(n for n in flat if n.op != "constant")
-    axes = equation.params["dimension_numbers"].start_index_map
     used = {axes[k % len(axes)] for k, n in enumerate(flat) if n is number}
-    count = max(x.shape[a] - equation.params["slice_sizes"][a] + 1 for a in used)
+    count = max(x.shape[a] - sizes[a] + 1 for a in used)
     if count > FEW:
         raise Unsupported(f"gather at one of {count} places that data decide")
     cases = []

@@ -7,10 +7,11 @@ import numpy as np
 from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.elementwise import PASSED_ON
-from heliograph.codegen.graph import Buffer, Node
-from heliograph.codegen.loops import repeated
+from heliograph.codegen.graph import Buffer, Key, Node
+from heliograph.codegen.loops import in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
 from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.shapes import FEW
 
 View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
 
@@ -62,17 +63,29 @@ def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[
 
 
 def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    x, sizes = inputs[0], equation.params["slice_sizes"]
+    sizes = equation.params["slice_sizes"]
+    x = indexable(lowering, inputs[0], inputs[1:])
     if not isinstance(x, InMemory):
         return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []
     for axis, start in enumerate(inputs[1:]):
-        first = clamped(lowering, lowering.nodes(start)[()], x.shape[axis] - sizes[axis])
+        first = clamped(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
         if isinstance(first, int):
             offset += x.strides[axis] * first
         else:
             moves.append((x.strides[axis], first))
     return [x.view(sizes, x.strides, offset, *moves)]
+
+
+def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
+    """A table, or an array of many entries, in memory, where data or the number of a turn say which are taken."""
+    nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
+    if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
+        return x
+    flat = x.ravel().tolist()
+    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
+        return x
+    return in_memory(lowering, x)
 
 
 def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
@@ -88,8 +101,9 @@ def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
 
 def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """x[i, j, ...] of whole rows: a view. Other gathers take the nodes."""
-    x, numbers, sizes = inputs[0], equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
     axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
+    x = indexable(lowering, inputs[0], [indices])
     if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
         return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
     offset, moves = 0, []

@@ -1,0 +1,191 @@
+"""Native code agrees with XLA, whatever the width, the cores and the neighbours."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.codegen.compiled import Alone, Compiled, compile
+from heliograph.codegen.engine import engine_of
+from heliograph.codegen.program import lower
+
+RANDOM = np.random.default_rng(4)
+PLANT = hg.LinearPlant([[0.9, 0.1], [0.0, 0.8]], np.diag([0.1, 0.2]), [1.0, 0.0], np.eye(2))
+SENSOR = hg.LinearSensor([[1.0, 0.5]], 0.3)
+TURNING = hg.Plant(lambda x, u: 0.8 * x + 0.3 * jnp.sin(jnp.roll(x, 1)), 0.1 * np.eye(2), np.ones(2), np.eye(2))
+BENT = hg.Sensor(lambda x: (x[0] + 0.2 * x[1] ** 2)[None], 0.1)
+RELAYS = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), 0.02), hg.hop(1.0, noise=0.01, amplification=1.2)])
+UNCERTAIN = hg.hop(hg.Discrete([0.5, 1.0], [0.4, 0.6], 0.1), 0.05)
+CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
+FADING = hg.markov_fading([0.3, 1.0], CHAIN, noise=0.1)
+FILTERS = {
+    "kalman": lambda: hg.kalman_filter(PLANT, SENSOR),
+    "precise": lambda: hg.kalman_filter(PLANT, hg.LinearSensor([[1.0, 0.5], [0.3, 1.0]], np.diag([1e-12, 1.0]))),
+    "linear": lambda: hg.linear_filter(PLANT, SENSOR, RELAYS),
+    "extended": lambda: hg.extended_filter(TURNING, BENT, RELAYS),
+    "cubature": lambda: hg.cubature_filter(TURNING, BENT, UNCERTAIN),
+    "imm": lambda: hg.filters.imm_filter(PLANT, SENSOR, FADING),
+    "gpb2": lambda: hg.filters.gpb2_filter(PLANT, SENSOR, FADING),
+    "polynomial": lambda: hg.polynomial_filter(PLANT, SENSOR, RELAYS, 30, 1),
+}
+
+
+def over_recording(item):
+    """A function of one recording: all estimates, and the state after it."""
+
+    def one(z):
+        def body(state, row):
+            state, estimate = item.step(state, row[0], np.zeros(0), row[1])
+            return state, (estimate.mean, estimate.covariance)
+
+        return jax.lax.scan(body, jax.tree.map(jnp.asarray, item.init()), (z, jnp.arange(len(z))))[1]
+
+    return one
+
+
+def measurements(item, runs, steps):
+    z = RANDOM.normal(size=(runs, steps, item.received))
+    return np.where(RANDOM.random(z.shape) < 0.1, np.nan, z)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_every_filter_gives_what_xla_gives(name):
+    """To 1e-12 of the claimed deviation; what did not arrive among the data."""
+    item = FILTERS[name]()
+    one, z = over_recording(item), measurements(item, 5, 30)
+    mean, covariance = compile(one, z[0])(z)
+    with jax.enable_x64(True):
+        expected = [np.asarray(x) for x in jax.jit(jax.vmap(one))(z)]
+    deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
+    assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
+    assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
+
+
+@pytest.mark.parametrize("name", ["cubature", "imm"])
+def test_bits_depend_on_no_width_and_no_neighbour(name):
+    """Of one run alone, of 13 in blocks of 8, 4 and 16, by one core and by several."""
+    item = FILTERS[name]()
+    one, z = over_recording(item), measurements(item, 13, 20)
+    program = lower(one, z[0])
+    whole = Compiled(program, [True], 8)(z, cores=3)
+    for width in (4, 16):
+        for a, b in zip(whole, Compiled(lower(one, z[0]), [True], width)(z, cores=1), strict=True):
+            np.testing.assert_array_equal(a, b)
+    alone = Alone(lower(one, z[0]))
+    for run in (0, 12):
+        alone.inputs[0][...] = z[run]
+        alone()
+        for a, b in zip(whole, alone.outputs, strict=True):
+            np.testing.assert_array_equal(a[run], b)
+
+
+def test_what_all_runs_share_is_computed_once_and_gives_the_same_bits():
+    """A filter whose covariances depend on no data: computed beside the runs, or within them."""
+    item = FILTERS["linear"]()
+
+    def one(z, noise):
+        sensor = hg.LinearSensor([[1.0, 0.5]], noise)
+        return over_recording(hg.linear_filter(PLANT, sensor, hg.perfect()))(z)
+
+    z = RANDOM.normal(size=(9, 40, item.received))
+    noise = np.full((1, 1), 0.3)
+    shared = compile(one, z[0], noise, shared=(1,))
+    assert shared.once is not None
+    for a, b in zip(shared(z, noise), compile(one, z[0], noise)(z, np.repeat(noise[None], 9, 0)), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_loops_end_for_each_run_at_its_own_turn():
+    def root(x):
+        """Newton's method until nothing changes, and how many turns that took."""
+
+        def closer(state):
+            y, _, turns = state
+            return 0.5 * (y + x / y), y, turns + 1
+
+        y, _, turns = jax.lax.while_loop(
+            lambda s: (jnp.abs(s[0] - s[1]) > 1e-15 * s[0]) & (s[2] < 60), closer, (x, 0 * x, jnp.asarray(0))
+        )
+        return y, turns
+
+    x = 10.0 ** RANDOM.uniform(-8, 8, size=37)
+    y, turns = compile(root, x[0])(x)
+    with jax.enable_x64(True):
+        expected = jax.vmap(root)(x)
+    np.testing.assert_allclose(y, np.sqrt(x), rtol=1e-15)
+    np.testing.assert_array_equal(turns, expected[1])
+
+
+def test_arithmetic_on_whole_recordings_is_a_loop_over_their_rows():
+    def function(x, y):
+        both = jnp.concatenate([x[1:], x[:1]]) * jnp.sin(y)[:, None] - x[::-1]
+        return both, jnp.sum(both, axis=0), x @ jnp.ones((3, 2)), jax.vmap(lambda r: jnp.outer(r, r))(x), both[7, 1]
+
+    x, y = RANDOM.normal(size=(6, 90, 3)), RANDOM.normal(size=(6, 90))
+    found = compile(function, x[0], y[0])(x, y)
+    with jax.enable_x64(True):
+        expected = jax.vmap(function)(x, y)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
+
+
+def test_numbers_of_the_data_choose_rows_of_tables_and_recordings():
+    table = RANDOM.normal(size=(80, 2))
+
+    def function(x, k):
+        return jnp.asarray(table)[k], x[k], jax.lax.dynamic_slice(x, (k,), (3,))
+
+    x, k = RANDOM.normal(size=(11, 100)), RANDOM.integers(-120, 120, size=11)
+    with jax.enable_x64(True):
+        expected = jax.vmap(function)(x, k)
+    for a, b in zip(compile(function, x[0], k[0])(x, k), expected, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize(
+    "function",
+    [
+        lambda x: (jnp.maximum(x, 0.1), jnp.sign(x), jnp.isfinite(x), x != x, jnp.round(x), jnp.floor(x)),
+        lambda x: (x.astype(int), (x > 0).astype(float), jnp.fmod(x, 0.3), jnp.abs(x), jnp.sqrt(x), 1 / x),
+        lambda x: (jnp.where(x > 0, jnp.log(x), jnp.exp(x)), jnp.arctan2(x, -1.0), jnp.tanh(x), jnp.log1p(x)),
+    ],
+)
+def test_special_numbers_are_what_jax_makes_of_them(function):
+    x = np.concatenate([RANDOM.normal(size=20), [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, 1e-300, 0.5, -2.5]])
+    found = compile(function, x[0])(x)
+    with jax.enable_x64(True):
+        expected = jax.vmap(function)(x)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-14)
+
+
+def test_random_draws_are_those_of_jax():
+    def draw(number):
+        key = jax.random.fold_in(jax.random.key(3), number)
+        return jax.random.uniform(key), jax.random.normal(jax.random.split(key)[1], (2,))
+
+    numbers = np.arange(20)
+    uniform, normal = compile(draw, numbers[0])(numbers)
+    with jax.enable_x64(True):
+        expected = jax.vmap(draw)(numbers)
+    np.testing.assert_array_equal(uniform, expected[0])
+    np.testing.assert_allclose(normal, expected[1], rtol=1e-14)
+
+
+def test_a_user_can_ask_for_the_engine_and_force_one(monkeypatch):
+    def svd(x):
+        return jnp.linalg.svd(x)[1]
+
+    x = RANDOM.normal(size=(3, 2, 2))
+    assert engine_of(lambda x: x @ x, x) == "native: 15 operations"  # one product of eight is two entries'
+    assert engine_of(svd, x).startswith("xla: svd")
+    np.testing.assert_allclose(hg.simulation.over_runs(svd, x), np.linalg.svd(x)[1])
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "native")
+    with pytest.raises(ValueError, match="native code: expected a program of operations that it takes, got svd"):
+        hg.simulation.over_runs(svd, x)
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "xla")
+    assert engine_of(svd, x) == "xla: HELIOGRAPH_ENGINE is set to it"
+    monkeypatch.setenv("HELIOGRAPH_ENGINE", "gpu")
+    with pytest.raises(ValueError, match="HELIOGRAPH_ENGINE: expected native or xla, got gpu"):
+        engine_of(svd, x)

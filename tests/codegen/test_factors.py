@@ -1,0 +1,46 @@
+"""Eigenvalues and factors of small matrices that are written out entry by entry."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from heliograph.codegen.compiled import compile
+
+RANDOM = np.random.default_rng(6)
+
+
+@pytest.mark.parametrize("n", [1, 2, 3, 6])
+def test_eigenvalues_are_those_of_the_library(n):
+    """To rounding of the largest; also where scales differ by ten decades, of equal eigenvalues and of zero."""
+    a = RANDOM.normal(size=(20, n, n))
+    a = a @ a.transpose(0, 2, 1)
+    scales = 10.0 ** RANDOM.uniform(-5, 5, size=(20, n))
+    a[10:] *= scales[10:, :, None] * scales[10:, None]
+    a[0], a[1] = np.eye(n), 0.0
+    values, vectors = compile(lambda a: tuple(jnp.linalg.eigh(a)), a[0])(a)
+    size = np.linalg.norm(a, axis=(1, 2))[:, None]
+    assert np.all(np.diff(values, axis=1) >= 0)
+    assert np.max(np.abs(values - np.linalg.eigvalsh(a)) / (size + 1e-300)) < 1e-14
+    again = np.einsum("rij,rj,rkj->rik", vectors, values, vectors)
+    assert np.max(np.abs(again - a) / (size[..., None] + 1e-300)) < 1e-14
+    turned = np.einsum("rij,rik->rjk", vectors, vectors)
+    assert np.max(np.abs(turned - np.eye(n))) < 1e-14
+
+
+def test_eigenvalues_of_what_is_no_number_are_none():
+    a = np.array([[[1.0, np.nan], [np.nan, 2.0]], [[1.0, 0.5], [0.5, 2.0]]])
+    values, vectors = compile(lambda a: tuple(jnp.linalg.eigh(a)), a[0])(a)
+    assert np.isnan(values[0]).all() and np.isnan(vectors[0]).all() and np.isfinite(values[1]).all()
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_systems_are_solved_with_the_largest_entry_first(n):
+    """Also where the first entry of a column is zero; to rounding times the matrix's condition."""
+    a, b = RANDOM.normal(size=(20, n, n)), RANDOM.normal(size=(20, n, 2))
+    if n > 1:
+        a[:, 0, 0] = 0.0
+    x, determinant = compile(lambda a, b: (jnp.linalg.solve(a, b), jnp.linalg.det(a)), a[0], b[0])(a, b)
+    limit = 1e-15 * 10 * n * np.linalg.cond(a)[:, None, None]
+    expected = np.linalg.solve(a, b)
+    assert np.all(np.abs(x - expected) <= limit * np.abs(expected).max(axis=(1, 2), keepdims=True))
+    np.testing.assert_allclose(determinant, np.linalg.det(a), rtol=1e-12)
