@@ -180,7 +180,9 @@ def test_single_precision_keeps_variances_positive(tmp_path):
 
 @needs_compiler
 def test_the_first_precise_measurement_keeps_its_digits(tmp_path):
-    """1e6 measured with 1e-2 leaves 1e-2 in single precision too: P - K H P would leave nothing or less."""
+    """1e6 measured with 1e-2 leaves 1e-2 in single precision too, where P - P^2 / (P + R) is nothing."""
+    p, r = np.float32(1e6), np.float32(1e-2)
+    assert p - p * p / (p + r) == 0
     device = Device(precise(), tmp_path, precision="float")
     assert device.step([0.0]) == 0
     np.testing.assert_allclose(device.covariance()[0, 0], 1e-2, rtol=1e-6)
