@@ -80,6 +80,26 @@ def test_bits_depend_on_no_width_and_no_neighbour(name):
             np.testing.assert_array_equal(a[run], b)
 
 
+def test_a_state_stays_in_its_place_from_call_to_call():
+    """A filter stepped through a recording by one call a row."""
+    item = FILTERS["cubature"]()
+    start, z = item.init(), measurements(item, 1, 20)[0]
+    leaves, tree = jax.tree.flatten(start)
+
+    def step(z, *leaves):
+        state, estimate = item.step(jax.tree.unflatten(tree, leaves), z)
+        return *jax.tree.leaves(state), estimate.mean
+
+    alone = Alone(lower(step, z[0], *map(np.asarray, leaves)), {k: k + 1 for k in range(len(leaves))})
+    for place, leaf in zip(alone.inputs[1:], leaves, strict=True):
+        place[...] = leaf
+    expected = compile(over_recording(item), z)(z[None])[0][0]
+    for row, mean in zip(z, expected, strict=True):
+        alone.inputs[0][...] = row
+        alone()
+        np.testing.assert_array_equal(alone.outputs[-1], mean)
+
+
 def test_what_all_runs_share_is_computed_once_and_gives_the_same_bits():
     """A filter whose covariances depend on no data: computed beside the runs, or within them."""
     item = FILTERS["linear"]()

@@ -60,10 +60,14 @@ def _over(
 def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
     numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
-    examples = [like(x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True)]
+    kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True))
     tree, function = params["tree"], params["kernel"].function
-    inner = jax.make_jaxpr(lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves))))(*examples)
-    return lowering.inline(inner, inputs)
+    key = (function, tree, kinds)
+    if key not in lowering.kernels:
+        lowering.kernels[key] = jax.make_jaxpr(
+            lambda *leaves: jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
+        )(*(like(*kind) for kind in kinds))
+    return lowering.inline(lowering.kernels[key], inputs)
 
 
 def _run(x: Value, place: Node | int) -> Value:

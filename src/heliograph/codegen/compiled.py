@@ -1,9 +1,10 @@
 """A function of one run, compiled for many: called on arrays with a leading axis of runs, on all cores."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from types import MappingProxyType
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from heliograph.codegen.machine import Machine, features
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 
+LITTLE = 100_000  # operations of vectors: done sooner than other threads are woken
 SHARES = 4  # parts of the work for each core, so that one that is held up holds up little
 
 
@@ -52,18 +54,17 @@ class Compiled:
 
     def _run(self, pointers: np.ndarray, runs: int, cores: int) -> None:
         blocks = -(-runs // self.width)
+        if cores == 1 or blocks * self.code.work < LITTLE:
+            self._blocks(pointers, 0, blocks, runs)
+            return
         share = -(-blocks // (cores * SHARES))
-        starts = range(0, blocks, max(share, 1))
+        starts = range(0, blocks, share)
+        list(threads().map(lambda start: self._blocks(pointers, start, min(start + share, blocks), runs), starts))
 
-        def work(start: int) -> None:
-            scratch = aligned(self.code.scratch)
-            self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, start, min(start + share, blocks), runs)
-
-        if cores == 1 or len(starts) == 1:
-            for start in starts:
-                work(start)
-        else:
-            list(threads().map(work, starts))
+    def _blocks(self, pointers: np.ndarray, begin: int, end: int, runs: int) -> None:
+        """By this thread."""
+        scratch = aligned(self.code.scratch)
+        self.blocks.run(pointers.ctypes.data, scratch.ctypes.data, begin, end, runs)
 
     def _copy_common(self, outputs: list[np.ndarray], shared: np.ndarray) -> None:
         for array, common, place, buffer in zip(
@@ -75,13 +76,17 @@ class Compiled:
 
 
 class Alone:
-    """Code for one run: memory of its own for arguments and results, which a call reads and writes in place."""
+    """Code for one run: memory of its own for arguments and results, which a call reads and writes in place.
 
-    def __init__(self, program: Program):
-        code = written(program, [True] * len(program.inputs), 1, features()[2], alone=True)
+    `in_place` says which results, leaf by leaf, take the place of which arguments, such as a filter's state.
+    """
+
+    def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
+        code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
         self.code, self.machine, self.tree = code, Machine(code.blocks), program.tree
         self.inputs = [np.zeros(b.shape, DTYPES[b.type]) for b in program.inputs]
-        self.outputs = [np.zeros(b.shape, DTYPES[b.type]) for b in code.outputs]
+        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in code.outputs]
+        self.outputs = [self.inputs[in_place[k]] if k in in_place else x for k, x in enumerate(fresh)]
         self.scratch = aligned(code.scratch)
         self.pointers = pointers_to([*self.inputs, *code.tables, *self.outputs, aligned(code.shared)])
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
@@ -111,7 +116,7 @@ def best_width() -> int:
 
 def pointers_to(arrays: Sequence[np.ndarray]) -> np.ndarray:
     """Their addresses in memory."""
-    return np.array([x.ctypes.data for x in arrays], dtype=np.uint64)
+    return np.array([x.__array_interface__["data"][0] for x in arrays], dtype=np.uint64)
 
 
 def aligned(size: int) -> np.ndarray:

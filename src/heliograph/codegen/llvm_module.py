@@ -1,6 +1,7 @@
 """The functions of a compiled program as text, and where its numbers lie in memory."""
 
-from collections.abc import Iterable
+import math
+from collections.abc import Collection, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -8,9 +9,10 @@ import numpy as np
 from heliograph.codegen.folding import DTYPES
 from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store, Unsupported
 from heliograph.codegen.llvm_operations import BITS
-from heliograph.codegen.llvm_text import Slots, Writer, products_of
-from heliograph.codegen.lowering import Lowering, Value
-from heliograph.codegen.memory import InMemory, contiguous
+from heliograph.codegen.llvm_text import Slots, Writer, loops_of, products_of
+from heliograph.codegen.loops import copied
+from heliograph.codegen.lowering import Lowering
+from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.program import Program, needed
 from heliograph.codegen.random_bits import hash_function
 from heliograph.codegen.spread import varying
@@ -25,7 +27,8 @@ class Code(NamedTuple):
     """Text of the two functions, and what they are called with.
 
     `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
-    `scratch` bytes belong to a thread. `common` says which outputs all runs share.
+    `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` stand in the program,
+    and a block takes `work` of them, each turn of its loops counted.
     """
 
     blocks: str
@@ -37,28 +40,32 @@ class Code(NamedTuple):
     shared: int
     scratch: int
     operations: int
+    work: int
 
 
-def output_buffers(program: Program) -> list[Buffer]:
-    """Have a program store its results: each in a buffer of its own."""
+def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
+    """Have a program store its results: each in a buffer of its own.
+
+    Those of these numbers `last`, after everything else is computed, so that they may lie where arguments did.
+    """
     lowering = Lowering()
     lowering.graph = program.graph
     found: list[Buffer] = []
-    for value in program.outputs:
-        stored = _stored(lowering, value, found)
+    for number, value in enumerate(program.outputs):
+        nodes_only = number in last or not isinstance(value, InMemory)
+        stored = _filled(lowering, lowering.nodes(value)) if nodes_only else _stored(lowering, value, found)
         found.append(stored.buffer)
     return found
 
 
-def _stored(lowering: Lowering, value: Value, taken: list[Buffer]) -> InMemory:
-    if isinstance(value, InMemory):
-        buffer = value.buffer
-        whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
-        alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
-        if whole and alone and value.size == buffer.size:
-            return value
-    nodes = lowering.nodes(value)
-    return _filled(lowering, nodes)
+def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
+    """An array in memory as it is, where it is all of what the program filled; else copied."""
+    buffer = value.buffer
+    whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
+    alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
+    if whole and alone and value.size == buffer.size:
+        return value
+    return _filled(lowering, lowering.nodes(value)) if value.size <= LONG else copied(lowering, value)
 
 
 def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
@@ -70,15 +77,17 @@ def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
     return InMemory.whole(buffer)
 
 
-def written(program: Program, differing: Iterable[bool], width: int, fuse: bool, alone: bool = False) -> Code:
+def written(
+    program: Program, differing: Iterable[bool], width: int, fuse: bool, alone: bool = False, last: Collection[int] = ()
+) -> Code:
     """The text of a program whose inputs differ between runs, or do not.
 
-    `alone`: one run, whose arrays are used in place.
+    `alone`: one run, whose arrays are used in place; results of the numbers `last` may lie where arguments did.
 
     Raises:
         Unsupported: an operation that has no text.
     """
-    outputs = output_buffers(program)
+    outputs = output_buffers(program, last)
     lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
     items = needed(outputs)
     operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
@@ -113,12 +122,17 @@ def written(program: Program, differing: Iterable[bool], width: int, fuse: bool,
         once = _with_functions(_once(writer, program, pointers, in_shared), writer)
     arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
     places = [in_shared.get(b, 0) for b in outputs]
-    return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations)
+    return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, _work(mine))
 
 
 def sorted_items(items: Iterable[Any]) -> list[Any]:
     """In one order, whatever that of the set."""
     return sorted(items, key=lambda x: x.serial if isinstance(x, Node) else -1)
+
+
+def _work(items: Iterable[Any]) -> int:
+    """Operations of a block of runs; a loop that data end counts as one turn."""
+    return sum(math.prod(loop.length or 1 for loop in loops_of(x)) for x in items if isinstance(x, Node))
 
 
 def _places(buffers: Iterable[Buffer], width: int, start: int) -> tuple[int, dict[Buffer, int]]:

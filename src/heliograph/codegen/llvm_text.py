@@ -285,7 +285,7 @@ class Slots:
         if node not in self.places:
             self.places[node] = self.size
             turns = 1
-            for loop in _loops(node):
+            for loop in loops_of(node):
                 turns *= loop.length or 1
             self.size += 8 * turns
         return self.places[node]
@@ -310,7 +310,7 @@ class Slots:
 
     def _address(self, writer: Writer, node: Node) -> str:
         place, stride, index = self.place(node), 8, ""
-        for loop in _loops(node):
+        for loop in loops_of(node):
             assert loop.counter is not None
             part = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
             index = writer.add(f"add i64 {index}, {part}") if index else part
@@ -319,7 +319,7 @@ class Slots:
         return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
 
 
-def _loops(node: Node) -> list[Loop]:
+def loops_of(node: Node) -> list[Loop]:
     """The loops around a node, innermost first."""
     return [b.owner for b in node.block.inwards() if isinstance(b.owner, Loop)]
 

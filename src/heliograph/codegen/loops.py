@@ -144,6 +144,11 @@ def in_memory(lowering: Lowering, value: Value) -> InMemory:
     return InMemory.whole(buffer)
 
 
+def copied(lowering: Lowering, x: InMemory) -> InMemory:
+    """The same long array in new memory of its own."""
+    return repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1][0]
+
+
 def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     """Turns as long as some run's condition holds; a run whose condition does not keeps its numbers."""
     params, graph, outer = equation.params, lowering.graph, lowering.graph.current

@@ -28,6 +28,7 @@ class Lowering:
 
     def __init__(self) -> None:
         self.graph = Graph()
+        self.kernels: dict[Any, ClosedJaxpr] = {}  # traced for one run, once for equal shapes
 
     def inline(self, program: ClosedJaxpr | Jaxpr, inputs: Sequence[Value], consts: Sequence[Any] = ()) -> list[Value]:
         """The results of a traced program for these arguments."""

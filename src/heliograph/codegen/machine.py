@@ -3,7 +3,6 @@
 import ctypes
 from collections.abc import Callable
 from functools import cache
-from typing import Any
 
 import jax
 import llvmlite.binding as llvm
@@ -29,7 +28,10 @@ def features() -> tuple[str, str, bool, bool]:
 
 
 class Machine:
-    """Code of one text; the function `run` in it may be called as long as this is held."""
+    """Code of one text; the function `run` in it may be called as long as this is held.
+
+    LLVM's passes over the text find nothing more in straight lines, and take as long as making code of them.
+    """
 
     def __init__(self, text: str):
         level = 0 if jax.config.values["jax_disable_most_optimizations"] else 1
@@ -37,9 +39,6 @@ class Machine:
         machine = target().create_target_machine(cpu=cpu, features=flags, opt=level)
         module = llvm.parse_assembly(text)
         module.verify()
-        if level:
-            passes: Any = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=level))
-            passes.getModulePassManager().run(module, passes)
         self.engine = llvm.create_mcjit_compiler(module, machine)
         self.engine.finalize_object()
         self.run: Function = SIGNATURE(self.engine.get_function_address("run"))

@@ -8,7 +8,7 @@ from jax.extend.core import JaxprEqn
 
 from heliograph.codegen.elementwise import PASSED_ON
 from heliograph.codegen.graph import Buffer, Key, Node
-from heliograph.codegen.loops import in_memory, repeated
+from heliograph.codegen.loops import copied, in_memory
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
 from heliograph.codegen.memory import LONG, InMemory, contiguous
 from heliograph.codegen.shapes import FEW
@@ -154,9 +154,8 @@ def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
     if x.size <= LONG or not isinstance(x, InMemory):
         for place, node in enumerate(lowering.nodes(x).ravel().tolist()):
             graph.store(buffer, node, start + place, (), ())
-        return
-    stacked = repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1]
-    buffer.take_in(stacked[0].buffer, start)
+    else:
+        buffer.take_in(copied(lowering, x).buffer, start)
 
 
 VIEWS: dict[str, View] = {

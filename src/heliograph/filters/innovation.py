@@ -89,9 +89,10 @@ def log_density(value: jax.Array, covariance: jax.Array, size: jax.Array) -> jax
             pivot >= -rounding(NEGATIVE_TOLERANCE, value) * variance[j]
         )
         safe = jnp.where(determined, 1.0, pivot)
-        density = -(rest[j] ** 2 / safe + jnp.log(2 * np.pi * safe)) / 2
+        scale = 1 / safe
+        density = -(rest[j] ** 2 * scale + jnp.log(2 * np.pi * safe)) / 2
         agrees = jnp.where(jnp.abs(rest[j]) <= reach[j], 0.0, -jnp.inf)
-        column = jnp.where(determined, 0.0, left[:, j] / safe)
+        column = jnp.where(determined, 0.0, left[:, j] * scale)
         after = rest - column * rest[j], left - column[:, None] * left[j][None]
         return *after, total + jnp.where(determined, agrees, density)
 

@@ -9,6 +9,7 @@ import numpy as np
 from heliograph.filters.belief import Belief
 from heliograph.numerics.module import Module
 from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import symmetric
 from heliograph.numerics.types import Bool, Float
 
 
@@ -74,8 +75,9 @@ class MergeByMode(AbstractMerging):
 def merged(mean: jax.Array, covariance: jax.Array, weight: jax.Array) -> tuple[Belief, jax.Array]:
     """Means and covariances of the mixtures with weight (components, mixtures), and each mixture's weight."""
     law = jnp.sum(weight, axis=0)
-    share = jnp.where(law > 0, weight / jnp.where(law > 0, law, 1.0), 1 / len(weight))
+    share = jnp.where(law > 0, weight * (1 / jnp.where(law > 0, law, 1.0)), 1 / len(weight))
     center = jnp.sum(share[:, :, None] * mean[:, None], axis=0)
     apart = mean[:, None] - center
     inside = covariance[:, None] + apart[:, :, :, None] * apart[:, :, None]
-    return Belief(center, jnp.sum(share[:, :, None, None] * inside, axis=0)), law
+    spread = jnp.sum(share[:, :, None, None] * inside, axis=0)
+    return Belief(center, jnp.moveaxis(symmetric(jnp.moveaxis(spread, 0, 2)), 2, 0)), law

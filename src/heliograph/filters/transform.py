@@ -66,15 +66,15 @@ def _cubature_moments(offsets: jax.Array, values: jax.Array) -> Transformed:
 
 @runs_last
 def _center(values: jax.Array) -> jax.Array:
-    return add([values[:, j] for j in range(values.shape[1])]) / values.shape[1]
+    return add([values[:, j] for j in range(values.shape[1])]) * (1 / values.shape[1])
 
 
 @runs_last
 def _about(offsets: jax.Array, values: jax.Array, center: jax.Array) -> Transformed:
     n = offsets.shape[0]
-    spread = values - center[:, None]
-    cross = times(offsets, transpose(values[:, :n] - values[:, n:])) / (2 * n)
-    return Transformed(center, times(spread, transpose(spread)) / (2 * n), cross)
+    weight, spread = 1 / (2 * n), values - center[:, None]
+    cross = times(weight * offsets, transpose(values[:, :n] - values[:, n:]))
+    return Transformed(center, weight * times(spread, transpose(spread)), cross)
 
 
 class Linearization(AbstractTransform):

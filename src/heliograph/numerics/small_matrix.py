@@ -34,8 +34,13 @@ def transpose(a: Array) -> jax.Array:
 
 
 def symmetric(a: jax.Array) -> jax.Array:
-    """(A + A') / 2."""
-    return (a + transpose(a)) / 2
+    """A symmetric matrix from what is symmetric but for rounding: its upper triangle, mirrored.
+
+    Native code does not compute the lower one.
+    """
+    n = len(a)
+    upper = np.triu(np.ones((n, n), bool)).reshape(n, n, *[1] * (a.ndim - 2))
+    return jnp.where(upper, a, transpose(a))
 
 
 def add(terms: Sequence[Array]) -> jax.Array:
@@ -68,8 +73,8 @@ def times_vector(a: Array, x: jax.Array) -> jax.Array:
 
 
 def congruence(a: Array, p: jax.Array) -> jax.Array:
-    """A P A'."""
-    return times(times(a, p), transpose(a))
+    """A P A' for a symmetric P."""
+    return symmetric(times(times(a, p), transpose(a)))
 
 
 def inner(a: jax.Array, b: jax.Array) -> jax.Array:
