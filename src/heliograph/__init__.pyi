@@ -111,6 +111,9 @@ from .live.stream import (
 from .live.timeline import (
     Timeline as Timeline,
 )
+from .export.c_files import (
+    export_c as export_c,
+)
 from .planning.network_design import (
     design as design,
 )

@@ -10,6 +10,7 @@ from heliograph.cli.app import app
 from heliograph.cli.completion import completion
 from heliograph.cli.design import design
 from heliograph.cli.explore import explore
+from heliograph.cli.export import export
 from heliograph.cli.fit import fit
 from heliograph.cli.new import new
 from heliograph.cli.replay import replay
@@ -24,7 +25,7 @@ from heliograph.simulation.compilation_cache import keep_compilations
 BAD_INPUT = 2
 
 # In the order of the help.
-COMMANDS = new, run, fit, serve, replay, demo, example, reproduce, sweep, explore, design, completion
+COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
 for one in COMMANDS:
     app.command(one)
 

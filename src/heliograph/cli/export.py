@@ -1,0 +1,96 @@
+"""`heliograph export`: one step of a network's filter as C, for a device."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from cyclopts import Parameter
+
+from heliograph.cli.app import place
+
+if TYPE_CHECKING:
+    from heliograph.export.c_files import Exported
+    from heliograph.export.measure import Cost
+    from heliograph.simulation.network import Network
+
+
+def export(
+    network: str,
+    /,
+    *,
+    filter: Annotated[str, Parameter(help="Name of the filter.")],
+    out: Annotated[Path, place("The source to write, such as step.c; step.h is written beside it.")],
+    node: Annotated[str | None, Parameter(help="Node that has it; needed where several do.")] = None,
+    precision: Annotated[str, Parameter(help="double, or float: single precision.")] = "double",
+) -> None:
+    """Write one step of a filter of your own network as C99, for a device: no heap, no library but libm.
+
+    All names in the files begin with the name of the file. Printed are bytes, operations and the time of a step.
+
+    Parameters
+    ----------
+    network:
+        A Python file or module that holds a heliograph.Network: my_network.py, or my_network.py:name where it
+        holds several. The name may be that of a function that returns one.
+    """
+    from heliograph.disk.quoting import visible
+    from heliograph.export.c_files import PRECISIONS, check_place, export_named
+    from heliograph.export.measure import cost
+    from heliograph.export.text import claim_of
+    from heliograph.files.network_file import load_network
+    from heliograph.files.recording import received_names
+
+    check_place(out)
+    loaded = load_network(network)
+    chosen = node_of(loaded, filter, node)
+    item = loaded.nodes[chosen].filters[filter]
+    names = received_names(loaded.nodes[chosen])[: item.received]
+    written = export_named(item, out, precision, names)
+    measured = cost(written.header, written.source, item.received, len(item.inputs), PRECISIONS[precision])
+    claim = claim_of(item, PRECISIONS[precision])
+    print(visible(f"{written.header}, {written.source}: {chosen}/{filter} ({claim}), {precision} precision"))
+    print("\n".join(costs(written, measured)))
+
+
+def node_of(network: "Network", filter_: str, node: str | None) -> str:
+    """The node that has the filter.
+
+    Raises:
+        ValueError: no such node, or none or several that have it.
+    """
+    from heliograph.numerics.check import fail
+
+    having = [name for name in network.names if filter_ in network.nodes[name].filters]
+    if not having:
+        known = sorted({name for item in network.nodes.values() for name in item.filters})
+        raise fail("--filter", f"one of the network's filters {known}", repr(filter_))
+    if node is None and len(having) > 1:
+        raise fail("--node", f"one of {having}, which all have a filter {filter_!r}", "none")
+    if node is not None and node not in having:
+        raise fail("--node", f"one that has a filter {filter_!r} {having}", repr(node))
+    return having[0] if node is None else node
+
+
+KINDS = {
+    "additions": ("add", "sub", "neg"),
+    "multiplications": ("mul",),
+    "divisions": ("div",),
+    "roots": ("sqrt",),
+    "choices": ("select", "max", "min"),
+}
+
+
+def costs(written: "Exported", measured: "Cost") -> list[str]:
+    """What the step costs, in two lines."""
+    from heliograph.export.measure import COMPILER
+
+    counts = {kind: sum(written.operations.get(op, 0) for op in ops) for kind, ops in KINDS.items()}
+    counts["others"] = sum(written.operations.values()) - sum(counts.values())
+    parts = ", ".join(f"{count:,} {kind}" for kind, count in counts.items() if count)
+    state = f"state {written.state_bytes:,} bytes"
+    code = "code unmeasured" if measured.code_bytes is None else f"code {measured.code_bytes:,} bytes"
+    time = (
+        f"time unmeasured: no C compiler {COMPILER!r} here"
+        if measured.nanoseconds is None
+        else f"a step {measured.nanoseconds:,.0f} ns ({COMPILER} -O2 on this machine)"
+    )
+    return [f"{sum(written.operations.values()):,} operations: {parts}", f"{state}, {code}, {time}"]

@@ -1,0 +1,1 @@
+"""Filters as source code for devices that have neither Python nor a heap."""

@@ -1,0 +1,105 @@
+"""A filter as two files of C99."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from heliograph.codegen.c_operations import Real
+from heliograph.disk.output_file import check_output
+from heliograph.disk.whole_file import whole_files
+from heliograph.export.program import step_program
+from heliograph.export.text import CText, Form, c_text
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.factored import factored
+from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.model.over_time import first
+from heliograph.numerics.check import fail, instance, shown
+
+PRECISIONS: dict[str, Real] = {"double": "double", "float": "float"}
+RESERVED = frozenset((
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
+    "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed", "sizeof",
+    "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+))  # fmt: skip
+
+
+class Exported(NamedTuple):
+    """The files, how often each operation stands in a step, and bytes of the state."""
+
+    header: Path
+    source: Path
+    operations: dict[str, int]
+    state_bytes: int
+
+
+def export_c(filter: AbstractFilter, path: str | Path, precision: str = "double") -> Exported:
+    """Write one step of a filter as C99, for a device: `step.h` and `step.c` where `path` is "step.c".
+
+    `step_start(state)` begins; `step_step(state, z, u)` predicts over one step with the inputs u and uses what arrived
+    of z (NaN: did not arrive), and returns 0, or refuses by another number and leaves the state as it was;
+    `step_mean(state)` and `step_covariance(state)` (row by row) are the estimate. No heap, no variables of the file, no
+    library but libm. All names begin with the name of the file.
+
+    `precision`: "double", which agrees with `Stream` to rounding; "float", single precision with the covariance as
+    L D L', whose variances stay positive, for linear, extended and cubature filters and schedules of gains. The filter
+    of a plant that varies over time holds its tables, and refuses a step past their end.
+
+    Raises:
+        ValueError: no filter; a path that does not end in .c, is no name in C or cannot be written; random numbers, or
+            operations that C has not, with the line they come from; single precision of another filter. Then nothing
+            is written.
+    Source: Bierman, Factorization methods for discrete sequential estimation (1977), for single precision.
+    """
+    return export_named(filter, path, precision, None)
+
+
+def export_named(filter_: object, path: str | Path, precision: str, received: Sequence[str] | None) -> Exported:
+    """`export_c` with names for the components of z, z0, z1, ... or the sensor's where none are given.
+
+    Raises:
+        ValueError: what `export_c` refuses.
+    """
+    item: AbstractFilter = instance("export", filter_, AbstractFilter, "a filter")
+    source = check_place(path)
+    if precision not in PRECISIONS:
+        raise fail("precision", " or ".join(PRECISIONS), shown(precision))
+    text = text_of(item, source.stem, PRECISIONS[precision], received)
+    header = source.with_suffix(".h")
+    with whole_files([header, source]) as partials:
+        for partial, content in zip(partials, (text.header, text.source), strict=True):
+            partial.write_text(content, encoding="utf-8")
+    return Exported(header, source, text.operations, text.state_bytes)
+
+
+def check_place(path: str | Path) -> Path:
+    """The path of the source, whose name begins the names in it.
+
+    Raises:
+        ValueError: a path that does not end in .c, is no name in C or cannot be written.
+    """
+    source = Path(path)
+    check_output(source, (".c",))
+    check_output(source.with_suffix(".h"), (".h",))
+    stem = source.stem
+    if not (stem.isascii() and stem.isidentifier()) or stem in RESERVED or stem.startswith("_"):
+        raise fail(f"output file {source}", "a name that C takes for its functions, such as step.c", repr(stem))
+    return source
+
+
+def text_of(item: AbstractFilter, prefix: str, real: Real, received: Sequence[str] | None = None) -> CText:
+    """Both files of a filter.
+
+    Raises:
+        ValueError: random numbers, operations that C has not, single precision of a filter that has no such form.
+    """
+    names = received_names(item) if received is None else received
+    kind = f"a {type(item).__name__} in {'double' if real == 'double' else 'single'} precision"
+    if real == "float" and not isinstance(item, ScheduledFilter):  # whose covariances are a table
+        item, kind = factored(item), f"{kind}, its covariance as L D L'"
+    return c_text(step_program(item), Form(prefix, real, names, kind))
+
+
+def received_names(item: AbstractFilter) -> Sequence[str]:
+    """The sensor's outputs where the filter has a sensor and as many arrive, else z0, z1, ..."""
+    outputs: tuple[str, ...] = first(item.sensor).outputs if hasattr(item, "sensor") else ()
+    return outputs if len(outputs) == item.received else [f"z{i}" for i in range(item.received)]

@@ -1,0 +1,152 @@
+"""One step of a filter as a graph of scalar operations: from state, measurement and inputs to state and estimate."""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.codegen.finite import DeviceLowering, FiniteGraph
+from heliograph.codegen.graph import Buffer, Node, Unsupported
+from heliograph.codegen.lowering import array_of, place, traced, type_of
+from heliograph.codegen.memory import InMemory
+from heliograph.codegen.program import scalars
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.check import InputError, fail
+from heliograph.numerics.types import PyTree
+
+RANDOM = ("random_", "threefry")
+
+
+class Leaf(NamedTuple):
+    """An array of the state: its name, its buffer, its numbers at the start and the nodes after a step."""
+
+    name: str
+    buffer: Buffer
+    start: np.ndarray
+    after: list[Node]
+
+
+class StepProgram(NamedTuple):
+    """A step: what it reads, what it makes; `mean` and `covariance` also before the first step."""
+
+    filter: AbstractFilter
+    graph: FiniteGraph
+    leaves: list[Leaf]
+    z: Buffer
+    u: Buffer
+    k: Buffer
+    mean: list[Node]
+    covariance: list[Node]
+    start_mean: np.ndarray
+    start_covariance: np.ndarray
+    equations: list[Any]
+
+
+def step_program(item: AbstractFilter) -> StepProgram:
+    """Lower `step` of a filter.
+
+    An array of the state that is symmetric at the start, and after every step that began with a symmetric one, is
+    symmetric always: then one of its triangles is read and the other only written.
+
+    Raises:
+        ValueError: random numbers, operations that are not lowered; with the operation and its place.
+    """
+    state = item.init()
+    leaves, tree = jax.tree.flatten(state)
+    z, u, k = np.zeros(item.received), np.zeros(len(item.inputs)), np.asarray(0)
+
+    def step(leaves: list[jax.Array], z: jax.Array, u: jax.Array, k: jax.Array) -> PyTree:
+        after, estimate = item.step(jax.tree.unflatten(tree, leaves), z, u, k)
+        return jax.tree.leaves(after), estimate.mean, estimate.covariance
+
+    program, _ = traced(step, leaves, z, u, k)
+    equations = list(_equations(program.jaxpr))
+    for equation in equations:
+        if equation.primitive.name.startswith(RANDOM):
+            raise no_c(equation.primitive.name, place(equation))
+    estimate, names = item.estimate(state), names_of(state)
+    symmetric = {i for i, leaf in enumerate(leaves) if _is_symmetric(np.asarray(leaf))}
+    while True:
+        graph, inputs, outputs = _lowered(program, len(leaves), symmetric)
+        lost = {i for i in symmetric if not _is_symmetric(np.asarray(outputs[i]))}
+        if not lost:
+            break
+        symmetric -= lost
+    *buffers, of_z, of_u, of_k = inputs
+    *after, mean, covariance = map(scalars, outputs)
+    parts = zip(names, buffers, map(np.asarray, leaves), after, strict=True)
+    return StepProgram(
+        filter=item,
+        graph=graph,
+        leaves=[Leaf(*part) for part in parts],
+        z=of_z,
+        u=of_u,
+        k=of_k,
+        mean=mean,
+        covariance=covariance,
+        start_mean=np.asarray(estimate.mean),
+        start_covariance=np.asarray(estimate.covariance),
+        equations=equations,
+    )
+
+
+def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGraph, list[Buffer], list[Any]]:
+    """Graph, input buffers and output values; the last inputs are z, u and k."""
+    lowering, inputs, values = DeviceLowering(), [], []
+    graph = lowering.graph
+    try:
+        for number, variable in enumerate(program.jaxpr.invars):
+            aval = variable.aval
+            buffer = Buffer("input", type_of(aval), tuple(aval.shape), graph.top)
+            inputs.append(buffer)
+            if number != leaves:  # all but the measurement, of which components may be missing
+                graph.buffers.add(buffer)
+            value: Any = InMemory.whole(buffer)
+            if number in symmetric:
+                nodes, n = value.nodes(graph), aval.shape[0]
+                value = array_of([nodes[min(i, j), max(i, j)] for i in range(n) for j in range(n)], aval.shape)
+            values.append(value)
+        with jax.enable_x64(True):
+            outputs = [lowering.nodes(x) for x in lowering.inline(program, values)]
+    except Unsupported as found:
+        raise no_c(found.operation, found.place) from None
+    return graph, inputs, outputs
+
+
+def no_c(operation: str, where: str) -> InputError:
+    """The one line on what cannot be exported."""
+    return fail("export", "operations that C has", f"{operation} at {where}")
+
+
+def place_of(operation: str, equations: list[Any]) -> str:
+    """The line that an operation of the graph comes from."""
+    same = (e for e in equations if e.primitive.name.removesuffix("_convert_type") == operation)
+    return next((place(e) for e in same), "an unknown line")
+
+
+def names_of(state: PyTree) -> list[str]:
+    """Names in C for the arrays of a state, after the fields in which they stand."""
+    names: list[str] = []
+    for path, _ in jax.tree_util.tree_flatten_with_path(state)[0]:
+        parts = (str(getattr(k, "name", getattr(k, "key", getattr(k, "idx", "")))) for k in path)
+        text = "_".join("".join(c if c.isalnum() and c.isascii() else "_" for c in p) for p in parts)
+        text = f"state_{text}".rstrip("_") if not text or not text[0].isalpha() else text
+        names.append(text if text not in names else f"{text}_{len(names)}")
+    return names
+
+
+def _is_symmetric(value: np.ndarray) -> bool:
+    if value.ndim != 2 or value.shape[0] != value.shape[1] or len(value) < 2:
+        return False
+    return all(value[i, j] == value[j, i] for i in range(len(value)) for j in range(i))
+
+
+def _equations(jaxpr: Any) -> Iterator[Any]:
+    """All operations, those of programs inside too."""
+    for equation in jaxpr.eqns:
+        yield equation
+        for part in equation.params.values():
+            for inner in part if isinstance(part, tuple | list) else (part,):
+                if hasattr(inner, "eqns") or hasattr(inner, "jaxpr"):
+                    yield from _equations(getattr(inner, "jaxpr", inner))

@@ -1,0 +1,277 @@
+"""A filter as C: the numbers of Python, what it refuses, and what the files hold."""
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.disk import whole_file
+from heliograph.export.measure import COMPILER, FLAGS
+from tests.export.device import Device, needs_compiler
+from tests.follow import apart, follow
+
+README = (Path(__file__).parents[2] / "README.md").read_text()
+STEPS = 10_000
+LINE = hg.LinearPlant([[1, 0.1], [0, 0.95]], 0.02 * np.eye(2), [1.0, 2.0], np.eye(2), [[0.0], [0.1]])
+RANGE = hg.LinearSensor([[1.0, 0.3]], 0.05)
+FADING = hg.hop(hg.Rayleigh(0.8), 0.02)
+TWO_GAINS = hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5]), 0.1)
+
+
+@pytest.fixture(scope="module")
+def readme():
+    """The network of the README, as it stands there."""
+    scope: dict = {"__name__": "my_network"}
+    exec(re.search(r"<!-- file: my_network.py -->\n```python\n(.*?)```", README, re.DOTALL)[1], scope)
+    return scope["network"]
+
+
+@pytest.fixture(scope="module")
+def recording(readme):
+    """10,000 steps of a cart that is held between its walls; a fifth of the components did not arrive."""
+    rng, x = np.random.default_rng(1), np.array([5.0, 0.0])
+    z, u = np.empty((STEPS, 2)), np.full((STEPS, 2), 0.5)
+    for k in range(STEPS):
+        u[k, 0] = -0.5 * (x[0] - 5) - x[1] + 0.3 * rng.normal()
+        x = x + u[k, 1] * np.array([x[1], u[k, 0]]) + rng.normal(size=2) * np.sqrt([1e-4, 5e-3])
+        relayed = 1.2 * (rng.rayleigh(0.8) * (x[0] + 0.1 * rng.normal()) + 0.14 * rng.normal()) + 0.1 * rng.normal()
+        z[k] = relayed, 10 - x[0] + 0.1 * rng.normal()
+    z[rng.random((STEPS, 2)) < 0.2] = np.nan
+    return z, u
+
+
+@pytest.fixture(scope="module")
+def recorded(readme, recording):
+    return hg.run(readme, {"cart": recording[0]}, inputs=recording[1]).estimates["cart"]
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["relay_aware", "mean_gain"])
+@pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-4)])
+def test_the_readme_s_filters_are_those_of_run(readme, recording, recorded, tmp_path, name, precision, most):
+    """In deviations. Single precision: the mean itself, up to 10 m, is known to 6e-7 m, 1e-5 of its deviation."""
+    device = Device(readme.nodes["cart"].filters[name], tmp_path, precision=precision)
+    reference = recorded[name].mean, recorded[name].covariance
+    assert max(apart(device.follow(*recording), reference)) < most
+
+
+def changing():
+    """A plant and a link that change from step to step."""
+    plants = [hg.LinearPlant([[1, 0.1], [0, 0.9 + k / 999]], (0.01 + k / 999) * np.eye(2), [1, 2], np.eye(2),
+                             [[0], [0.1]]) for k in range(30)]  # fmt: skip
+    hops = [hg.hop(hg.Rayleigh(0.5 + k / 30), 0.02) for k in range(30)]
+    return hg.linear_filter(hg.model.over_time(plants), RANGE, hg.model.over_time(hops))
+
+
+def scheduled():
+    """A relay that filters and forwards, as a schedule of gains."""
+    plant = hg.LinearPlant(LINE.matrix, LINE.noise, LINE.initial_mean, LINE.initial_covariance)
+    slots = [{"relay": {"sensor": FADING}}, {"receiver": {"relay": FADING}}]
+    network = hg.model.RelayNetwork(plant, RANGE, ["relay"], slots)
+    design = hg.relays.own_error_design(network, 30)
+    return hg.filters.ScheduledFilter(hg.relays.relay_schedules(network, design)["relay"])
+
+
+FILTERS = {
+    "linear behind a random gain": lambda: hg.linear_filter(LINE, RANGE, FADING),
+    "over time": changing,
+    "uncertain probabilities": lambda: hg.linear_filter(
+        LINE, RANGE, hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
+    ),
+    "late": lambda: hg.linear_filter(LINE, RANGE, hg.model.delayed(FADING, hg.Discrete([0, 1], [0.5, 0.5]))),
+    "squares of what arrives": lambda: hg.polynomial_filter(
+        hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1), TWO_GAINS, horizon=30, degree=2
+    ),
+    "hidden modes": lambda: hg.linear_filter(LINE, RANGE, hg.gilbert_elliott(FADING, hg.hop(0.2, 0.05), 0.2, 0.3)),
+}
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", FILTERS)
+def test_other_filters_too(name, tmp_path):
+    """To rounding over 30 steps, one of them without data."""
+    item, rng = FILTERS[name](), np.random.default_rng(0)
+    z, u = rng.normal(size=(30, item.received)) + 1, 0.1 * rng.normal(size=(30, len(item.inputs)))
+    z[4] = np.nan
+    assert max(apart(Device(item, tmp_path).follow(z, u), follow(item, z, u))) < 1e-12
+
+
+@needs_compiler
+@pytest.mark.parametrize(("precision", "most"), [("double", 1e-12), ("float", 1e-5)])
+def test_a_relay_s_schedule(precision, most, tmp_path):
+    """Its gains and its covariance are tables: complete data, and NaN for the covariance after a gap."""
+    item = scheduled()
+    device, z = Device(item, tmp_path, precision=precision), np.random.default_rng(0).normal(size=(30, 1))
+    assert np.isnan(device.mean()).all(), "before its first prediction a schedule estimates nothing"
+    assert max(apart(device.follow(z, np.zeros((30, 0))), follow(item, z, np.zeros((30, 0))))) < most
+    assert device.step([0.0]) == 3, "past its end"
+    device = Device(item, tmp_path, name=f"again_{precision}", precision=precision)
+    assert device.step([np.nan]) == 0 and np.isnan(device.covariance()).all() and np.isfinite(device.mean()).all()
+
+
+@needs_compiler
+def test_what_is_refused_leaves_the_state(tmp_path):
+    device = Device(changing(), tmp_path)
+    assert device.step([1.0], [0.1]) == 0
+    before = device.state.copy()
+    for z, u, code in (([np.inf], [0.0], 1), ([1.0], [np.nan], 2), ([1.0], [-np.inf], 2)):
+        assert device.step(z, u) == code
+        np.testing.assert_array_equal(device.state, before)
+    assert [device.step([1.0], [0.1]) for _ in range(30)] == [0] * 29 + [3]
+    before = device.state.copy()
+    assert device.step([1.0], [0.1]) == 3
+    np.testing.assert_array_equal(device.state, before)
+
+
+@needs_compiler
+def test_an_estimate_that_is_no_number_is_refused(tmp_path):
+    """A finite input whose square is not."""
+    plant = hg.Plant(lambda x, u: 0.9 * x + u**2, 0.1, [0.0], 1.0, inputs=["u"])
+    device = Device(hg.extended_filter(plant, hg.LinearSensor([[1.0]], 0.1), FADING), tmp_path)
+    assert device.step([1.0], [0.5]) == 0
+    before = device.state.copy()
+    assert device.step([1.0], [1e200]) == 4
+    np.testing.assert_array_equal(device.state, before)
+    assert device.step([1.0], [0.5]) == 0 and np.isfinite(device.mean()).all()
+
+
+def precise():
+    """Position measured a hundred million times better than it is known."""
+    plant = hg.LinearPlant([[1, 0.1], [0, 1]], np.diag([0.0, 1e-6]), [0, 0], 1e6 * np.eye(2))
+    return hg.kalman_filter(plant, hg.LinearSensor([[1.0, 0.0]], 1e-2))
+
+
+MILLION = """
+#include <stdio.h>
+#include "step.h"
+int main(void)
+{
+    static step_state state;
+    step_start(&state);
+    for (long k = 0; k < 1000000; ++k) {
+        float z[1] = {(float)(k % 7 - 3)};
+        if (step_step(&state, z, 0)) return 1;
+        const float *p = step_covariance(&state);
+        if (!(p[0] > 0 && p[3] > 0 && p[0] * p[3] > p[1] * p[2])) return 2;
+    }
+    printf("%.9g %.9g %.9g", step_covariance(&state)[0], step_covariance(&state)[1], step_covariance(&state)[3]);
+    return 0;
+}
+"""
+
+
+@needs_compiler
+def test_single_precision_keeps_variances_positive(tmp_path):
+    """P_0 / R = 1e8 over a million steps; the end is the steady covariance, to the rounding of a few products."""
+    item = precise()
+    hg.export_c(item, tmp_path / "step.c", "float")
+    (tmp_path / "main.c").write_text(MILLION)
+    subprocess.run([COMPILER, *FLAGS, "main.c", "step.c", "-lm", "-o", "main"], cwd=tmp_path, check=True)
+    said = subprocess.run([str(tmp_path / "main")], capture_output=True, text=True, check=True).stdout
+    steady = follow(item, np.zeros((3000, 1)), np.zeros((3000, 0)))[1][-1]
+    np.testing.assert_allclose(np.array(said.split(), float), [steady[0, 0], steady[0, 1], steady[1, 1]], rtol=1e-5)
+
+
+@needs_compiler
+def test_the_first_precise_measurement_keeps_its_digits(tmp_path):
+    """1e6 measured with 1e-2 leaves 1e-2 in single precision too, where P - P^2 / (P + R) is nothing."""
+    p, r = np.float32(1e6), np.float32(1e-2)
+    assert p - p * p / (p + r) == 0
+    device = Device(precise(), tmp_path, precision="float")
+    assert device.step([0.0]) == 0
+    np.testing.assert_allclose(device.covariance()[0, 0], 1e-2, rtol=1e-6)
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("nm") is None, reason="no command nm, which lists an object's symbols")
+@pytest.mark.parametrize("precision", ["double", "float"])
+def test_no_heap_no_variables_no_library_but_libm(readme, tmp_path, precision):
+    hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c", precision)
+    subprocess.run([COMPILER, *FLAGS, "-c", "cart.c", "-o", "cart.o"], cwd=tmp_path, check=True)
+    listed = subprocess.run(["nm", "cart.o"], cwd=tmp_path, capture_output=True, text=True, check=True).stdout
+    symbols = [line.split()[-2:] for line in listed.splitlines()]
+    assert {name for kind, name in symbols if kind == "U"} == {"sqrt" if precision == "double" else "sqrtf"}
+    assert sorted(name for kind, name in symbols if kind == "T") == [
+        "cart_covariance", "cart_mean", "cart_start", "cart_step",
+    ]  # fmt: skip
+    assert not [name for kind, name in symbols if kind in "BbDdC"]
+
+
+def test_the_files_say_what_they_are(readme, tmp_path):
+    written = hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c")
+    header, source = written.header.read_text(), written.source.read_text()
+    for text in ("z[0]: left", "u[1]: dt", "mean[1]: velocity", "Claim: nominal", f"heliograph {hg.__version__}"):
+        assert text in header
+    assert "typedef struct {\n    double mean[2];\n    double covariance[4];\n} cart_state;" in header
+    assert written.state_bytes == 48 and written.operations["mul"] < 200
+    again = hg.export_c(readme.nodes["cart"].filters["relay_aware"], tmp_path / "cart.c")
+    assert (again.header.read_text(), again.source.read_text()) == (header, source)
+    exact = hg.export_c(hg.linear_filter(LINE, RANGE, FADING), tmp_path / "line.c")
+    single = hg.export_c(hg.linear_filter(LINE, RANGE, FADING), tmp_path / "line_f.c", "float")
+    assert "Claim: exact" in exact.header.read_text() and "Claim: nominal" in single.header.read_text()
+
+
+def test_a_name_does_not_end_the_comment(tmp_path):
+    plant = hg.LinearPlant([[0.9]], 1.0, [0.0], 1.0, states=["*/ int x; /*"])
+    item = hg.kalman_filter(plant, hg.LinearSensor([[1.0]], 1.0))
+    header = hg.export_c(item, tmp_path / "a.c").header.read_text()
+    assert header.count("*/") == 1 and header.count("/*") == 1
+
+
+def with_transition(function):
+    plant = hg.Plant(function, 0.1 * np.eye(2), [0.0, 0.0], np.eye(2))
+    return hg.extended_filter(plant, RANGE, FADING)
+
+
+SHIFTED = with_transition(lambda x, u: jax.lax.conv(x[None, None], jnp.ones((1, 1, 1)), (1,), "SAME")[0, 0])
+BEYOND = with_transition(lambda x, u: jax.scipy.special.erfinv(x / 9))
+HIDDEN = hg.gilbert_elliott(FADING, hg.hop(0.2, 0.05), 0.2, 0.3)
+UNKNOWN = hg.hop(hg.Discrete([0.8, 1.2], [0.5, 0.5], 0.1), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("make", "path", "precision", "words"),
+    [
+        (lambda: hg.filters.particle_filter(LINE, RANGE, HIDDEN, 9), "a.c", "double", "got random_.*particle.py:"),
+        (lambda: SHIFTED, "a.c", "double", r"C has, got conv_general_dilated at .*test_c_files\.py:\d+"),
+        (lambda: BEYOND, "a.c", "double", r"operations that C has, got erf_inv at .*test_c_files\.py:\d+"),
+        (lambda: hg.linear_filter(LINE, RANGE, FADING), "a.cpp", "double", "a name that ends in .c"),
+        (lambda: hg.linear_filter(LINE, RANGE, FADING), "2a.c", "double", "a name that C takes"),
+        (lambda: hg.linear_filter(LINE, RANGE, FADING), "while.c", "double", "a name that C takes"),
+        (lambda: hg.linear_filter(LINE, RANGE, FADING), "no/a.c", "double", "an existing folder"),
+        (lambda: hg.linear_filter(LINE, RANGE, FADING), "a.c", "half", "expected double or float, got 'half'"),
+        (lambda: hg.linear_filter(LINE, RANGE, UNKNOWN), "a.c", "float", "probabilities are known"),
+        (lambda: hg.linear_filter(LINE, RANGE, HIDDEN), "a.c", "float", "or a schedule of gains, got ModalFilter"),
+        (lambda: "relay_aware", "a.c", "double", "export: expected a filter"),
+    ],
+)  # fmt: skip
+def test_one_line_and_nothing_written(make, path, precision, words, tmp_path):
+    with pytest.raises(ValueError, match=words) as refused:
+        hg.export_c(make(), tmp_path / path, precision)
+    assert "\n" not in str(refused.value) and not list(tmp_path.iterdir())
+
+
+def test_both_files_or_none(tmp_path, monkeypatch):
+    """The second file cannot take its place: the first is what it was before."""
+    item, replace = hg.linear_filter(LINE, RANGE, FADING), whole_file.replace
+    (tmp_path / "a.h").write_text("before")
+
+    def full(partial, path):
+        if path.suffix == ".c":
+            raise OSError(28, "No space left on device")
+        replace(partial, path)
+
+    monkeypatch.setattr(whole_file, "replace", full)
+    with pytest.raises(OSError, match=r"No space left on device: '.*a\.c'"):
+        hg.export_c(item, tmp_path / "a.c")
+    assert [p.name for p in tmp_path.iterdir()] == ["a.h"] and (tmp_path / "a.h").read_text() == "before"
+    (tmp_path / "a.h").unlink()
+    with pytest.raises(OSError, match="No space"):
+        hg.export_c(item, tmp_path / "a.c")
+    assert not list(tmp_path.iterdir())
