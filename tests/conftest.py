@@ -10,6 +10,8 @@ import tempfile
 
 import pytest
 
+from tests.parts import RealParts, started
+
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 IN_A_HURRY = (
     "--xla_cpu_use_fusion_emitters=false",
@@ -20,6 +22,7 @@ IN_A_HURRY = (
 
 def pytest_configure(config):
     """The first process sets the environment; workers and the commands that tests start find it there."""
+    config.pluginmanager.register(RealParts())
     if FOLDER not in os.environ:
         os.environ[FOLDER] = config.compilations = tempfile.mkdtemp(prefix="heliograph-tests-")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
@@ -79,10 +82,18 @@ def forget():
 
 
 @pytest.fixture(scope="session")
-def fits(tmp_path_factory):
-    """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
+def widths(tmp_path_factory):
+    """One browser for all pages."""
     from tests.widths import Widths
 
     widths = Widths(tmp_path_factory.mktemp("pages") / "page.html")
     yield widths
     widths.close()
+
+
+@pytest.fixture
+def fits(widths, request):
+    """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
+    if widths.there():
+        started(request.node, "browser")
+    return widths

@@ -12,8 +12,11 @@ import heliograph as hg
 from heliograph import cli
 from heliograph.examples.motor_drive import compute, drive, example, listeners, machine
 from heliograph.examples.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
+from heliograph.numerics.extras import how_to_install
 
-needs_simulator = pytest.mark.skipif(find_spec("gym_electric_motor") is None, reason="needs the extra motor")
+needs_simulator = pytest.mark.skipif(
+    find_spec("gym_electric_motor") is None, reason=f"no motor simulator here: {how_to_install('motor')}"
+)
 RUNNING = np.array([3.0, -1.0, 0.1, -0.37, 124.0, 2.0])  # A, Vs, rad/s, Nm: near the drive's end
 
 
