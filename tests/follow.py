@@ -1,0 +1,92 @@
+"""A filter stepped over rows of measurements by one compiled scan, and many filters of one structure side by side."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.model import Innovation
+from heliograph.numerics.float64 import compiled
+
+ROWS = 8  # what is compiled serves every number of rows up to the next multiple of it
+
+
+class Followed(NamedTuple):
+    """What a filter says after each row, and its state after the last one.
+
+    Shapes: mean (rows, n), covariance (rows, n, n); innovation of (rows, m), (rows, m, m) and (rows,).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    innovation: Innovation
+    state: Any
+
+
+def follow(item: AbstractFilter, z: Any, u: Any = None) -> Followed:
+    """Predict and correct over rows, from the filter's start.
+
+    z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs).
+    """
+    z = np.array([measured(item, row) for row in z])
+    u = np.array([given(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
+    assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
+    return _cut(_follow(item, *_padded(z, u), len(z)), len(z), 0)
+
+
+def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:
+    """`follow` of each filter over rows of its own, z (filters, rows, received), with the filters as first axis.
+
+    Filters of one structure are one program, whatever their numbers: a property is tried on all of them at once.
+    """
+    rows, groups = np.asarray(z), {}
+    for i, item in enumerate(items):
+        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(item))
+        groups.setdefault((jax.tree.structure(item), shapes), []).append(i)
+    parts, order = [], np.concatenate([*groups.values()])
+    for chosen in groups.values():
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in chosen])
+        data, inputs = _padded(rows[chosen], np.zeros((*rows[chosen].shape[:2], 0)))
+        parts.append(_cut(_follow_each(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[np.argsort(order)], *parts)
+
+
+def _padded(z: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in which nothing arrives after the others."""
+    more = -z.shape[-2] % ROWS
+    width = [(0, 0)] * (z.ndim - 2) + [(0, more), (0, 0)]
+    return np.pad(z, width, constant_values=np.nan), np.pad(u, width)
+
+
+def _cut(result: Followed, rows: int, axis: int) -> Followed:
+    """Without the rows that were added."""
+    steps = jax.tree.map(lambda leaf: np.take(leaf, np.arange(rows), axis), result._replace(state=()))
+    return steps._replace(state=result.state)
+
+
+def _scan(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
+    start = jax.tree.map(jnp.asarray, item.init())
+
+    def body(carry: Any, row: Any) -> Any:
+        state, until_last = carry
+        k, z_k, u_k = row
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        until_last = jax.tree.map(lambda new, old: jnp.where(k < last, new, old), after, until_last)
+        estimate = item.after_step(after, k)
+        return (after, until_last), (estimate.mean, estimate.covariance, innovation)
+
+    (_, state), steps = jax.lax.scan(body, (start, start), (jnp.arange(len(z)), z, u))
+    return Followed(*steps, state)
+
+
+@compiled
+def _follow(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
+    return _scan(item, z, u, last)
+
+
+@compiled
+def _follow_each(items: AbstractFilter, z: Any, u: Any) -> Followed:
+    return jax.vmap(lambda item, rows, inputs: _scan(item, rows, inputs, len(rows)))(items, z, u)
