@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter, given, measured
-from heliograph.model import Innovation
+from heliograph.model import Estimate, Innovation
 from heliograph.numerics.float64 import compiled
 
 ROWS = 8  # what is compiled serves every number of rows up to the next multiple of it
@@ -35,6 +35,12 @@ def follow(item: AbstractFilter, z: Any, u: Any = None) -> Followed:
     u = np.array([given(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
     assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
     return _cut(_follow(item, *_padded(z, u), len(z)), len(z), 0)
+
+
+def last(item: AbstractFilter, z: Any, u: Any = None) -> Estimate:
+    """The estimate after the last of these rows."""
+    steps = follow(item, z, u)
+    return Estimate(steps.mean[-1], steps.covariance[-1], item.claim)
 
 
 def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:

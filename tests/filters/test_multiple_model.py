@@ -6,6 +6,7 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.follow import follow
 
 PLANT = hg.LinearPlant([[0.98]], 0.04, [0.0], 0.04 / (1 - 0.98**2))
 SENSOR = hg.LinearSensor([[1.0]], 0.05)
@@ -61,11 +62,9 @@ def exact(plant, sensor, links, data, arrival=(1.0, 1.0, 1.0)):
 
 
 def stepped(item, data):
-    state, found, total = item.init(), None, 0.0
-    for k, z in enumerate(data):
-        state, heard = item.correct(item.predict(state, (), k), np.atleast_1d(z), k)
-        found, total = item.estimate(state), total + float(heard.log_likelihood)
-    return found, total
+    """The estimate after the last measurement, and the log-likelihood of all."""
+    steps = follow(item, data)
+    return hg.model.Estimate(steps.mean[-1], steps.covariance[-1], item.claim), steps.innovation.log_likelihood.sum()
 
 
 def steady_law():

@@ -5,6 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.follow import follow
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors
 
@@ -13,12 +14,8 @@ HORIZON = 10
 
 
 def run(item, data):
-    state, means, bounds = item.init(), [], []
-    for k, z in enumerate(data):
-        state, estimate = item.step(state, z, (), k)
-        means.append(np.asarray(estimate.mean))
-        bounds.append(np.asarray(estimate.covariance))
-    return np.array(means), np.array(bounds)
+    """Means and covariances after each measurement."""
+    return follow(item, data)[:2]
 
 
 def measurements(outputs, seed=0):
