@@ -1,7 +1,8 @@
 """A network that a property test drew, as Python that makes it again: what a failing one prints."""
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from operator import attrgetter
@@ -27,6 +28,16 @@ def as_code(**parts: Any) -> str:
     lines = [f"{name} = {expression(value, modules)}" for name, value in parts.items()]
     imports = ["import numpy as np", "import heliograph as hg", *(f"import {module}" for module in sorted(modules))]
     return "\n".join([*imports, *lines])
+
+
+@contextmanager
+def printing(**parts: Any) -> Iterator[None]:
+    """Add these parts as code to what is said when the test inside fails."""
+    try:
+        yield
+    except Exception as error:
+        error.add_note(f"What was drawn:\n{as_code(**parts)}")
+        raise
 
 
 def expression(value: Any, modules: set[str]) -> str:

@@ -5,7 +5,7 @@ import pytest
 
 import heliograph as hg
 from tests import test_properties
-from tests.as_code import as_code
+from tests.as_code import as_code, printing
 
 HOP = hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7], 0.05), 0.1, amplification=1.4)
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]], name="door")  # one without a name is like no other
@@ -50,3 +50,10 @@ def test_a_property_that_fails_prints_it():
     plant, sensor, chains, z = cases[7]
     assert (scope["plant"], scope["sensor"], scope["channel"]) == (plant, sensor, test_properties.channel(chains))
     assert np.array_equal(scope["z"], z) and scope["scale"] == 7.0
+
+
+def test_a_test_that_draws_one_network_prints_it_when_it_fails():
+    with pytest.raises(AssertionError) as caught, printing(channel=LINKS["modes"], seed=3):
+        raise AssertionError
+    scope = made(caught.value.__notes__[0].removeprefix("What was drawn:"))
+    assert scope["channel"] == LINKS["modes"] and scope["seed"] == 3

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.as_code import printing
 from tests.oracles import delays as oracle
 
 A, C, R, N = np.array([[1.0, 1.0], [0.0, 0.95]]), np.array([[1.0, 0.0]]), np.array([[0.3]]), np.array([[0.05]])
@@ -103,10 +104,16 @@ def test_not_told_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
         np.diag(generator.random(2)),
     )
     weights, gains, noise = generator.dirichlet(np.ones(3)), generator.normal(size=2), generator.uniform(0.01, 1)
+    drawn = {"a": a, "c": c, "r": np.array(r), "q": q, "weights": weights, "gains": gains, "noise": noise}
+    with printing(**drawn):
+        check_that_it_is_the_best(**drawn)
+
+
+def check_that_it_is_the_best(a, c, r, q, weights, gains, noise):
     with jax.enable_x64(True):
-        found = np.asarray(claimed(a, c, np.array(r), q, weights, gains, np.array([[noise]])))[2::2]
+        found = np.asarray(claimed(a, c, r, q, weights, gains, np.array([[noise]])))[2::2]
     law = np.insert(weights, 2, 0.0)
-    parts, second = oracle.signals(a, q, c, np.array(r), START, SPREAD, 8), np.mean(gains**2)
+    parts, second = oracle.signals(a, q, c, r, START, SPREAD, 8), np.mean(gains**2)
     heard = oracle.of_untold(parts, independent(law), np.mean(gains), second, noise * (second + 1))
     best = np.array([oracle.best_linear(parts, heard, k) for k in range(1, 9)])
     np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())

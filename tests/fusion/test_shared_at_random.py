@@ -5,6 +5,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 import heliograph as hg
+from tests.as_code import printing
 from tests.fusion.fusion_problems import two_gains
 
 STEPS = 8
@@ -82,6 +83,11 @@ def test_what_holds_for_every_network(seed, growth):
     """Cross-covariances are those by hand; order and copies change nothing; the mean and memory are never worse."""
     d = drawn(seed, growth)
     net = network(d, RULES)
+    with printing(plant=net.plant, common=net.common, drawn=d):
+        check_what_holds(d, net)
+
+
+def check_what_holds(d, net):
     found = hg.simulation.cross_covariances(net, "own", STEPS)
     joint = found.joint + np.einsum("ia,jb->iajb", found.bias, found.bias)
     plans = [net.nodes[f"node {i}"].filters["own"].planned(np.zeros((STEPS, 0))) for i in range(2)]
