@@ -21,6 +21,8 @@ from heliograph.model.estimate import Estimate
 from tests.oracles.range_only import cubature_oracle
 from tests.widths import Widths
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 PLAZA2 = robot.DRIVES["plaza2"]
 

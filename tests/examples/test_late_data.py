@@ -17,6 +17,8 @@ from heliograph.examples.late_data.trace import SLOT, read_trace
 from heliograph.live.timeline import Timeline
 from heliograph.report.figures import svg
 
+pytestmark = pytest.mark.slow
+
 
 def row(node, sequence, sent, received, clock="0:00:01.000000"):
     """As the testbed writes it: flag, slots and number with their lowest byte first, flag, hops."""

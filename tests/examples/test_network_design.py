@@ -10,6 +10,8 @@ from heliograph.examples.demo.twin import Design
 from heliograph.examples.network_design import compute, page, published, run
 from heliograph.examples.network_design.published import Circuit, packets
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory, fits):

@@ -183,6 +183,7 @@ def simulated(filters):
     return network, hg.monte_carlo(network, STEPS, 1024, key=0)
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_as_known_before(simulated):
     _, record = simulated
     errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, own in record.estimates.items() for f in own}
@@ -193,6 +194,7 @@ def test_simulated_errors_are_as_known_before(simulated):
     assert abs(told.mean() - 0.460) < 3 * told.std() / 32
 
 
+@pytest.mark.slow
 def test_relays_that_are_late_by_chance(simulated):
     """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
     (network, record), generator = simulated, np.random.default_rng(0)
@@ -213,6 +215,7 @@ def test_relays_that_are_late_by_chance(simulated):
     assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
 
 
+@pytest.mark.slow
 def test_a_record_as_events(simulated):
     """Each value under the step that it is of; a value that is heard twice comes under one number twice."""
     network, record = simulated

@@ -104,6 +104,7 @@ def test_it_keeps_the_contract_of_filters():
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))
 
 
+@pytest.mark.slow
 def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
     """Against central differences of relative error 1e-7."""
     z = np.random.default_rng(0).normal(size=(10, 1))

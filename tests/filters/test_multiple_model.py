@@ -152,6 +152,7 @@ def test_permuting_modes_changes_nothing(build):
     np.testing.assert_allclose(first, second, rtol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_they_keep_the_contract_of_filters(build):
     check_filter(build(WIDE, BOTH, wide_link()))
@@ -180,6 +181,7 @@ def record():
     return hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, filters)}), 160, 512, 0)
 
 
+@pytest.mark.slow
 def test_what_is_merged_early_is_worse_and_claims_too_little(record):
     """The example's figures, 512 runs of 160 steps: claims within 4 % (they vary by run), errors in their order."""
     names = [build.__name__ for build in FILTERS]
@@ -240,6 +242,7 @@ def test_what_varies_in_time_is_followed(build):
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_they_run_in_single_precision():
     filters = {build.__name__: build(PLANT, SENSOR, LINK) for build in (FILTERS[1], FILTERS[2])}
     filters["particles"] = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
@@ -267,6 +270,7 @@ def test_particles_depend_on_seed_and_data_alone():
     assert other.mean[0] != once.mean[0]
 
 
+@pytest.mark.slow
 def test_particles_are_the_same_in_a_simulation_a_recording_and_a_stream(record):
     item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, {"particles": item})})

@@ -162,6 +162,7 @@ def record(request):
     return hg.monte_carlo(hg.Network(PLANT, nodes), SETTLED.stop, RUNS, 2)
 
 
+@pytest.mark.slow
 def test_claims_hold_in_simulation(record):
     """Mean claim and mean square error over the last 30 steps agree within four standard errors over runs."""
     for name in record.estimates:
@@ -192,6 +193,7 @@ def test_arrival_that_varies_and_is_certain_at_some_steps():
     np.testing.assert_allclose(found[2], [expected.mean[0], expected.covariance[0, 0]], rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "item",
     [

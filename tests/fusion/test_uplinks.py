@@ -87,6 +87,7 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     np.testing.assert_allclose(found.covariance[-1], stacked(arrives), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees(record):
     """Mean squares within three standard errors of each run's own claim; the quantized one's is above."""
     for name, estimate in record.estimates["fused"].items():

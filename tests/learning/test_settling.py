@@ -49,6 +49,7 @@ def settles(objective, x, data):
         return bool(_settling(objective, x, data.measurements)[1])
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(arrays(float, 3, elements=st.floats(-1.5, 1.5)))
 def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):

@@ -66,6 +66,7 @@ def in_order(network, accepted, now):
     return item
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6), mixing=st.floats(0.5, 3 * WINDOW))
 def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixing):

@@ -74,6 +74,7 @@ def final_error(channel, p):
     return jnp.trace(jax.lax.scan(body, filter_.init(), jnp.arange(STEPS))[0].covariance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_gradient_of_the_final_error_is_that_of_finite_differences(name):
     channel, parameters = CASES[name]

@@ -33,6 +33,8 @@ from tests.oracles import cubature_fusion as oracle
 from tests.oracles import relayed_machine
 from tests.papers.verdicts import both, check_verdicts
 
+pytestmark = pytest.mark.slow
+
 FILTERS = {"open_loop", "mean_gain", "extended_polytope", "cubature_printed", "cubature_tight", "cubature_polytope",
            "cubature_zero_mean"}  # fmt: skip
 BOUNDED = FILTERS - {"open_loop", "mean_gain"}

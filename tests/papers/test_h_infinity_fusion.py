@@ -30,6 +30,8 @@ from tests.papers.h_infinity_fusion_verdicts import VERDICTS
 from tests.papers.readme import said_of
 from tests.papers.verdicts import check_verdicts
 
+pytestmark = pytest.mark.slow
+
 RECURSIVE = example.RECURSIVE
 pytest.importorskip("cvxpy")
 

@@ -19,6 +19,8 @@ from heliograph.papers.h_infinity_fusion import (
     worst_disturbance,
 )
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("cvxpy")
 
 

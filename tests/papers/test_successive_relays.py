@@ -16,6 +16,8 @@ from tests.papers.readme import said_of
 from tests.papers.reproduction import kept
 from tests.papers.verdicts import both, check_verdicts
 
+pytestmark = pytest.mark.slow
+
 RUNS = 600
 
 

@@ -84,6 +84,7 @@ def problem(request):
     return request.param, problem_of(request.param)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences(problem):
     check_gradients(problem[1])
 

@@ -30,6 +30,7 @@ CONSTANT = {"p": (1.0, 1e-3, 9.0), "q": (1.0, 1e-3, 9.0)}
 UNSTABLE = hg.LinearPlant([[1.2, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), [1.0, 2.0], np.eye(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "free", "error"),
     [
