@@ -7,7 +7,7 @@ PYTHONS ?= python3.11 python3.13
 BIN := .venv/bin
 INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-compile
 # What was installed, on all cores: pip would use one.
-COMPILE := -m compileall -qq -j 0 .venv/lib
+COMPILE := -W ignore -m compileall -qq -j 0 .venv/lib
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 CREATED := .venv/.python$(VERSION)
 

@@ -164,6 +164,7 @@ MAKERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     """Five turns: what is heard without its turns gives what is heard with them, likelihoods too."""
@@ -250,6 +251,7 @@ def test_a_plant_says_how_states_differ():
     np.testing.assert_allclose(plant.near(x, other), [[1.0, 2.0, 3.1 - 2 * np.pi]])
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_around_the_circle():
     """Truth and signals are told between -pi and pi, and x - xhat is the error, whoever subtracts."""
     plant, sensor = turning(True)

@@ -231,6 +231,7 @@ def test_a_record_as_events(simulated):
         hg.simulation.arrivals(record, network)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["told", "fixed"])
 def test_the_contract(filters, name):
     check_filter(filters[name])

@@ -153,6 +153,7 @@ DRIFTING = {  # gains' correlations, channel, the channel for c
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DRIFTING)
 def test_drifting_gains_need_no_grid(name):
     """Their covariance is that over all paths of c, though the filter knows but one or two functions of it."""

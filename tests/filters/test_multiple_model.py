@@ -109,6 +109,7 @@ CURVED = hg.Plant(lambda x, u: x + 0.1 * np.array([1.0, -1.0]) * x**2, 0.01 * np
 PRODUCT = hg.Sensor(lambda x: x[:1] * x[1:], 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_one_mode_is_the_cubature_filter(build):
     one = hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]])
@@ -213,6 +214,7 @@ def test_losses_say_something_of_the_mode(build, data):
     np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS[1:])
 def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
@@ -230,6 +232,7 @@ def test_a_mode_that_losses_reveal_is_known():
         np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_what_varies_in_time_is_followed(build):
     """Equal maps, a plant and a sensor that vary: the linear filter."""

@@ -47,6 +47,7 @@ def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     assert set(net.claims()["fused"].values()) == {"exact"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""
@@ -112,6 +113,7 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
         np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
     groups = {"a": [0, 3], "b": [1, 2, 4]}
@@ -210,6 +212,7 @@ def test_a_covariance_each_is_not_enough():
         hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
 
 
+@pytest.mark.slow
 def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
     """Cubature filters behind gains that hardly vary are the linear ones: weights, reports and claims agree.
 

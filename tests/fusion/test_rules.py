@@ -18,6 +18,7 @@ RULES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_contract(name):
     check_fusion(RULES[name])

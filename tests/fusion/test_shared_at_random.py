@@ -2,6 +2,7 @@
 
 import hypothesis as hy
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 
 import heliograph as hg
@@ -77,6 +78,7 @@ def by_hand(d, gains):
     return joint
 
 
+@pytest.mark.slow
 @hy.settings(max_examples=4, deadline=None, derandomize=True)
 @hy.given(seed=st.integers(0, 2**32 - 1), growth=st.floats(0.3, 1.2))
 def test_what_holds_for_every_network(seed, growth):

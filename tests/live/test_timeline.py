@@ -110,6 +110,7 @@ def assert_unchanged(before, after):
         np.testing.assert_array_equal(array, after[1][name], err_msg=name)
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_any_order_within_the_window_and_everything_twice(world, seed):
@@ -126,6 +127,7 @@ def test_any_order_within_the_window_and_everything_twice(world, seed):
     assert_same_bits(once, in_order(network, found, once.now))
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_what_comes_in_order_is_used_however_late(world, seed):

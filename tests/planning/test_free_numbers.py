@@ -185,6 +185,7 @@ def test_a_relay_is_placed_where_the_closed_form_puts_it():
     assert hg.power(found.network).total == pytest.approx(power, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_powers_and_amplifications_agree():
     """The same network by amplifications, as a function, and by powers, by name."""
 

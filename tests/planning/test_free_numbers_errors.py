@@ -43,6 +43,7 @@ def test_gradients_of_every_error_are_those_of_differences(build, free, error):
     check_gradients(Problem(build, as_numbers(free), error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free", "asked"),
     [
