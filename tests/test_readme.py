@@ -58,6 +58,7 @@ def after_make_demo(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_all_of_it_runs_in_order(after_make_demo):
     scopes: dict[str, dict] = {}
     commands = 0

@@ -103,6 +103,7 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_best_over_all_paths(name):
     at_step, law, transitions, maps = CASES[name]

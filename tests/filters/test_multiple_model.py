@@ -142,6 +142,7 @@ def test_equal_maps_need_no_chain(build):
     np.testing.assert_allclose(total, known, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS)
 def test_permuting_modes_changes_nothing(build):
     data = np.random.default_rng(0).normal(size=(5, 2))

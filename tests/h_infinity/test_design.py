@@ -122,6 +122,7 @@ def test_a_second_solver_finds_the_same_level():
     assert hg.h_infinity.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
 
 
+@pytest.mark.slow
 def test_without_measurements_the_channel_plays_no_part():
     closed = hg.h_infinity.level_without_measurements(node(0))
     np.testing.assert_allclose(closed, 0.029031, rtol=3e-5)

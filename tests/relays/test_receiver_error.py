@@ -30,6 +30,7 @@ def ratio(design, own):
     return design.trace("receiver")[1:] / own.trace("receiver")[1:]
 
 
+@pytest.mark.slow
 def test_tuned_together_the_receiver_errs_less(own):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
     assert np.mean(ratio(tuned, own)) <= 0.775  # found: 0.7680

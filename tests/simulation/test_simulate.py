@@ -139,6 +139,7 @@ def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
                 np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_true_channel_makes_the_data_and_the_filter_believes_another(statistics):
     (hearing, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
     assert hearing < deaf - 4 * np.hypot(error, other)

@@ -61,6 +61,7 @@ def test_statistics_of_the_record_and_its_smoothed_part(record):
             assert both[1].rmse()[0] < 0.97 * both[0].rmse()[0]
 
 
+@pytest.mark.slow
 def test_in_bounded_memory_with_gains_known_before_data():
     smooth = hg.smoothing.FixedInterval()
     statistics = hg.monte_carlo(WHOLE, HORIZON, 4 * RUNS, 3, keep=hg.Statistics(), smooth=smooth)

@@ -96,6 +96,7 @@ def network():
     return hg.Network(plant, nodes)
 
 
+@pytest.mark.slow
 def test_a_network_says_the_same_with_fewer_kernels(network, monkeypatch):
     """Each run's numbers are worked through in other company: up to rounding the same, 1e-13 of what is near 1."""
     counts = []
