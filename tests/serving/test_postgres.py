@@ -1,5 +1,7 @@
 """The same store in PostgreSQL, where there is one to start."""
 
+from pathlib import Path
+
 import pytest
 
 from heliograph.serving.service import Service
@@ -24,6 +26,11 @@ def server():
 def database(server):
     """The address of an empty one."""
     return server.database()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc here: run on Linux")
+def test_the_server_is_not_root(server):
+    assert Path(f"/proc/{server.process.pid}").stat().st_uid != 0
 
 
 def test_processes_share_a_store_in_postgresql(tmp_path, database):
