@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
 
@@ -18,6 +19,8 @@ IN_A_HURRY = (
     "--xla_cpu_parallel_codegen_split_count=1",
     "--xla_disable_hlo_passes=hlo-verifier",
 )
+
+MOST, GROWTH = 1.4e9, 0.2e9  # bytes of a process before it lets go, and since it last did
 
 
 def pytest_configure(config):
@@ -70,6 +73,27 @@ def forget_compiled_programs():
     """A module's programs are hardly ever another's; kept, they and what the compiler left would be gigabytes."""
     yield
     forget()
+
+
+@pytest.fixture(scope="module")
+def memory_at_start():
+    """Of this process, in bytes: a list, to which is added where the module lets go on the way."""
+    return [resident()]
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory(memory_at_start):
+    """A module that compiles much, as that of all pages of the docs, lets go of it on the way."""
+    yield
+    if resident() > max(MOST, memory_at_start[-1] + GROWTH):
+        forget()
+        memory_at_start.append(resident())
+
+
+def resident():
+    """Memory of this process, bytes; 0 where the system does not say."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
 
 
 def forget():
