@@ -155,6 +155,7 @@ def test_refuses_one_seed():
         compute.compute(1)
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_model_is_the_simulator_s_machine():
     found = drive.simulate_drive(loaded=False)
@@ -171,6 +172,7 @@ def test_the_model_is_the_simulator_s_machine():
     assert np.max(np.abs(ends - found.truth[1:, :5])) < 1.3e-6
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_simulator_s_speed_obeys_torque_and_load():
     found = drive.simulate_drive().truth * RATED
@@ -183,6 +185,7 @@ def test_the_simulator_s_speed_obeys_torque_and_load():
     assert np.max(np.abs(np.diff(found[:, 4]))) > 0.1
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
     found = drive.simulate_drive()

@@ -93,6 +93,7 @@ def first_step(measured):
     return type(measured)(*(None if part is None else part[0] for part in measured))
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_the_recursion(problem):
     name, one = problem
     found = one.at(one.numbers.start).covariances[0]
