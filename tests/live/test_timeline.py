@@ -33,7 +33,12 @@ class World:
         return self.name
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+DAILY = ("forgetful", "moving")  # a world in steps and one in continuous time
+
+
+@pytest.fixture(
+    scope="module", params=[name if name in DAILY else pytest.param(name, marks=pytest.mark.slow) for name in WORLDS]
+)
 def world(request):
     return World(request.param)
 

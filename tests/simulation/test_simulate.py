@@ -208,6 +208,7 @@ def test_saturation_is_reported_and_nothing_is_claimed_there(record):
     assert 1 < record.uplinks["escape"].symbols_per_value() < 5
 
 
+@pytest.mark.slow
 def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
     some = [hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk) for chunk in (64, 256)]
     for name in ("outer", "covariance", "nees", "count"):

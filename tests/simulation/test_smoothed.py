@@ -24,6 +24,7 @@ def record():
     return hg.monte_carlo(GAPS, HORIZON, RUNS, 3, smooth=hg.smoothing.FixedLag(LAG))
 
 
+@pytest.mark.slow
 def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
     found = record.smoothed
     assert found.failures() == [] and np.array_equal(found.truth, record.truth)
