@@ -5,12 +5,16 @@ PYTHON ?= python3
 PYTHONS ?= python3.11 python3.13
 
 BIN := .venv/bin
-INSTALL := -m pip install --quiet --quiet --disable-pip-version-check
+INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-compile
+# What was installed, on all cores: pip would use one.
+COMPILE := -W ignore -m compileall -qq -j 0 .venv/lib
 VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2])' 2>/dev/null)
 CREATED := .venv/.python$(VERSION)
 
-.PHONY: help demo test docs bench soak constraints clean
+.PHONY: help demo test check docs bench soak constraints clean
 .NOTPARALLEL:
+# Each test process, and each command that a test starts, would compile all sources anew.
+unexport PYTHONDONTWRITEBYTECODE
 
 help:  ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' Makefile | expand -t 14
@@ -18,11 +22,15 @@ help:  ## Show this list
 demo: .venv/.demo  ## Run the demonstration and write its report to out/
 	$(BIN)/heliograph demo --out out
 
-test: .venv/.test  ## Lint, check types and run the tests
+test: .venv/.test  ## Check style and types, run the tests that guard daily work (five minutes)
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
-	$(BIN)/mypy --strict src studies
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/mypy --strict src studies & types=$$!; \
+	$(BIN)/pytest -n 2 --dist loadfile -m "not slow"; tests=$$?; \
+	wait $$types && exit $$tests
+
+check: .venv/.check  ## Run all other tests: studies from end to end, kills, brokers, a browser (eight minutes)
+	$(BIN)/pytest -n 2 --dist loadfile -m slow
 
 docs: .venv/.docs  ## Build the documentation into out/docs, running its gallery, and check every page of it
 	@rm -rf out/docs docs/_made
@@ -51,16 +59,25 @@ $(CREATED):
 .venv/.demo: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph into .venv (the first time: a minute or two, 1.4 GB) ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[report,tables,recordings,results,sweep,lmi,live]'
+	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 
 .venv/.test: $(CREATED) pyproject.toml constraints.txt
 	@echo "Installing heliograph and its tools into .venv (the first time: a minute or two) ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all]'
+	@$(BIN)/python $(COMPILE) || true
 	@touch .venv/.demo $@
+
+.venv/.check: .venv/.test
+	@echo "Installing the simulator of a motor drive into .venv ..."
+	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,motor]'
+	@$(BIN)/python $(COMPILE) || true
+	@touch $@
 
 .venv/.docs: .venv/.test
 	@echo "Installing what builds the documentation into .venv ..."
 	@$(BIN)/python $(INSTALL) -c constraints.txt -e '.[dev,all,docs]'
+	@$(BIN)/python $(COMPILE) || true
 	@touch $@
 
 # The newest of everything on the oldest and on a newer Python. jax, numpy, scipy and zarr have left 3.11 behind,
@@ -69,12 +86,12 @@ constraints:  ## Pin the newest versions in constraints.txt (needs Python 3.11 a
 	@set -e; work=$$(mktemp -d); trap 'rm -rf "$$work"' EXIT; export LC_ALL=C; \
 	for python in $(PYTHONS); do \
 	  "$$python" -m venv "$$work/venv" --clear; \
-	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs]'; \
+	  "$$work/venv/bin/python" $(INSTALL) -e '.[dev,all,docs,motor]'; \
 	  "$$work/venv/bin/python" -m pip freeze --exclude-editable | grep -E '^[A-Za-z0-9._-]+==[^ ]+$$' \
 	    | sort > "$$work/$$(echo "$$python" | tr / _).txt"; \
 	done; \
 	set -- $(subst /,_,$(PYTHONS)); old="$$work/$$1.txt"; new="$$work/$$2.txt"; \
-	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs] resolves to.'; \
+	{ echo '# Written by "make constraints": what a fresh install of heliograph[dev,all,docs,motor] resolves to.'; \
 	  { comm -12 "$$old" "$$new"; \
 	    comm -23 "$$old" "$$new" | sed 's/$$/; python_version < "3.12"/'; \
 	    comm -13 "$$old" "$$new" | sed 's/$$/; python_version >= "3.12"/'; } | sort -f; } > constraints.txt

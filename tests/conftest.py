@@ -7,8 +7,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from pathlib import Path
 
 import pytest
+
+from tests.parts import RealParts, started
 
 FOLDER = "JAX_COMPILATION_CACHE_DIR"
 IN_A_HURRY = (
@@ -17,9 +20,12 @@ IN_A_HURRY = (
     "--xla_disable_hlo_passes=hlo-verifier",
 )
 
+MOST, GROWTH = 1.4e9, 0.2e9  # bytes of a process before it lets go, and since it last did
+
 
 def pytest_configure(config):
     """The first process sets the environment; workers and the commands that tests start find it there."""
+    config.pluginmanager.register(RealParts())
     if FOLDER not in os.environ:
         os.environ[FOLDER] = config.compilations = tempfile.mkdtemp(prefix="heliograph-tests-")
         os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.2"
@@ -29,9 +35,9 @@ def pytest_configure(config):
         os.environ["JAX_TRACEBACK_IN_LOCATIONS_LIMIT"] = "0"
         # BLAS threads wait busily for matrices of a few rows: thirty times the processor time of a small L-BFGS-B.
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-        for flag in IN_A_HURRY:
+        for flag in (" ".join(IN_A_HURRY), *IN_A_HURRY):  # all at once, or those that this release knows
             flags = f"{os.environ.get('XLA_FLAGS', '')} {flag}"
-            if understood(flags):
+            if flag not in os.environ.get("XLA_FLAGS", "") and understood(flags):
                 os.environ["XLA_FLAGS"] = flags
 
 
@@ -69,6 +75,27 @@ def forget_compiled_programs():
     forget()
 
 
+@pytest.fixture(scope="module")
+def memory_at_start():
+    """Of this process, in bytes: a list, to which is added where the module lets go on the way."""
+    return [resident()]
+
+
+@pytest.fixture(autouse=True)
+def bounded_memory(memory_at_start):
+    """A module that compiles much, as that of all pages of the docs, lets go of it on the way."""
+    yield
+    if resident() > max(MOST, memory_at_start[-1] + GROWTH):
+        forget()
+        memory_at_start.append(resident())
+
+
+def resident():
+    """Memory of this process, bytes; 0 where the system does not say."""
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") if statm.exists() else 0
+
+
 def forget():
     """Let go of all compiled programs."""
     if "jax" in sys.modules:
@@ -79,10 +106,18 @@ def forget():
 
 
 @pytest.fixture(scope="session")
-def fits(tmp_path_factory):
-    """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
+def widths(tmp_path_factory):
+    """One browser for all pages."""
     from tests.widths import Widths
 
     widths = Widths(tmp_path_factory.mktemp("pages") / "page.html")
     yield widths
     widths.close()
+
+
+@pytest.fixture
+def fits(widths, request):
+    """Called with a page, fails if something there is wider than the window of a screen or of a phone."""
+    if widths.there():
+        started(request.node, "browser")
+    return widths

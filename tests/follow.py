@@ -1,26 +1,112 @@
-"""Filters over rows of data: means and covariances after each step, in double precision."""
+"""A filter stepped over rows of measurements by one compiled scan, and many filters of one structure side by side."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from heliograph.filters.base import AbstractFilter, given, measured
+from heliograph.model import Estimate, Innovation
+from heliograph.numerics.float64 import compiled
 
-def follow(item, z, u):
-    """Means (steps, n) and covariances (steps, n, n) of a filter's estimates."""
+ROWS = 8  # what is compiled serves every number of rows up to the next multiple of it
 
-    def step(state, row):
-        k, measurement, inputs = row
-        state, estimate = item.step(state, measurement, inputs, k)
-        return state, (estimate.mean, estimate.covariance)
 
+class Followed(NamedTuple):
+    """What a filter says after each row, and its state after the last one.
+
+    Shapes: mean (rows, n), covariance (rows, n, n); innovation of (rows, m), (rows, m, m) and (rows,).
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    innovation: Innovation
+    state: Any
+
+
+def follow(item: AbstractFilter, z: Any, u: Any = None) -> Followed:
+    """Predict and correct over rows, from the filter's start.
+
+    z: (rows, received), or (rows,) for one component, NaN where nothing arrived; u: (rows, inputs).
+    """
+    z = np.array([measured(item, row) for row in z])
+    u = np.array([given(item, row) for row in (np.zeros((len(z), 0)) if u is None else u)])
+    assert len(u) == len(z) and (item.horizon is None or len(z) <= item.horizon)
+    return _cut(_follow(item, *_padded(z, u), len(z)), len(z), 0)
+
+
+def follow_known(item: AbstractFilter, z: Any, u: Any) -> Followed:
+    """`follow` by a program that knows the filter's numbers, as an exported step does."""
     with jax.enable_x64(True):
-        rows = jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)
-        return jax.tree.map(np.asarray, jax.lax.scan(step, item.init(), rows)[1])
+        return jax.tree.map(np.asarray, jax.jit(lambda z, u: _scan(item, z, u, len(z)))(np.asarray(z), np.asarray(u)))
+
+
+def last(item: AbstractFilter, z: Any, u: Any = None) -> Estimate:
+    """The estimate after the last of these rows."""
+    steps = follow(item, z, u)
+    return Estimate(steps.mean[-1], steps.covariance[-1], item.claim)
+
+
+def follow_each(items: Sequence[AbstractFilter], z: np.ndarray) -> Followed:
+    """`follow` of each filter over rows of its own, z (filters, rows, received), with the filters as first axis.
+
+    Filters of one structure are one program, whatever their numbers: a property is tried on all of them at once.
+    """
+    rows, groups = np.asarray(z), {}
+    for i, item in enumerate(items):
+        shapes = tuple(np.shape(leaf) for leaf in jax.tree.leaves(item))
+        groups.setdefault((jax.tree.structure(item), shapes), []).append(i)
+    parts, order = [], np.concatenate([*groups.values()])
+    for chosen in groups.values():
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *[items[i] for i in chosen])
+        data, inputs = _padded(rows[chosen], np.zeros((*rows[chosen].shape[:2], 0)))
+        parts.append(_cut(_follow_each(stacked, data, inputs), rows.shape[1], 1)._replace(state=()))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves)[np.argsort(order)], *parts)
 
 
 def apart(estimates, reference):
     """Largest distance of means and of covariances from a reference, in its claimed deviations."""
-    (mean, covariance), (other, claimed) = estimates, reference
+    (mean, covariance), (other, claimed) = estimates[:2], reference[:2]
     deviation = np.sqrt(np.diagonal(claimed, axis1=1, axis2=2))
     of_covariance = np.abs(covariance - claimed) / (deviation[:, :, None] * deviation[:, None])
     return np.max(np.abs(mean - other) / deviation), np.max(of_covariance)
+
+
+def _padded(z: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows in which nothing arrives after the others."""
+    more = -z.shape[-2] % ROWS
+    width = [(0, 0)] * (z.ndim - 2) + [(0, more), (0, 0)]
+    return np.pad(z, width, constant_values=np.nan), np.pad(u, width)
+
+
+def _cut(result: Followed, rows: int, axis: int) -> Followed:
+    """Without the rows that were added."""
+    steps = jax.tree.map(lambda leaf: np.take(leaf, np.arange(rows), axis), result._replace(state=()))
+    return steps._replace(state=result.state)
+
+
+def _scan(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
+    start = jax.tree.map(jnp.asarray, item.init())
+
+    def body(carry: Any, row: Any) -> Any:
+        state, until_last = carry
+        k, z_k, u_k = row
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        until_last = jax.tree.map(lambda new, old: jnp.where(k < last, new, old), after, until_last)
+        estimate = item.after_step(after, k)
+        return (after, until_last), (estimate.mean, estimate.covariance, innovation)
+
+    (_, state), steps = jax.lax.scan(body, (start, start), (jnp.arange(len(z)), z, u))
+    return Followed(*steps, state)
+
+
+@compiled
+def _follow(item: AbstractFilter, z: Any, u: Any, last: Any) -> Followed:
+    return _scan(item, z, u, last)
+
+
+@compiled
+def _follow_each(items: AbstractFilter, z: Any, u: Any) -> Followed:
+    return jax.vmap(lambda item, rows, inputs: _scan(item, rows, inputs, len(rows)))(items, z, u)

@@ -17,6 +17,7 @@ GALLERY = sorted((ROOT / "docs" / "gallery").glob("*.py"))
 BLOCK = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", [p for p in PAGES if BLOCK.search(p.read_text())], ids=lambda p: p.name)
 def test_examples_run(page, tmp_path, monkeypatch):
     """A network that several pages draw with one horizon and as many runs is compiled once."""
@@ -26,6 +27,7 @@ def test_examples_run(page, tmp_path, monkeypatch):
         exec(compile(block, page.name, "exec"), scope)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("example", GALLERY, ids=lambda p: p.stem)
 def test_the_gallery_runs(example):
     """Each example draws one picture."""

@@ -1,33 +1,37 @@
-"""Laws that hold for every network: tried on random ones."""
+"""Laws that hold for every network: tried on dozens of random ones at once."""
+
+from functools import cache
 
 import numpy as np
-from hypothesis import given, settings
-from hypothesis import strategies as st
+import pytest
 
 import heliograph as hg
+from tests.as_code import as_code
+from tests.follow import follow, follow_each
 
-FEW = settings(max_examples=6)  # every example compiles its own network
 ROUNDING = 1e-9  # relative to the largest entry, over four steps of small matrices
 STEPS = 4
+COUNT = 24  # networks of one size; filters of one size are one program, whatever chain of hops is in front of them
+SIZES = [(1, 2), (2, 1), (3, 2)]  # states and outputs
 
 
-@st.composite
-def networks(draw):
-    """A random plant, sensor and list of scalar channels, one per output, known or uncertain."""
-    rng = np.random.default_rng(draw(st.integers(0, 10**6)))
-    n, m = draw(st.integers(1, 3)), draw(st.integers(1, 2))
+@cache
+def networks(n, m, seed=0):
+    """Random plants, sensors, lists of scalar channels, one per output, known or uncertain, and received signals."""
+    rng = np.random.default_rng([seed, n, m])
+    return [network(rng, n, m, 0.05 * (i % 2)) for i in range(COUNT)]
+
+
+def network(rng, n, m, radius):
     a = rng.normal(size=(n, n))
     plant = hg.LinearPlant(a / max(1, np.abs(np.linalg.eigvals(a)).max()), 0.1, rng.normal(size=n), np.eye(n))
     sensor = hg.LinearSensor(rng.normal(size=(m, n)), 0.1)
-    radius = draw(st.sampled_from([0.0, 0.05]))
     laws = [
         hg.Discrete(rng.uniform(-0.5, 1.5, 3), [0.2, 0.3, 0.5], radius),
         hg.Rayleigh(0.8),
         hg.random_affine.bernoulli(0.7),
     ]
-    chains = [
-        [(laws[rng.integers(3)], rng.uniform(0.01, 0.3)) for _ in range(draw(st.integers(1, 3)))] for _ in range(m)
-    ]
+    chains = [[(laws[rng.integers(3)], rng.uniform(0.01, 0.3)) for _ in range(rng.integers(1, 4))] for _ in range(m)]
     return plant, sensor, chains, rng.normal(size=(STEPS, m))
 
 
@@ -43,67 +47,110 @@ def channel(chains, scale=1.0, off=None):
     return hg.parallel(parts)
 
 
-def follow(item, z):
-    state, result = item.init(), []
-    for k, row in enumerate(z):
-        state, estimate = item.step(state, row, (), k)
-        result.append(estimate)
-    return np.array([e.mean for e in result]), np.array([e.covariance for e in result])
+def uncertain(chains):
+    return any(np.any(getattr(law, "radius", 0)) for chain in chains for law, _ in chain)
 
 
-def close(first, second):
-    for a, b in zip(first, second, strict=True):
-        np.testing.assert_allclose(a, b, rtol=0, atol=ROUNDING * max(np.abs(b).max(), 1e-300))
+def certain(chains):
+    """The same chains without their uncertain laws."""
+    return [[(hg.Rayleigh(0.5) if uncertain([[hop]]) else hop[0], hop[1]) for hop in chain] for chain in chains]
 
 
-@FEW
-@given(networks(), st.sampled_from([hg.cubature_filter, hg.extended_filter, hg.linear_filter]))
-def test_bounds_stay_positive_semidefinite(case, build):
-    plant, sensor, chains, z = case
-    _, bounds = follow(build(plant, sensor, channel(chains)), z)
-    assert np.all(np.linalg.eigvalsh(bounds)[:, 0] >= -ROUNDING * np.abs(bounds).max())
+@cache
+def followed(build, n, m):
+    """What filters of one kind say of the networks of one size."""
+    cases = networks(n, m)
+    return follow_each([build(plant, sensor, channel(chains)) for plant, sensor, chains, _ in cases], rows(cases))
 
 
-@FEW
-@given(networks(), st.floats(0.3, 3.0))
-def test_units_of_the_received_signal_do_not_matter(case, scale):
-    plant, sensor, chains, z = case
-    ours = hg.cubature_filter(plant, sensor, channel(chains))
-    scaled = hg.cubature_filter(plant, sensor, channel(chains, scale))
-    close(follow(scaled, scale * z), follow(ours, z))
+def rows(cases):
+    return np.stack([case[3] for case in cases])
 
 
-@FEW
-@given(networks())
-def test_missing_data_equal_a_channel_that_is_off(case):
-    plant, sensor, chains, z = case
-    if len(chains) < 2:
-        chains, sensor = chains * 2, hg.LinearSensor(np.vstack([sensor.matrix] * 2), 0.1)
-        z = np.hstack([z, z])
-    chains = [[(law if not np.any(getattr(law, "radius", 0)) else hg.Rayleigh(0.5), q) for law, q in c] for c in chains]
-    missing = z.copy()
-    missing[:, 1] = np.nan
-    whole = hg.linear_filter(plant, sensor, channel(chains))
-    close(follow(whole, missing), follow(hg.linear_filter(plant, sensor, channel(chains, off=1)), z))
+def hold(cases, off, most, **others):
+    """Fail with the network as code where `off`, one number for each case, exceeds `most`."""
+    wrong = np.flatnonzero(~(off <= most))
+    if wrong.size:
+        plant, sensor, chains, z = cases[first := int(wrong[0])]
+        parts = {"plant": plant, "sensor": sensor, "channel": channel(chains), "z": z}
+        more = {name: value[first] for name, value in others.items()}
+        raise AssertionError(
+            f"{wrong.size} of {len(cases)} networks are off, the first by {off[first]:g} where {most:g} is allowed:\n"
+            + as_code(**parts, **more)
+        )
 
 
-@FEW
-@given(networks())
-def test_recordings_step_by_step(case):
-    plant, sensor, chains, z = case
-    item = hg.cubature_filter(plant, sensor, channel(chains))
-    network = hg.Network(plant, {"node": hg.Node(sensor, channel(chains), {"f": item})})
-    together = hg.run(network, {"node": z}).estimates["node"]["f"]
-    close((together.mean, together.covariance), follow(item, z))
+def apart(first, second):
+    """The largest difference of means and of covariances, relative to the largest entry."""
+    gaps = [
+        np.abs(a - b).max(axis=(1, *range(2, a.ndim))) / np.maximum(np.abs(b).max(axis=(1, *range(2, b.ndim))), 1e-300)
+        for a, b in ((first.mean, second.mean), (first.covariance, second.covariance))
+    ]
+    return np.maximum(*gaps)
 
 
-@FEW
-@given(networks(), st.integers(0, 3))
-def test_more_noise_never_lowers_the_best_linear_error(case, hop):
-    plant, sensor, chains, z = case
-    louder = [[(law, q * (4 if k == hop % len(c) else 1)) for k, (law, q) in enumerate(c)] for c in chains]
-    quiet, loud = (follow(hg.linear_filter(plant, sensor, channel(c)), z)[1] for c in (chains, louder))
-    gap = np.linalg.eigvalsh(loud - quiet)[:, 0]
-    if not any(np.any(getattr(law, "radius", 0)) for c in chains for law, _ in c):
-        assert np.all(gap >= -ROUNDING * np.abs(loud).max())
-    assert np.all(np.trace(loud - quiet, axis1=1, axis2=2) >= -1e-7 * np.abs(loud).max())
+@pytest.mark.parametrize(("n", "m"), SIZES)
+@pytest.mark.parametrize("build", [hg.cubature_filter, hg.extended_filter, hg.linear_filter])
+def test_bounds_stay_positive_semidefinite(build, n, m):
+    cases, bounds = networks(n, m), followed(build, n, m)
+    smallest = np.linalg.eigvalsh(bounds.covariance)[..., 0].min(axis=1)
+    hold(cases, -smallest / np.abs(bounds.covariance).max(axis=(1, 2, 3)), ROUNDING)
+
+
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_units_of_the_received_signal_do_not_matter(n, m):
+    cases, scales = networks(n, m), np.random.default_rng(1).uniform(0.3, 3.0, COUNT)
+    scaled = [
+        hg.cubature_filter(plant, sensor, channel(chains, scale))
+        for (plant, sensor, chains, _), scale in zip(cases, scales, strict=True)
+    ]
+    result = follow_each(scaled, scales[:, None, None] * rows(cases))
+    hold(cases, apart(result, followed(hg.cubature_filter, n, m)), ROUNDING, scale=scales)
+
+
+@pytest.mark.parametrize(("n", "m"), [size for size in SIZES if size[1] == 2])
+def test_missing_data_equal_a_channel_that_is_off(n, m):
+    cases = [(plant, sensor, certain(chains), z) for plant, sensor, chains, z in networks(n, m)]
+    whole, off = (
+        [hg.linear_filter(plant, sensor, channel(chains, off=i)) for plant, sensor, chains, _ in cases]
+        for i in (None, 1)
+    )
+    missing = rows(cases)
+    missing[:, :, 1] = np.nan
+    hold(cases, apart(follow_each(whole, missing), follow_each(off, rows(cases))), ROUNDING)
+
+
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_recordings_step_by_step(n, m):
+    """Of ten networks with one list of chains, whose numbers differ: a network's channel is part of its program."""
+    template = networks(n, m, seed=2)[0][2]
+    rng, cases = np.random.default_rng(3), []
+    for plant, sensor, _, z in networks(n, m)[:10]:
+        cases.append((plant, sensor, [[(law, rng.uniform(0.01, 0.3)) for law, _ in chain] for chain in template], z))
+    off = []
+    for plant, sensor, chains, z in cases:
+        item = hg.cubature_filter(plant, sensor, channel(chains))
+        network = hg.Network(plant, {"node": hg.Node(sensor, channel(chains), {"f": item})})
+        together = hg.run(network, {"node": z}).estimates["node"]["f"]
+        alone = follow(item, z)
+        pairs = ((together.mean, alone.mean), (together.covariance, alone.covariance))
+        off.append(max(np.abs(a - b).max() / np.abs(b).max() for a, b in pairs))
+    hold(cases, np.array(off), ROUNDING)
+
+
+@pytest.mark.parametrize(("n", "m"), SIZES)
+def test_more_noise_never_lowers_the_best_linear_error(n, m):
+    cases = networks(n, m)
+    noisy = np.random.default_rng(4).integers(0, 4, COUNT)
+    louder = [
+        hg.linear_filter(plant, sensor, channel([[(law, q * (4 if k == hop % len(c) else 1))
+                                                 for k, (law, q) in enumerate(c)] for c in chains]))
+        for (plant, sensor, chains, _), hop in zip(cases, noisy, strict=True)
+    ]  # fmt: skip
+    quiet, loud = followed(hg.linear_filter, n, m).covariance, follow_each(louder, rows(cases)).covariance
+    size = np.abs(loud).max(axis=(1, 2, 3))
+    known = np.array([not uncertain(chains) for _, _, chains, _ in cases])
+    gap = np.linalg.eigvalsh(loud - quiet)[..., 0].min(axis=1)
+    hold(cases, np.where(known, -gap / size, 0.0), ROUNDING, hop=noisy)
+    traces = np.trace(loud - quiet, axis1=2, axis2=3).min(axis=1)
+    hold(cases, -traces / size, 1e-7, hop=noisy)

@@ -9,6 +9,7 @@ import heliograph as hg
 from heliograph.model import silent
 from heliograph.numerics.check import covariance
 from heliograph.simulation.record import is_sound
+from tests.follow import last
 
 CART = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
 FILTERS = {
@@ -19,13 +20,6 @@ FILTERS = {
     "mixture": hg.mixture_filter,
     "polynomial": lambda *parts: hg.polynomial_filter(*parts, 2, degree=1),
 }
-
-
-def after(item, measurements):
-    state = item.init()
-    for k, z in enumerate(measurements):
-        state, _ = item.correct(item.predict(state, (), k), z, k)
-    return item.estimate(state)
 
 
 def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_draw():
@@ -41,7 +35,7 @@ def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_d
 def test_an_exact_filter_of_states_in_very_different_units_has_the_scalar_filters_numbers():
     plant = hg.LinearPlant(np.eye(2), np.diag([0.1, 1e-17]), np.zeros(2), np.diag([1e2, 1e-16]))
     sensor = hg.LinearSensor(np.eye(2), np.diag([1.0, 1e-16]))
-    found = after(hg.cubature_filter(plant, sensor, hg.perfect(2)), [[1.0, 1e-8]])
+    found = last(hg.cubature_filter(plant, sensor, hg.perfect(2)), [[1.0, 1e-8]])
     prior = np.array([100.1, 1.1e-16])
     noise, z = np.array([1.0, 1e-16]), np.array([1.0, 1e-8])
     expected = prior / (1 + prior / noise)
@@ -87,27 +81,27 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_silent_component_is_as_if_it_were_not_there(name):
-    heard = after(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])
+    heard = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])
     pair = hg.LinearSensor([[1.0], [1.0]], 0.1)
-    found = after(FILTERS[name](CART, pair, hg.parallel([hg.perfect(), silent()])), [[1.0, 0.0]] * 2)
+    found = last(FILTERS[name](CART, pair, hg.parallel([hg.perfect(), silent()])), [[1.0, 0.0]] * 2)
     np.testing.assert_allclose([found.mean[0], found.covariance[0, 0]], [heard.mean[0], heard.covariance[0, 0]])
 
 
 @pytest.mark.parametrize("channel", [silent(), hg.dropout(hg.perfect(), 0.0)], ids=["silent", "never arrives"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_behind_a_silent_channel_a_filter_predicts(name, channel):
-    found = after(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), channel), [[0.0], [0.0]])
+    found = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), channel), [[0.0], [0.0]])
     np.testing.assert_allclose([found.mean[0], found.covariance[0, 0]], [0.0, 0.81**2 + 0.1 * (1 + 0.81)], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_noise_free_hops_and_a_position_known_exactly(name):
     twice = hg.LinearSensor([[1.0], [1.0]], 0.0)
-    found = after(FILTERS[name](CART, twice, hg.perfect(2)), [[1.0, 1.0], [0.5, 0.5]])
+    found = last(FILTERS[name](CART, twice, hg.perfect(2)), [[1.0, 1.0], [0.5, 0.5]])
     assert found.mean[0] == pytest.approx(0.5, abs=1e-14) and 0 <= found.covariance[0, 0] < 1e-14
     assert is_sound(found)
     plant = hg.LinearPlant(np.eye(2), np.diag([0.0, 0.1]), [3.0, 0.0], np.diag([0.0, 1.0]))
-    known = after(FILTERS[name](plant, hg.LinearSensor(np.eye(2), np.diag([0.0, 0.1])), hg.perfect(2)), [[3.0, 1.0]])
+    known = last(FILTERS[name](plant, hg.LinearSensor(np.eye(2), np.diag([0.0, 0.1])), hg.perfect(2)), [[3.0, 1.0]])
     np.testing.assert_allclose(known.mean, [3.0, 1.1 / 1.2], rtol=1e-13)
     np.testing.assert_allclose(known.covariance, np.diag([0.0, 0.11 / 1.2]), atol=1e-14)
 
@@ -119,7 +113,7 @@ UNCERTAIN = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5], 0.1), noise=0.1)
 def test_the_bound_of_a_zero_mean_error_where_nothing_can_be_learned(c, p):
     plant = hg.LinearPlant(np.eye(2), 0.0, [3.0, 0.0], p)
     item = hg.cubature_filter(plant, hg.LinearSensor([[c, 0.0]], 0.1), UNCERTAIN, hg.filters.ZeroMean())
-    found = after(item, [[1.0], [1.0]])
+    found = last(item, [[1.0], [1.0]])
     np.testing.assert_allclose(found.covariance, p * np.eye(2), atol=1e-11)
     np.testing.assert_allclose(found.mean, [3.0, 0.0], atol=1e-11)
 
@@ -131,7 +125,7 @@ def test_a_zero_mean_bound_skips_missing_components_as_the_filter_built_without_
     full = hg.cubature_filter(plant, hg.LinearSensor(np.eye(4), 0.1), channel, rule)
     z = np.array([0.7, np.nan, np.nan, np.nan])
     one = hg.cubature_filter(plant, hg.LinearSensor(np.eye(4)[:1], 0.1), UNCERTAIN, rule)
-    found, expected = after(full, [z, z]), after(one, [z[:1], z[:1]])
+    found, expected = last(full, [z, z]), last(one, [z[:1], z[:1]])
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9)
     np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-9)
 

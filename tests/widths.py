@@ -38,9 +38,14 @@ class Widths:
         self.text = text  # where a page that is no file is put
         self.process: subprocess.Popen[str] | None = None
 
+    @staticmethod
+    def there() -> bool:
+        """Whether there is a browser."""
+        return program() is not None
+
     def __call__(self, page: Path | str) -> None:
         """Fail if something on a page, a file, its text or an address, is wider than its window."""
-        if program() is None:
+        if not self.there():
             return
         if isinstance(page, str) and not page.startswith("http:"):
             self.text.write_text(page, encoding="utf-8")

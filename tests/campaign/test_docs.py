@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import pytest
+
 from heliograph import cli
 
 PAGE = (Path(__file__).parents[2] / "docs" / "campaigns.md").read_text()
@@ -13,6 +15,7 @@ def block(kind: str) -> str:
     return text
 
 
+@pytest.mark.slow
 def test_the_example_runs(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("my_network.py").write_text(block("python"))

@@ -1,6 +1,5 @@
 import json
 import re
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -135,7 +134,7 @@ def test_a_folder_without_results_is_one_line(place, tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser here")
+@pytest.mark.real("browser")
 def test_a_browser_draws_what_is_chosen(explored, tmp_path):
     page = tmp_path / "explore.html"
     page.write_text(explored)

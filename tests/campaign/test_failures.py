@@ -97,6 +97,7 @@ def test_no_setting_can_be_built(tmp_path, trouble):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_a_worker_that_dies_is_replaced(tmp_path, trouble):
     trouble.write_text("die")
     campaign = write(tmp_path)

@@ -12,6 +12,8 @@ from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import open_results
 from tests.campaign.example import CHUNKS, chunk_files, contents, write
 
+pytestmark = pytest.mark.slow
+
 DRIVER = """
 import sys
 import heliograph as hg

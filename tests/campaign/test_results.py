@@ -60,6 +60,7 @@ def test_a_part_of_the_runs_is_the_same_part_of_all(tmp_path):
         hg.monte_carlo(network, 4, 36, 1, first_run=63)
 
 
+@pytest.mark.slow
 def test_different_nodes_and_filters_and_the_world(tmp_path):
     text = CAMPAIGN.partition("[grid]")[0].replace("seed = 5", 'keep = "trajectories"')
     campaign = write(

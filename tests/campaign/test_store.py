@@ -138,6 +138,7 @@ def out_of_time_where_it_hangs(tmp_path, monkeypatch):
     return asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("network", "error", "jobs"),
     [
@@ -260,6 +261,7 @@ def test_names_end_no_campaign_and_act_nowhere(tmp_path, capsys, monkeypatch):
     assert "\x1b" not in page and "[/red]" in page
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_late_is_replaced(tmp_path, out_of_time_where_it_hangs):
     campaign = write(tmp_path, network=HANGING)
     with in_processes(campaign.as_json(), tmp_path / "no store", 1, timeout=15) as engine:

@@ -74,6 +74,7 @@ def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, cap
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 0.4, 1.2])
 def test_ctrl_c_in_a_process_of_its_own(folder, delay):
     """From when the network's file is read: then all is loaded, traced and compiled."""

@@ -95,6 +95,7 @@ def east_and_west() -> tuple[hg.Record, hg.Record]:
     return hg.run(network(1.0), east, U, smooth=smooth), hg.run(network(-1.0), west, U, smooth=smooth)
 
 
+@pytest.mark.slow
 def test_half_a_turn_further_everything_is_turned(east_and_west):
     """Cubature points turn with P = L L', so results are equal to rounding; the particles' draws come from z's bits."""
     bearings = east_and_west[1].measurements["a"][:, 1]
@@ -113,6 +114,7 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
         np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
+@pytest.mark.slow
 def test_what_is_smoothed_is_turned_too(east_and_west):
     """Sweeps never wrap, so that the cut is nowhere; what they tell is between -pi and pi. To rounding of 30 steps."""
     found = [record.smoothed for record in east_and_west]
@@ -124,6 +126,7 @@ def test_what_is_smoothed_is_turned_too(east_and_west):
             assert np.all(np.abs(other[:, 2]) <= np.pi)
 
 
+@pytest.mark.slow
 def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_where_something_does(east_and_west):
     east, west = east_and_west
     worst = []
@@ -134,6 +137,7 @@ def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_wher
     assert worst[0] < 1e-9 and worst[1] > 3  # metres
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["without the cut", "across the cut"])
 def test_filters_are_consistent_across_the_cut_as_elsewhere(side):
     found = hg.monte_carlo(network(side), STEPS, 2000, 0, keep=hg.Statistics(), inputs=U)
@@ -160,6 +164,7 @@ MAKERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_compass_on_the_circle_is_one_on_a_line_that_was_wound_up(name):
     """Five turns: what is heard without its turns gives what is heard with them, likelihoods too."""
@@ -246,6 +251,7 @@ def test_a_plant_says_how_states_differ():
     np.testing.assert_allclose(plant.near(x, other), [[1.0, 2.0, 3.1 - 2 * np.pi]])
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_around_the_circle():
     """Truth and signals are told between -pi and pi, and x - xhat is the error, whoever subtracts."""
     plant, sensor = turning(True)

@@ -6,16 +6,10 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.about_mean import AboutMean, about_mean
 from heliograph.testing import check_filter
+from tests.follow import last
 
 SKEWED = hg.random_affine.FiniteSupport([[1.0], [-0.25]], [0.2, 0.8])
 EITHER = hg.random_affine.FiniteSupport([[0.1], [-0.1]], [0.5, 0.5])
-
-
-def last(item, measurements):
-    state = item.init()
-    for k, z in enumerate(measurements):
-        state, estimate = item.step(state, [z], (), k)
-    return estimate
 
 
 @pytest.mark.parametrize("build", [hg.polynomial_filter, hg.filters.scheduled_polynomial_filter])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.as_code import printing
 from tests.oracles import delays as oracle
 
 A, C, R, N = np.array([[1.0, 1.0], [0.0, 0.95]]), np.array([[1.0, 0.0]]), np.array([[0.3]]), np.array([[0.05]])
@@ -103,10 +104,16 @@ def test_not_told_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
         np.diag(generator.random(2)),
     )
     weights, gains, noise = generator.dirichlet(np.ones(3)), generator.normal(size=2), generator.uniform(0.01, 1)
+    drawn = {"a": a, "c": c, "r": np.array(r), "q": q, "weights": weights, "gains": gains, "noise": noise}
+    with printing(**drawn):
+        check_that_it_is_the_best(**drawn)
+
+
+def check_that_it_is_the_best(a, c, r, q, weights, gains, noise):
     with jax.enable_x64(True):
-        found = np.asarray(claimed(a, c, np.array(r), q, weights, gains, np.array([[noise]])))[2::2]
+        found = np.asarray(claimed(a, c, r, q, weights, gains, np.array([[noise]])))[2::2]
     law = np.insert(weights, 2, 0.0)
-    parts, second = oracle.signals(a, q, c, np.array(r), START, SPREAD, 8), np.mean(gains**2)
+    parts, second = oracle.signals(a, q, c, r, START, SPREAD, 8), np.mean(gains**2)
     heard = oracle.of_untold(parts, independent(law), np.mean(gains), second, noise * (second + 1))
     best = np.array([oracle.best_linear(parts, heard, k) for k in range(1, 9)])
     np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
@@ -176,6 +183,7 @@ def simulated(filters):
     return network, hg.monte_carlo(network, STEPS, 1024, key=0)
 
 
+@pytest.mark.slow
 def test_simulated_errors_are_as_known_before(simulated):
     _, record = simulated
     errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, own in record.estimates.items() for f in own}
@@ -186,6 +194,7 @@ def test_simulated_errors_are_as_known_before(simulated):
     assert abs(told.mean() - 0.460) < 3 * told.std() / 32
 
 
+@pytest.mark.slow
 def test_relays_that_are_late_by_chance(simulated):
     """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
     (network, record), generator = simulated, np.random.default_rng(0)
@@ -206,6 +215,7 @@ def test_relays_that_are_late_by_chance(simulated):
     assert np.all(np.diag(estimate.covariance) > np.diag(best[3]))
 
 
+@pytest.mark.slow
 def test_a_record_as_events(simulated):
     """Each value under the step that it is of; a value that is heard twice comes under one number twice."""
     network, record = simulated
@@ -221,6 +231,7 @@ def test_a_record_as_events(simulated):
         hg.simulation.arrivals(record, network)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["told", "fixed"])
 def test_the_contract(filters, name):
     check_filter(filters[name])

@@ -4,6 +4,7 @@ import pytest
 from filterpy.kalman import CubatureKalmanFilter, KalmanFilter
 
 import heliograph as hg
+import tests.follow
 from heliograph.testing import check_filter
 from tests import machine
 from tests.machine import PRINTED, STRONG
@@ -16,12 +17,8 @@ SETTINGS = {"printed": PRINTED, "strong": STRONG}
 
 
 def follow(item, measurements):
-    """Estimates of a filter over (steps, m) measurements."""
-    state, estimates = item.init(), []
-    for k, z in enumerate(measurements):
-        state, estimate = item.step(state, z, (), k)
-        estimates.append(estimate)
-    return np.array([e.mean for e in estimates]), np.array([e.covariance for e in estimates])
+    """Means and covariances of a filter over (steps, m) measurements."""
+    return tests.follow.follow(item, measurements)[:2]
 
 
 def follow_oracle(setting, node, predict, update, measurements):

@@ -54,6 +54,7 @@ def test_the_linear_filter_beats_the_others_behind_fading(behind_fading):
     assert behind_fading["mean_gain"].nees_per_dimension()[0] > 2  # it does not know
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("corner", range(len(LAW.extremes())))
 def test_upper_claims_hold_under_every_extreme_law(corner):
     believed = hg.hop(LAW, 0.05, dimension=2)

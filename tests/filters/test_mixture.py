@@ -6,6 +6,7 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.filters.combinations import atoms_of
+from tests.follow import follow
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model
 
@@ -66,6 +67,7 @@ def test_a_missing_measurement_is_a_prediction():
     assert found.mean[0] == pytest.approx(1.0) and found.covariance[0, 0] == pytest.approx(0.25 * 3 + 1.0)
 
 
+@pytest.mark.slow
 def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
     cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
@@ -102,11 +104,9 @@ MODES = [hg.hop(hg.Discrete([0.5, 1.5], [0.4, 0.6]), 0.2), hg.hop(-0.3, 0.1)]
 
 
 def run(item, data):
-    state, found = item.init(), []
-    for k, z in enumerate(data):
-        state, estimate = item.step(state, [z], (), k)
-        found.append((estimate.mean[0], estimate.covariance[0, 0]))
-    return np.array(found), state
+    """Mean and variance after each measurement."""
+    steps = follow(item, data)
+    return np.column_stack([steps.mean[:, 0], steps.covariance[:, 0, 0]])
 
 
 def test_modes_are_weighed_with_their_atoms():
@@ -134,23 +134,23 @@ def test_a_chain_that_forgets_is_a_mixture():
     """Equal rows: the same numbers as one map chosen anew at each step."""
     law = [0.75, 0.25]
     data = (0.7, np.nan, -1.1, 2.0)
-    chained, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, [law, law])), data)
-    mixed, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.random_affine.Mixture(MODES, law)), data)
+    chained = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES, [law, law])), data)
+    mixed = run(hg.mixture_filter(PLANT, SENSOR, hg.random_affine.Mixture(MODES, law)), data)
     np.testing.assert_allclose(chained, mixed, rtol=1e-12)
 
 
 def test_one_mode_is_the_filter_without_modes():
     data = (0.7, -1.1, 2.0)
-    one, _ = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
-    plain, _ = run(hg.mixture_filter(PLANT, SENSOR, MODES[0]), data)
+    one = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
+    plain = run(hg.mixture_filter(PLANT, SENSOR, MODES[0]), data)
     np.testing.assert_array_equal(one, plain)
 
 
 def test_with_gaussian_noise_it_is_gpb1():
     sensor, links = hg.LinearSensor([[1.0]], 0.1), hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
     data = (0.7, -1.1, 2.0, 0.1)
-    mixture, _ = run(hg.mixture_filter(PLANT, sensor, links), data)
-    merged, _ = run(hg.filters.gpb1_filter(PLANT, sensor, links), data)
+    mixture = run(hg.mixture_filter(PLANT, sensor, links), data)
+    merged = run(hg.filters.gpb1_filter(PLANT, sensor, links), data)
     np.testing.assert_allclose(mixture, merged, rtol=1e-12)
 
 

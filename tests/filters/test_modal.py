@@ -8,6 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.random_affine.second_moments import nominal_spread
 from tests.filters.modal_problems import BAD, CHAIN_A, GOOD, LAW_A, RELAY, chain_a
+from tests.follow import follow
 from tests.oracles import links_with_memory as oracle
 
 Series, Stack, Mixture, Modes = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Mixture", "Modes"))
@@ -36,12 +37,7 @@ THREE = [hg.hop(g, 0.1) for g in (0.3, -0.6, 1.2)]
 
 def errors(item, horizon=STEPS):
     """Covariances of the filter's errors, which no data change."""
-    state, found = item.init(), []
-    for k in range(horizon):
-        state = item.predict(state, U[k] if item.inputs else (), k)
-        state, _ = item.correct(state, np.ones(item.received), k)
-        found.append(item.estimate(state).covariance)
-    return np.array(found)
+    return follow(item, np.ones((horizon, item.received)), U[:horizon] if item.inputs else None).covariance
 
 
 def expected(initial, transitions, maps):
@@ -107,6 +103,7 @@ CASES = {  # channel at step k; law, transitions and the same channel in each mo
 }  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_it_is_the_best_over_all_paths(name):
     at_step, law, transitions, maps = CASES[name]
@@ -157,6 +154,7 @@ DRIFTING = {  # gains' correlations, channel, the channel for c
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DRIFTING)
 def test_drifting_gains_need_no_grid(name):
     """Their covariance is that over all paths of c, though the filter knows but one or two functions of it."""

@@ -58,6 +58,7 @@ def test_limits(name):
     np.testing.assert_allclose(one, other, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_estimates_do_not_depend_on_the_order_of_modes_and_hold_in_simulation():
     """The claimed variance lies within four standard errors of the measured one at each of the last steps."""
     channel = hg.gilbert_elliott(hg.hop(1.0, 0.05), hg.hop(0.2, 0.05), 0.03, 0.05)
@@ -79,6 +80,7 @@ def test_what_does_not_arrive_is_left_out():
     assert heard.log_likelihood == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.0, 0.01])
 def test_a_mean_far_from_zero_costs_no_digits(radius):
     """Where modes differ in their noise alone, a mean of 1e8 deviations moves all estimates and no covariance."""
@@ -104,6 +106,7 @@ def test_it_keeps_the_contract_of_filters():
     hg.testing.check_filter(hg.linear_filter(PLANT, two, hg.parallel([bursts(), bursts()])))
 
 
+@pytest.mark.slow
 def test_the_likelihood_has_a_gradient_in_what_the_links_remember():
     """Against central differences of relative error 1e-7."""
     z = np.random.default_rng(0).normal(size=(10, 1))

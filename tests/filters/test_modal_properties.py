@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from tests.as_code import printing
 from tests.filters.modal_problems import variances
 
 Modes = hg.random_affine.Modes
-SEEDS = range(6)
 
 
 def drawn(seed):
@@ -27,29 +27,42 @@ def drawn(seed):
     return plant, sensor, maps, generator.dirichlet(np.ones(3), size=3), generator.dirichlet(np.ones(3))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_equal_rows_are_no_memory(seed):
+def of_problems(count):
+    """Run a test with each of so many problems; one that fails prints its own as code."""
+
+    def decorated(test):
+        @pytest.mark.parametrize("seed", range(count))
+        def run(seed):
+            plant, sensor, maps, rows, law = drawn(seed)
+            with printing(plant=plant, sensor=sensor, maps=maps, rows=rows, law=law):
+                test(seed, plant, sensor, maps, rows, law)
+
+        run.__doc__ = test.__doc__
+        return run
+
+    return decorated
+
+
+@of_problems(6)
+def test_equal_rows_are_no_memory(seed, plant, sensor, maps, rows, law):
     """Against the mixture of the maps, which the filter of links that forget hears."""
-    plant, sensor, maps, _, law = drawn(seed)
     chain = hg.random_affine.MarkovChain([law] * 3)
     forgets = hg.random_affine.Mixture(maps, law)
     found = variances(plant, sensor, Modes(chain, maps), 30)
     np.testing.assert_allclose(found, variances(plant, sensor, forgets, 30), rtol=1e-11)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_order_of_modes_changes_nothing(seed):
-    plant, sensor, maps, rows, law = drawn(seed)
+@of_problems(6)
+def test_the_order_of_modes_changes_nothing(seed, plant, sensor, maps, rows, law):
     order = np.random.default_rng(seed + 100).permutation(3)
     one = Modes(hg.random_affine.MarkovChain(rows, law), maps)
     turned = Modes(hg.random_affine.MarkovChain(rows[np.ix_(order, order)], law[order]), [maps[i] for i in order])
     np.testing.assert_allclose(variances(plant, sensor, one, 30), variances(plant, sensor, turned, 30), rtol=1e-11)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed):
+@of_problems(6)
+def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed, plant, sensor, maps, rows, law):
     """Of the filter itself to rounding; a filter made for other rows is worse at every step."""
-    plant, sensor, maps, rows, law = drawn(seed)
     channel, other = (Modes(hg.random_affine.MarkovChain(r, law), maps) for r in (rows, rows[::-1]))
     own = hg.filters.true_error(hg.linear_filter(plant, sensor, channel), plant, sensor, channel, 30)
     wrong = hg.filters.true_error(hg.linear_filter(plant, sensor, other), plant, sensor, channel, 30)
@@ -58,10 +71,10 @@ def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed):
     assert np.all(smallest >= -1e-10 * np.abs(own.true).max())
 
 
-@pytest.mark.parametrize("seed", SEEDS[:3])
-def test_claims_hold_by_simulation(seed):
+@pytest.mark.slow
+@of_problems(3)
+def test_claims_hold_by_simulation(seed, plant, sensor, maps, rows, law):
     """Sum of both states' squares against the trace, within 4.5 standard errors at each of 12 steps."""
-    plant, sensor, maps, rows, law = drawn(seed)
     relay = hg.autoregressive_fading(1.0, 0.5, 0.7, 0.1)
     channel = hg.amplify_and_forward([Modes(hg.random_affine.MarkovChain(rows, law), maps), relay])
     item = hg.linear_filter(plant, sensor, channel)

@@ -6,6 +6,7 @@ from scipy import stats
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.follow import follow
 
 PLANT = hg.LinearPlant([[0.98]], 0.04, [0.0], 0.04 / (1 - 0.98**2))
 SENSOR = hg.LinearSensor([[1.0]], 0.05)
@@ -61,11 +62,9 @@ def exact(plant, sensor, links, data, arrival=(1.0, 1.0, 1.0)):
 
 
 def stepped(item, data):
-    state, found, total = item.init(), None, 0.0
-    for k, z in enumerate(data):
-        state, heard = item.correct(item.predict(state, (), k), np.atleast_1d(z), k)
-        found, total = item.estimate(state), total + float(heard.log_likelihood)
-    return found, total
+    """The estimate after the last measurement, and the log-likelihood of all."""
+    steps = follow(item, data)
+    return hg.model.Estimate(steps.mean[-1], steps.covariance[-1], item.claim), steps.innovation.log_likelihood.sum()
 
 
 def steady_law():
@@ -110,6 +109,7 @@ CURVED = hg.Plant(lambda x, u: x + 0.1 * np.array([1.0, -1.0]) * x**2, 0.01 * np
 PRODUCT = hg.Sensor(lambda x: x[:1] * x[1:], 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_one_mode_is_the_cubature_filter(build):
     one = hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]])
@@ -142,6 +142,7 @@ def test_equal_maps_need_no_chain(build):
     np.testing.assert_allclose(total, known, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS)
 def test_permuting_modes_changes_nothing(build):
     data = np.random.default_rng(0).normal(size=(5, 2))
@@ -153,6 +154,7 @@ def test_permuting_modes_changes_nothing(build):
     np.testing.assert_allclose(first, second, rtol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_they_keep_the_contract_of_filters(build):
     check_filter(build(WIDE, BOTH, wide_link()))
@@ -181,6 +183,7 @@ def record():
     return hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, filters)}), 160, 512, 0)
 
 
+@pytest.mark.slow
 def test_what_is_merged_early_is_worse_and_claims_too_little(record):
     """The example's figures, 512 runs of 160 steps: claims within 4 % (they vary by run), errors in their order."""
     names = [build.__name__ for build in FILTERS]
@@ -212,6 +215,7 @@ def test_losses_say_something_of_the_mode(build, data):
     np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", FILTERS[1:])
 def test_they_keep_the_contract_behind_losses_that_say_something(build):
     check_filter(build(PLANT, SENSOR, losing((0.3, 0.9))))
@@ -229,6 +233,7 @@ def test_a_mode_that_losses_reveal_is_known():
         np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_what_varies_in_time_is_followed(build):
     """Equal maps, a plant and a sensor that vary: the linear filter."""
@@ -241,6 +246,7 @@ def test_what_varies_in_time_is_followed(build):
     np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_they_run_in_single_precision():
     filters = {build.__name__: build(PLANT, SENSOR, LINK) for build in (FILTERS[1], FILTERS[2])}
     filters["particles"] = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
@@ -268,6 +274,7 @@ def test_particles_depend_on_seed_and_data_alone():
     assert other.mean[0] != once.mean[0]
 
 
+@pytest.mark.slow
 def test_particles_are_the_same_in_a_simulation_a_recording_and_a_stream(record):
     item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, {"particles": item})})

@@ -29,6 +29,7 @@ ORIGINALS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_its_steps_are_the_originals(name):
     original, draw = ORIGINALS[name], np.random.default_rng(3)

@@ -5,6 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph.testing import check_filter
+from tests.follow import follow
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors
 
@@ -13,12 +14,8 @@ HORIZON = 10
 
 
 def run(item, data):
-    state, means, bounds = item.init(), [], []
-    for k, z in enumerate(data):
-        state, estimate = item.step(state, z, (), k)
-        means.append(np.asarray(estimate.mean))
-        bounds.append(np.asarray(estimate.covariance))
-    return np.array(means), np.array(bounds)
+    """Means and covariances after each measurement."""
+    return follow(item, data)[:2]
 
 
 def measurements(outputs, seed=0):
@@ -106,6 +103,7 @@ def test_a_missing_measurement_counts_as_expected():
     np.testing.assert_allclose(left.value, right.value, rtol=0, atol=1e-15)
 
 
+@pytest.mark.slow
 def test_filters_keep_the_contract():
     s = model(two_sensors(), HORIZON)
     check_filter(hg.polynomial_filter(*s, HORIZON))
@@ -139,6 +137,7 @@ def test_uncertain_probabilities_make_the_claim_nominal():
         )
 
 
+@pytest.mark.slow
 def test_claims_hold_in_the_drivers_monte_carlo():
     """Exact claims of every degree and of memory, in one network on one data set: NEES and covariances."""
     horizon, s = 10, model(EXAMPLE, 10, initial=0.01 * np.eye(2))

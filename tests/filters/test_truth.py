@@ -57,6 +57,7 @@ def test_the_excess_grows_with_the_correlation_as_in_closed_form(lag):
     assert found.ratio[-1, 0] == pytest.approx(known[lag], abs=0.006)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", [bursts(), hg.amplify_and_forward(HOPS), hg.with_direct_link(bursts(), HOPS[0])])
 def test_the_exact_filter_claims_its_truth(channel):
     found = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 60)

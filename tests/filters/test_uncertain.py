@@ -39,6 +39,7 @@ def test_a_radius_of_zero_is_the_exact_filter():
     assert hg.linear_filter(PLANT, SENSOR, rough(0.0)).claim == "exact"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_it_dominates_the_truth_of_chains_that_wander_within_the_radius(seed):
     """Three modes with atoms, transitions drawn anew at each step, half of them at the ends."""
@@ -69,6 +70,7 @@ def test_it_dominates_the_truth_at_the_corners_and_the_exact_filter_there(corner
     assert np.all(true <= claimed) and np.all(variances(PLANT, SENSOR, chain, STEPS)[:, 0] <= true * (1 + 1e-12))
 
 
+@pytest.mark.slow
 def test_two_rough_chains_together():
     """|Delta| of a product of chains is at most (Pi_a + r_a) x (Pi_b + r_b) - Pi_a x Pi_b."""
     a, b = rough(0.01), Modes(hg.random_affine.MarkovChain(THREE, radius=0.02), [GOOD, BAD, hg.hop(0.6, 0.1)])

@@ -47,6 +47,7 @@ def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     assert set(net.claims()["fused"].values()) == {"exact"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""
@@ -91,6 +92,7 @@ def record(world):
     return hg.monte_carlo(world, 6, 4000, 2)
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees_with_what_is_claimed(world, record):
     """E |x - xhat|^2 at the last step within three standard errors, rules that know more never worse.
 
@@ -111,6 +113,7 @@ def test_monte_carlo_agrees_with_what_is_claimed(world, record):
         np.testing.assert_allclose(again.estimates["fused"][name].mean, estimate.mean[0], rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_a_tree_of_relays_is_its_weights_on_the_leaves(world, record):
     """Two relays of two and three nodes and a root, against W P W' by hand, and against simulated errors."""
     groups = {"a": [0, 3], "b": [1, 2, 4]}
@@ -145,6 +148,7 @@ def along_and_linear(plant, parts):
     return hg.Network(plant, nodes, fused)
 
 
+@pytest.mark.slow
 def test_losses_that_are_told_count_with_the_pattern_that_happened():
     """A node of which nothing arrives is its prediction: fusing with it is fusing with the plant's own mean."""
     z = {"node 0": np.zeros((6, 1)), "node 1": np.full((6, 2), np.nan)}
@@ -152,6 +156,7 @@ def test_losses_that_are_told_count_with_the_pattern_that_happened():
     np.testing.assert_allclose(fused["own matrix"].covariance, fused["alone"].covariance, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_losses_at_random_keep_the_claim():
     """Each run has the covariances of its own losses: mean squares agree within three standard errors."""
     plant, parts = random_case(5)
@@ -207,6 +212,7 @@ def test_a_covariance_each_is_not_enough():
         hg.fusion.fuse(hg.fusion.MatrixWeights(), pair)
 
 
+@pytest.mark.slow
 def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
     """Cubature filters behind gains that hardly vary are the linear ones: weights, reports and claims agree.
 
@@ -228,6 +234,7 @@ def test_filters_whose_gains_depend_on_data_are_followed_along_the_estimates():
         hg.Network(plant, net.nodes, {"one": hg.Fusion("cubature", hg.fusion.MatrixWeights(with_mean=True))})
 
 
+@pytest.mark.slow
 def test_a_large_tree_is_the_small_one():
     """Eleven leaves in a tree of degree three, made of numbers: every level as relays of named nodes give it."""
     plant, _ = random_case(4)

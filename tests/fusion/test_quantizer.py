@@ -61,6 +61,7 @@ def test_many_levels_clip():
     np.testing.assert_allclose(sent.value, np.clip(x, -3, 3), rtol=0, atol=3e-9 + 3 * ROUNDING)  # d / p
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(
     values=st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=12),

@@ -18,6 +18,7 @@ RULES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", RULES)
 def test_contract(name):
     check_fusion(RULES[name])
@@ -150,6 +151,7 @@ def network(channel, fused):
     return hg.Network(PLANT, nodes, fused(nodes))
 
 
+@pytest.mark.slow
 def test_central_filters_and_weights_go_by_the_order_of_the_nodes():
     """Not of their names or groups. Behind known gains, using nodes in turn equals one update with all measurements."""
     gain = hg.hop(1.2, 0.05)

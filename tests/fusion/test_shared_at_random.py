@@ -2,9 +2,11 @@
 
 import hypothesis as hy
 import numpy as np
+import pytest
 from hypothesis import strategies as st
 
 import heliograph as hg
+from tests.as_code import printing
 from tests.fusion.fusion_problems import two_gains
 
 STEPS = 8
@@ -76,12 +78,18 @@ def by_hand(d, gains):
     return joint
 
 
+@pytest.mark.slow
 @hy.settings(max_examples=4, deadline=None, derandomize=True)
 @hy.given(seed=st.integers(0, 2**32 - 1), growth=st.floats(0.3, 1.2))
 def test_what_holds_for_every_network(seed, growth):
     """Cross-covariances are those by hand; order and copies change nothing; the mean and memory are never worse."""
     d = drawn(seed, growth)
     net = network(d, RULES)
+    with printing(plant=net.plant, common=net.common, drawn=d):
+        check_what_holds(d, net)
+
+
+def check_what_holds(d, net):
     found = hg.simulation.cross_covariances(net, "own", STEPS)
     joint = found.joint + np.einsum("ia,jb->iajb", found.bias, found.bias)
     plans = [net.nodes[f"node {i}"].filters["own"].planned(np.zeros((STEPS, 0))) for i in range(2)]

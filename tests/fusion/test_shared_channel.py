@@ -65,6 +65,7 @@ def test_cross_covariances_of_what_is_shared():
     np.testing.assert_allclose(hg.simulation.fused_covariances(net, 15)["matrix"][-1], covariance, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees():
     """The claims within three standard errors; as if nothing but the plant were shared they would be off by more."""
     rules = {"matrix": hg.fusion.MatrixWeights(), "all": hg.fusion.AllReports()}

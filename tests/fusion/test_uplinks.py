@@ -73,6 +73,7 @@ def stacked(arrives):
     return x @ start @ x.T - cross @ np.linalg.solve(reports @ start @ reports.T + white, cross.T)
 
 
+@pytest.mark.slow
 def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     """Every pattern of one recording of zeros: 1e-9 of the stacked problem; what is still on its way counts not."""
     draw = np.random.default_rng(0)
@@ -87,6 +88,7 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     np.testing.assert_allclose(found.covariance[-1], stacked(arrives), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_monte_carlo_agrees(record):
     """Mean squares within three standard errors of each run's own claim; the quantized one's is above."""
     for name, estimate in record.estimates["fused"].items():
@@ -99,6 +101,7 @@ def test_monte_carlo_agrees(record):
             assert estimate.claim == "exact" and abs(excess.mean()) < 3 * error
 
 
+@pytest.mark.slow
 def test_runs_and_streams_give_what_was_simulated(net, record):
     """One run again: from its recording with the reports that came, and the centre alone fed with these."""
     data = {node: z[0] for node, z in record.measurements.items()}

@@ -71,6 +71,7 @@ def f(s):
     return lambda x: jnp.array([0.7 * x[0] * jnp.cos(0.1 * x[1]), 0.7 * x[1] * jnp.sin(s * x[0])])
 
 
+@pytest.mark.slow
 def test_the_papers_growth_constant_is_false_and_the_certificate_is_refused(monkeypatch):
     monkeypatch.setattr(slope_bound, "LIMIT", 0)  # what is refuted hangs on no proof
     design = hg.h_infinity.recursive_design(node(0), 1.8, START)

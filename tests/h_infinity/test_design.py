@@ -13,6 +13,7 @@ from tests.oracles import h_infinity_fusion as paper
 START = 10 * np.eye(4)  # the paper's P_0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["trace", "largest_eigenvalue", "log_determinant"])
 @pytest.mark.parametrize("i", range(4))
 def test_the_published_levels_can_be_designed_at_every_step(i, objective):
@@ -90,6 +91,7 @@ def test_steps_that_are_the_same_are_compiled_once(monkeypatch):
     assert len(made) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("i", range(4))
 def test_a_largest_eigenvalue_leaves_no_tie_open(i):
     """Many P+ share the smallest largest eigenvalue of L, and only the larger of them let later steps go on.
@@ -104,6 +106,7 @@ def test_a_largest_eigenvalue_leaves_no_tie_open(i):
     assert works((1 + 5e-4) * known) and not works(max((1 - 5e-4) * known, HORIZON[i]))
 
 
+@pytest.mark.slow
 def test_the_smallest_level_of_a_largest_eigenvalue_is_found():
     level = hg.h_infinity.smallest_recursive_level(node(0), "largest_eigenvalue").level
     np.testing.assert_allclose(level, 0.02649, rtol=5e-4)  # bisection to 1e-4
@@ -119,6 +122,7 @@ def test_a_second_solver_finds_the_same_level():
     assert hg.h_infinity.certify_level(short, design.gains, design.weights, design.multipliers, 1.8).certified
 
 
+@pytest.mark.slow
 def test_without_measurements_the_channel_plays_no_part():
     closed = hg.h_infinity.level_without_measurements(node(0))
     np.testing.assert_allclose(closed, 0.029031, rtol=3e-5)

@@ -41,6 +41,7 @@ UNITS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("initial", [5.0, 1e-6, 1e6])
 def test_smallest_levels_are_the_riccati_forms_in_any_units(initial):
     """The margin of every inequality, 1e-7 of the level squared, and the solver's 1e-8 leave 1e-5."""

@@ -56,6 +56,7 @@ def oracle(values, z, form, inputs=INPUTS):
     return likelihood(model, z, inputs, form)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", ["linear", "conditional"])
 def test_the_likelihood_is_that_of_the_recursion(found, recording, form):
     solution = next(one for one in found.solutions if one.form == form)
@@ -107,6 +108,7 @@ def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(
         found.rows("wald")
 
 
+@pytest.mark.slow
 def test_a_profile_ends_where_the_likelihood_has_fallen(found, monkeypatch):
     """At the end of an interval, with all others at their best, l is lower by half the 95 % point of chi-square."""
     linear, profile = found.solutions[0], Solution._profile
@@ -151,6 +153,7 @@ def chain():
     return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], 0.0), channel, {})})
 
 
+@pytest.mark.slow
 def test_a_ridge_is_told_before_the_data():
     """The route's mean gain and its noise, gain^2 0.2 + last noise, are two of three numbers."""
     before = hg.identifiable(chain, INPUTS)

@@ -49,6 +49,7 @@ def settles(objective, x, data):
         return bool(_settling(objective, x, data.measurements)[1])
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None)
 @given(arrays(float, 3, elements=st.floats(-1.5, 1.5)))
 def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):
@@ -61,6 +62,7 @@ def test_likelihoods_scores_and_information_are_those_of_the_scan(both, shift):
         np.testing.assert_allclose(a, b, rtol=0, atol=TOLERANCE * np.max(np.abs(b)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("both", [walk], indirect=True)
 def test_where_gains_do_not_settle_the_scan_is_taken(both):
     """With hardly any plant noise the covariance falls as 1/k."""
@@ -74,6 +76,7 @@ def test_where_gains_do_not_settle_the_scan_is_taken(both):
     np.testing.assert_array_equal(one.density[1], other.density[1])
 
 
+@pytest.mark.slow
 def test_with_something_lost_the_scan_is_taken(both):
     quick, plain, data = both
     z = data.measurements.copy()

@@ -33,7 +33,12 @@ class World:
         return self.name
 
 
-@pytest.fixture(scope="module", params=WORLDS)
+DAILY = ("forgetful", "moving")  # a world in steps and one in continuous time
+
+
+@pytest.fixture(
+    scope="module", params=[name if name in DAILY else pytest.param(name, marks=pytest.mark.slow) for name in WORLDS]
+)
 def world(request):
     return World(request.param)
 
@@ -66,6 +71,7 @@ def in_order(network, accepted, now):
     return item
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6), mixing=st.floats(0.5, 3 * WINDOW))
 def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixing):
@@ -109,6 +115,7 @@ def assert_unchanged(before, after):
         np.testing.assert_array_equal(array, after[1][name], err_msg=name)
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_any_order_within_the_window_and_everything_twice(world, seed):
@@ -125,6 +132,7 @@ def test_any_order_within_the_window_and_everything_twice(world, seed):
     assert_same_bits(once, in_order(network, found, once.now))
 
 
+@pytest.mark.slow
 @FEW
 @given(seed=st.integers(0, 10**6))
 def test_what_comes_in_order_is_used_however_late(world, seed):

@@ -67,6 +67,7 @@ def found() -> dict[str, dict[str, hg.Statistics]]:
     return hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 3, keep=hg.Statistics(), inputs=INPUTS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plain", "trajectory", "relay", "bursts"])
 def test_claims_are_exact(found: dict[str, dict[str, hg.Statistics]], name: str) -> None:
     s = found[name]["linear"]
@@ -76,6 +77,7 @@ def test_claims_are_exact(found: dict[str, dict[str, hg.Statistics]], name: str)
     assert np.max(np.abs(s.actual() - s.claimed()) / error) < Z_LIMIT
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "sent"), [("plain", 1.0), ("trajectory", 0.0)])
 def test_the_error_is_that_of_the_power_that_is_sent(
     found: dict[str, dict[str, hg.Statistics]], name: str, sent: float

@@ -74,6 +74,7 @@ def final_error(channel, p):
     return jnp.trace(jax.lax.scan(body, filter_.init(), jnp.arange(STEPS))[0].covariance)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_the_gradient_of_the_final_error_is_that_of_finite_differences(name):
     channel, parameters = CASES[name]
@@ -180,6 +181,7 @@ def test_noises_and_moments_of_every_map_can_be_traced():
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_channel_with_an_uncertain_law_keeps_its_bound_under_a_trace():
     """The worst cases over a known polytope are functions of the hop's power; the decisions on the way are the same."""
 

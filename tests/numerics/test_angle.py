@@ -39,6 +39,7 @@ def heading(x: jax.Array) -> jax.Array:
     return jnp.stack([jnp.arctan2(jnp.sin(y), jnp.cos(y)), x[1]])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", [Cubature(), Linearization(), PolynomialMoments(2), PolynomialMoments(1)])
 @pytest.mark.parametrize("deviation", [0.1, 3.0, 30.0])
 def test_an_angle_that_follows_another_has_exact_moments_however_wide(rule, deviation):

@@ -22,6 +22,7 @@ def design(relays):
     return hg.design(relays, budget=0.5)
 
 
+@pytest.mark.slow
 def test_gains_are_those_of_the_tuning_within_the_budget(relays, design):
     tuned = hg.relays.periodic_relays_for_best_receiver(relays, power_limit=0.5)
     for name, gain in tuned.items():
@@ -32,6 +33,7 @@ def test_gains_are_those_of_the_tuning_within_the_budget(relays, design):
     assert design.certificate.words == "best of the one start; no bound is known"
 
 
+@pytest.mark.slow
 def test_the_network_it_gives_sends_and_errs_as_designed(design):
     sent = hg.power(design.network)
     for name in ("north", "south"):

@@ -12,6 +12,7 @@ CHAIN = hg.random_affine.MarkovChain([[0.8, 0.2], [0.4, 0.6]])
 delayed = hg.model.delayed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "channel",
     [

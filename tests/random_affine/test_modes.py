@@ -38,8 +38,10 @@ CHANNELS = {
     "loss that is not told": hg.dropout(hg.parallel([link(), drift()]), 0.6),
 }
 
+LARGE = {"chains of their own", "one chain", "a drift and a chain", "one drift twice", "loss that is not told"}
 
-@pytest.mark.parametrize("name", CHANNELS)
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n in LARGE else n for n in CHANNELS])
 def test_draws_have_the_moments_and_the_memory_that_they_state(name):
     check_random_affine(CHANNELS[name])
 

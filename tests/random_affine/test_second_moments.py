@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.random_affine.base import conditional_moments
 from heliograph.random_affine.interval import CORNERS, moment_interval
+from tests.as_code import printing
 
 GAMMA = hg.Discrete([0.7, 0.85, 1.0], [0.3, 0.3, 0.4], 0.02)
 XI = hg.Discrete([0.8, 0.9, 1.0], [0.2, 0.3, 0.5], 0.02)
@@ -70,6 +71,12 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
     channel = hg.parallel([hg.amplify_and_forward([hg.hop(law(), 0.1), hg.hop(law(), 0.2)]) for _ in range(components)])
     if direct:
         channel = hg.with_direct_link(channel, hg.hop(law(), 0.1, dimension=components))
+    with printing(channel=channel):
+        check_that_maps_dominate(channel, rng)
+
+
+def check_that_maps_dominate(channel, rng):
+    components = channel.inputs
     found = hg.random_affine.second_order(channel)
     a = rng.normal(size=(components + 1, components + 1))
     w = a @ a.T

@@ -30,6 +30,7 @@ def ratio(design, own):
     return design.trace("receiver")[1:] / own.trace("receiver")[1:]
 
 
+@pytest.mark.slow
 def test_tuned_together_the_receiver_errs_less(own):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
     assert np.mean(ratio(tuned, own)) <= 0.775  # found: 0.7680
@@ -38,6 +39,7 @@ def test_tuned_together_the_receiver_errs_less(own):
     assert 1.0 < np.max(tuned.total_power() / own.total_power()) < 1.5
 
 
+@pytest.mark.slow
 def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=40, found=0.8752):
     """Descents that stop after a count of steps differ by what rounding makes of it: 0.1 % of the error."""
     own = own_error_design(example(), horizon)
@@ -56,6 +58,7 @@ def test_the_same_limit_gives_the_same_bits(horizon=40):
         np.testing.assert_array_equal(gains, second.gains[name])
 
 
+@pytest.mark.slow
 def test_a_limit_that_does_not_bind_costs_nothing(greedy, free):
     wide = receiver_error_design(unusual(), STEPS, power_limit=10 * free.total_power().max(), sweeps=100)
     weights = 1 / greedy.trace("receiver")[1:]
@@ -74,6 +77,7 @@ def test_a_limit_just_above_the_power_of_the_mean_is_met(greedy):
         assert np.any(design.total_power() > silent.total_power())
 
 
+@pytest.mark.slow
 def test_steps_without_weight_keep_their_gains(greedy):
     """Nothing hangs on the gains of the last step, whose normal matrix is zero: the others are those without it."""
     net, weights = unusual(), np.arange(1.0, STEPS)

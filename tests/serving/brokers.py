@@ -19,6 +19,8 @@ from heliograph.serving.transport import Transport
 from heliograph.serving.url import Address, address
 from heliograph_studies.live.server import Server
 
+KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]
+
 
 def running(folder: Path) -> Iterator[Server]:
     """A server while a module's tests run."""

@@ -20,7 +20,7 @@ from heliograph.serving.partition import Part, part_of, word
 from heliograph.serving.transport import TakenOverError, Transport
 from heliograph.serving.url import Address, address
 from heliograph_studies.live.server import Server
-from tests.serving.brokers import at, made, numbered, published, received, running, sent, silent
+from tests.serving.brokers import KINDS, at, made, numbered, published, received, running, sent, silent
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +90,7 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
     asyncio.run(work())
 
 
+@pytest.mark.real("NATS")
 def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
     async def work() -> None:
         where = at(server, "nats", "again")
@@ -110,6 +111,7 @@ def test_what_was_not_acknowledged_comes_again_in_order(server: Server):
     asyncio.run(work())
 
 
+@pytest.mark.real("NATS")
 def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, caplog):
     async def work() -> None:
         where = address(f"nats://me:s3cret@127.0.0.1:{server.nats}/site", {})
@@ -134,6 +136,7 @@ def test_a_server_that_is_killed_is_tried_again_and_nothing_is_missed(tmp_path, 
     assert "trying again" in caplog.text and "s3cret" not in caplog.text
 
 
+@pytest.mark.real("NATS")
 def test_the_server_cuts_plants_into_parts_as_we_do(server: Server):
     async def work() -> None:
         where, parts = at(server, "nats", "shared"), 3
@@ -152,6 +155,7 @@ def test_the_server_cuts_plants_into_parts_as_we_do(server: Server):
     asyncio.run(work())
 
 
+@pytest.mark.real("MQTT")
 def test_a_session_keeps_what_was_not_acknowledged(server: Server):
     async def work() -> None:
         where = at(server, "mqtt", "session")
@@ -175,6 +179,7 @@ def test_a_session_keeps_what_was_not_acknowledged(server: Server):
     asyncio.run(work())
 
 
+@pytest.mark.real("MQTT")
 def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
     async def work() -> None:
         where = at(server, "mqtt", "parted")
@@ -191,8 +196,8 @@ def test_a_sender_to_mqtt_writes_the_part_into_the_topic(server: Server):
     asyncio.run(work())
 
 
-@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make a certificate")
-@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl here: apt-get install openssl")
+@pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # paho leaves sockets to the collector
 def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatch, caplog):
     make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt

@@ -20,7 +20,7 @@ from heliograph.serving.output import Output
 from heliograph.serving.transport import Transport
 from heliograph.serving.url import Address
 from heliograph_studies.live.server import Server
-from tests.serving.brokers import at, published, running, sent, silent
+from tests.serving.brokers import KINDS, at, published, running, sent, silent
 
 
 @pytest.fixture(scope="module")
@@ -75,10 +75,12 @@ class OverMqtt:
         return list(self.heard)
 
 
+@pytest.mark.real("NATS")
 def test_jetstream_keeps_the_contract_and_sends_again_in_order(server: Server):
     assert check_transport(OverNats(server))
 
 
+@pytest.mark.real("MQTT")
 def test_mqtt_keeps_the_contract(server: Server):
     broker = OverMqtt(server)
     check_transport(broker)  # this server sends what is new first
@@ -86,7 +88,7 @@ def test_mqtt_keeps_the_contract(server: Server):
     broker.reader.loop_stop()
 
 
-@pytest.mark.parametrize("kind", ["nats", "mqtt"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: str):
     make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
     outputs = [Output(i, "a.b", "final", str(i).encode()) for i in range(300)]

@@ -8,6 +8,7 @@ FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")
 
 
+@pytest.mark.slow
 def test_a_killed_service_loses_nothing_and_counts_nothing_twice(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(FOLDER)
     import kills

@@ -3,7 +3,6 @@
 import asyncio
 import json
 import re
-import shutil
 import urllib.request
 from collections.abc import Awaitable, Callable
 from urllib.error import HTTPError
@@ -17,6 +16,7 @@ from heliograph.serving.page import Door, door, shown
 from heliograph.serving.surprise import DOUBT, MEMORY, Surprise
 from heliograph.serving.watch import Watch
 from tests.serving.watched import Scripted
+from tests.widths import program
 
 TOKEN = "a token of enough letters"
 
@@ -148,12 +148,12 @@ def test_a_page_of_elsewhere_that_takes_our_name_does_not_get_in():
     looked(look, Scripted())
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="no browser here")
+@pytest.mark.real("browser")
 def test_a_browser_draws_it_and_runs_nothing_that_came_from_outside(fits):
     async def look(url: str) -> None:
         await asyncio.to_thread(fits, f"{url}/")
         arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--timeout=4000", "--dump-dom", url]
-        browser = await asyncio.create_subprocess_exec("chromium", *arguments, stdout=-1, stderr=-3)
+        browser = await asyncio.create_subprocess_exec(str(program()), *arguments, stdout=-1, stderr=-3)
         text = (await browser.communicate())[0].decode()
         body = text[text.index("<main>") : text.index("</main>")]
         assert body.count("<svg") == 2 and 'class="area"' in body

@@ -1,8 +1,5 @@
 """The same store in PostgreSQL, where there is one to start."""
 
-import os
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -11,44 +8,30 @@ from heliograph.serving.database import engine_at
 from heliograph.serving.service import Service
 from heliograph.serving.store import Store
 from heliograph.serving.whose import identity
+from tests.postgres import Postgres
 from tests.serving import test_sharing
 from tests.serving.test_store import by_plant, journal, states
 from tests.serving.worlds import fleet, lines, messages, stepping
 
-pytest.importorskip("psycopg", reason="PostgreSQL is an extra of its own")
-SERVER = ("-c", "listen_addresses=", "-c", "fsync=off", "-c", "full_page_writes=off")
+pytestmark = pytest.mark.real("PostgreSQL")
+
+
+@pytest.fixture(scope="module")
+def server():
+    """One for these tests: it takes a second to make."""
+    with Postgres() as server:
+        yield server
 
 
 @pytest.fixture
-def database(tmp_path_factory):
-    """A server of its own in a new folder, on a socket there; it starts for nobody who may do everything."""
-    if shutil.which("initdb") is None or shutil.which("postgres") is None:
-        pytest.skip("no PostgreSQL here")
-    folder = Path(tmp_path_factory.mktemp("pg"))
-    who = []
-    if os.geteuid() == 0:
-        if shutil.which("runuser") is None:
-            pytest.skip("PostgreSQL does not start for root")
-        for place in (folder, *folder.parents[:2]):
-            place.chmod(0o777)
-        who = ["runuser", "-u", "nobody", "--"]
-    data = folder / "data"
-    made = subprocess.run(
-        [*who, "initdb", "-D", data, "-A", "trust", "-U", "me", "-N"], capture_output=True, cwd=folder
-    )
-    if made.returncode:
-        pytest.skip(f"PostgreSQL does not start here: {made.stderr.decode()[-200:]}")
-    server = subprocess.Popen(
-        [*who, "postgres", "-D", data, "-k", folder, *SERVER], stderr=subprocess.DEVNULL, cwd=folder
-    )
-    try:
-        ready = ["pg_isready", "-h", folder, "-q"]
-        while subprocess.run(ready, cwd=folder).returncode and server.poll() is None:
-            pass
-        yield f"postgresql://me@/postgres?host={folder}"
-    finally:
-        server.terminate()
-        server.wait()
+def database(server):
+    """The address of an empty one."""
+    return server.database()
+
+
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="no /proc here: run on Linux")
+def test_the_server_is_not_root(server):
+    assert Path(f"/proc/{server.process.pid}").stat().st_uid != 0
 
 
 def test_processes_share_a_store_in_postgresql(tmp_path, database):

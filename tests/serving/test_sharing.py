@@ -94,6 +94,7 @@ class Process:
         self.process = subprocess.Popen(command, cwd=folder, env=environment, stdout=self.log, stderr=self.log)
 
 
+@pytest.mark.real("NATS")
 def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Server, tmp_path: Path):
     found = messages(plants=12, count=60, seed=3, whole=True)
     expected = finals(output.body for output in Service(fleet(stepping()), Nowhere()).take(lines(found)))

@@ -58,6 +58,7 @@ def world(plain):
     return hg.Network(plant, nodes)
 
 
+@pytest.mark.slow
 def test_planned_filters_tell_what_they_would_without_a_plan():
     """Step by step without a plan; a channel that erases takes no plan."""
     network = world(hg.hop(hg.Rayleigh(1.0), 0.1))

@@ -32,6 +32,7 @@ def clean():
     return {name: value for name, value in os.environ.items() if not name.startswith("JAX_")} | {SETTING: "xla"}
 
 
+@pytest.mark.slow
 def test_a_second_process_compiles_nothing(tmp_path):
     def run():
         command = [sys.executable, "-c", PROGRAM, str(tmp_path / "cache")]

@@ -57,6 +57,7 @@ np.savez(sys.argv[1], truth=record.truth, mean=record.estimates["a"]["f"].mean, 
 """
 
 
+@pytest.mark.slow
 def test_several_devices_share_the_lanes(tmp_path):
     """Three devices that JAX makes of one processor; sums run in another order, so rounding may differ."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=3"
@@ -70,6 +71,7 @@ def test_several_devices_share_the_lanes(tmp_path):
     np.testing.assert_allclose(found["outer"], statistics.outer, rtol=1e-10, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_single_precision_tells_the_same_story():
     """Other draws of the same laws: RMSE within 4 standard errors of its difference over 8,192 runs."""
     double, single = (

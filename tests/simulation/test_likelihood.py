@@ -76,6 +76,7 @@ FILTERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILTERS)
 def test_gradients_are_finite_differences(name):
     item, step = FILTERS[name], 1e-5

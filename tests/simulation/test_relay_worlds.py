@@ -20,6 +20,8 @@ from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.sums import Statistics, error_statistics
 from tests.relays.relay_problems import example, unusual
 
+pytestmark = pytest.mark.slow
+
 FALSE_ALARM = 1e-4  # of each comparison over all its steps
 
 

@@ -5,6 +5,8 @@ import pytest
 
 import heliograph as hg
 
+pytestmark = pytest.mark.slow
+
 PLANT = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]])
 SENSOR = hg.LinearSensor([[0.0]], hg.Gaussian([[0.0]], [1.0]))  # y = 1, so that z is the gain
 BURSTS = [[0.9, 0.1], [0.2, 0.8]]

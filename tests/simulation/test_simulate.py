@@ -139,6 +139,7 @@ def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
                 np.testing.assert_allclose(estimate.covariance, together.covariance[k], rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_true_channel_makes_the_data_and_the_filter_believes_another(statistics):
     (hearing, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
     assert hearing < deaf - 4 * np.hypot(error, other)
@@ -207,6 +208,7 @@ def test_saturation_is_reported_and_nothing_is_claimed_there(record):
     assert 1 < record.uplinks["escape"].symbols_per_value() < 5
 
 
+@pytest.mark.slow
 def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
     some = [hg.monte_carlo(NETWORK, HORIZON, RUNS, 11, hg.Statistics(), INPUTS, chunk) for chunk in (64, 256)]
     for name in ("outer", "covariance", "nees", "count"):

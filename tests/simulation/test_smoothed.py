@@ -24,6 +24,7 @@ def record():
     return hg.monte_carlo(GAPS, HORIZON, RUNS, 3, smooth=hg.smoothing.FixedLag(LAG))
 
 
+@pytest.mark.slow
 def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
     found = record.smoothed
     assert found.failures() == [] and np.array_equal(found.truth, record.truth)
@@ -61,6 +62,7 @@ def test_statistics_of_the_record_and_its_smoothed_part(record):
             assert both[1].rmse()[0] < 0.97 * both[0].rmse()[0]
 
 
+@pytest.mark.slow
 def test_in_bounded_memory_with_gains_known_before_data():
     smooth = hg.smoothing.FixedInterval()
     statistics = hg.monte_carlo(WHOLE, HORIZON, 4 * RUNS, 3, keep=hg.Statistics(), smooth=smooth)

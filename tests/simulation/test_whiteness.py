@@ -20,6 +20,7 @@ def heard():
     return record.measurements["node"][0], filters
 
 
+@pytest.mark.slow
 def test_memory_is_found_where_a_filter_assumes_none(heard):
     """Lag 1 is .30 and lag 2 .20; within four standard errors."""
     z, filters = heard
@@ -29,6 +30,7 @@ def test_memory_is_found_where_a_filter_assumes_none(heard):
     assert 0.05 < found.predictable < 0.2
 
 
+@pytest.mark.slow
 def test_the_exact_filter_leaves_nothing_behind(heard):
     z, filters = heard
     found = hg.simulation.memory_test(z, filters["exact"])

@@ -81,6 +81,7 @@ def test_a_quadratic_smoother_is_the_best_in_z_and_its_squares():
     np.testing.assert_allclose(found.covariance[:, 0, 0], left, rtol=0, atol=CLOSE)
 
 
+@pytest.mark.slow
 def test_a_receiver_behind_relays_smooths_the_relays_states_too():
     network, time = relays(), 6
     gains = hg.relays.own_error_design(network, time).gains
@@ -107,6 +108,7 @@ def test_a_receiver_behind_relays_smooths_the_relays_states_too():
         hg.smoothing.retained_steps(schedule, z)
 
 
+@pytest.mark.slow
 def test_a_bound_holds_under_every_law_where_the_mean_gain_is_known():
     plant, sensor, time = hg.LinearPlant([[0.9]], 0.2, [1.0], 0.5), hg.LinearSensor([[1.0]], 0.1), 6
     quiet, loud = hg.hop(1.0, 0.05), hg.hop(1.0, 0.8)

@@ -54,6 +54,7 @@ def test_smoothers_are_the_stacked_linear_estimate(seed):
             np.testing.assert_allclose(found.covariance[at], covariance[about], atol=CLOSE, rtol=0)
 
 
+@pytest.mark.slow
 def test_planned_before_data_it_maps_data_to_the_same_means():
     item, _, z = problem(0)
     z = 0.1 * np.nan_to_num(z)  # larger data would not be such as the filter expects, and warn

@@ -38,6 +38,7 @@ def remembering():
     return hg.monte_carlo(hg.Network(PLANT, nodes), HORIZON, RUNS, 1, keep=hg.Statistics(), smooth=INTERVAL)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["uncertain chain", "multiple models"])
 def test_behind_links_that_remember_it_is_nominal_and_better_than_the_filter(remembering, kind):
     filtered, smoothed = remembering[kind]["one"], remembering.smoothed[kind]["one"]

@@ -3,7 +3,11 @@
 import json
 from itertools import pairwise
 
+import pytest
+
 from heliograph_studies.fusion import compute, example, machine
+
+pytestmark = pytest.mark.slow
 
 RULES = ["matrix", "matrix_with_mean", "all_reports", "central"]
 

@@ -13,6 +13,8 @@ from heliograph_studies.intermittent_observations.statements import statements
 from tests.riccati import riccati
 from tests.studies.readme import said_of
 
+pytestmark = pytest.mark.slow
+
 MEAN = {(0.1, 0.6): 4.3818, (0.3, 0.6): 6.1303, (0.1, 0.9): 3.6096, (0.4, 0.6): 6.8095}
 BOUND = {(0.1, 0.6): 4.5801, (0.3, 0.6): 6.5848, (0.1, 0.9): 3.6612, (0.4, 0.6): 7.3266}
 

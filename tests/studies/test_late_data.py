@@ -17,6 +17,8 @@ from heliograph_studies.late_data.plaza import fates_by_node
 from heliograph_studies.late_data.synthetic import synthetic_packets
 from heliograph_studies.late_data.trace import SLOT, read_trace
 
+pytestmark = pytest.mark.slow
+
 
 def row(node, sequence, sent, received, clock="0:00:01.000000"):
     """As the testbed writes it: flag, slots and number with their lowest byte first, flag, hops."""

@@ -9,6 +9,8 @@ import heliograph as hg
 from heliograph_studies.learning import compute, page, plaza, run
 from heliograph_studies.learning.setting import LAWS, METHODS, ROWS, learned, true_values, world
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_laws_have_the_moments_that_are_to_be_learned():
     for name, law in LAWS.items():

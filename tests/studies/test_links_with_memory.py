@@ -9,6 +9,8 @@ import heliograph as hg
 from heliograph_studies.links_with_memory import compute, page, run
 from heliograph_studies.links_with_memory.setting import bursts, correlated
 
+pytestmark = pytest.mark.slow
+
 FILTERS = {"memoryless", "exact", "gpb1", "imm", "gpb2", "particle", "mode_late", "mode_known"}
 
 

@@ -21,6 +21,7 @@ from heliograph_studies.live.server import Server
 from heliograph_studies.live.speed import PLANTS, many
 
 
+@pytest.mark.real("NATS")
 def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
     drive = read_drive(0)
     assert len(drive.lines) + drive.unheard == 3632 and 0 < drive.unheard < 300
@@ -39,6 +40,7 @@ def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
     assert not outcome.identical and outcome.lost == 1 and outcome.counted_twice == 2
 
 
+@pytest.mark.real("NATS")
 def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
     """A service makes the stream of what it tells before that of what it reads: a message in between would be lost."""
 

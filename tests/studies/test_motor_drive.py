@@ -10,10 +10,13 @@ from scipy.integrate import solve_ivp
 
 import heliograph as hg
 from heliograph import cli
+from heliograph.numerics.extras import how_to_install
 from heliograph_studies.motor_drive import compute, drive, example, listeners, machine
 from heliograph_studies.motor_drive.machine import POLE_PAIRS, RATED, STEP, Machine, euler, runge_kutta
 
-needs_simulator = pytest.mark.skipif(find_spec("gym_electric_motor") is None, reason="needs the extra motor")
+needs_simulator = pytest.mark.skipif(
+    find_spec("gym_electric_motor") is None, reason=f"no motor simulator here: {how_to_install('motor')}"
+)
 RUNNING = np.array([3.0, -1.0, 0.1, -0.37, 124.0, 2.0])  # A, Vs, rad/s, Nm: near the drive's end
 
 
@@ -152,6 +155,7 @@ def test_refuses_one_seed():
         compute.compute(1)
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_model_is_the_simulator_s_machine():
     found = drive.simulate_drive(loaded=False)
@@ -168,6 +172,7 @@ def test_the_model_is_the_simulator_s_machine():
     assert np.max(np.abs(ends - found.truth[1:, :5])) < 1.3e-6
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_simulator_s_speed_obeys_torque_and_load():
     found = drive.simulate_drive().truth * RATED
@@ -180,6 +185,7 @@ def test_the_simulator_s_speed_obeys_torque_and_load():
     assert np.max(np.abs(np.diff(found[:, 4]))) > 0.1
 
 
+@pytest.mark.slow
 @needs_simulator
 def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
     found = drive.simulate_drive()

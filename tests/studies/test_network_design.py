@@ -10,6 +10,8 @@ from heliograph_studies.demo.twin import Design
 from heliograph_studies.network_design import compute, page, published, run
 from heliograph_studies.network_design.published import Circuit, packets
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory, fits):

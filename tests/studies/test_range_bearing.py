@@ -2,9 +2,13 @@
 
 import json
 
+import pytest
+
 import heliograph as hg
 from heliograph_studies.range_bearing import compute, example
 from heliograph_studies.range_bearing.setting import close_by, passing
+
+pytestmark = pytest.mark.slow
 
 CHEAP = ("extended", "cubature", "four_points")
 

@@ -6,6 +6,8 @@ import pytest
 
 from heliograph_studies import smoothing
 
+pytestmark = pytest.mark.slow
+
 # A moving point: deviations sqrt(P_xx + P_yy) and mean traces, and variances of a lag's share of the filter's.
 FILTER = {"10": 0.8678, "50": 2.6563, "90": 4.7837, "mean_trace": 9.7282}
 SMOOTHER = {"10": 0.4950, "50": 1.5415, "90": 3.7904, "mean_trace": 5.0373}

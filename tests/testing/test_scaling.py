@@ -40,7 +40,9 @@ CHANNELS = {
 }
 
 
-@pytest.mark.parametrize("name", CHANNELS)
+@pytest.mark.parametrize(
+    "name", ["random gain", *(pytest.param(name, marks=pytest.mark.slow) for name in CHANNELS if name != "random gain")]
+)
 def test_linear_networks(name):
     assert check_scaling(linear_network(CHANNELS[name])) <= 1
 
@@ -53,6 +55,7 @@ def test_a_mixture():
     assert check_scaling(hg.Network(plant, {"node": hg.Node(sensor, channel, filters)})) <= 1
 
 
+@pytest.mark.slow
 def test_links_that_remember_and_losses_that_are_told():
     """By mode and by what arrives; of a lost packet the moments of what would have come are compared."""
     plant = hg.LinearPlant([[0.9, 0.2], [0.0, 0.8]], np.diag([0.1, 0.02]), [1.0, -2.0], np.diag([1.0, 0.5]))
@@ -78,6 +81,7 @@ def test_a_flag_has_no_unit():
         check_scaling(hg.Network(plant, {"node": node}))
 
 
+@pytest.mark.slow
 def test_a_nonlinear_network_with_inputs_and_states_known_exactly():
     plant = hg.Plant(
         lambda x, u: jnp.stack([x[0] + u[0] * x[1], x[1] - u[0] * jnp.sin(x[0]), x[2]]),

@@ -83,6 +83,7 @@ def problem(request):
     return request.param, problem_of(request.param)
 
 
+@pytest.mark.slow
 def test_gradients_are_those_of_differences(problem):
     check_gradients(problem[1])
 
@@ -91,6 +92,7 @@ def first_step(measured):
     return type(measured)(*(None if part is None else part[0] for part in measured))
 
 
+@pytest.mark.slow
 def test_the_error_is_that_of_the_recursion(problem):
     name, item = problem
     result = item.at(item.numbers.start).covariances[0]
@@ -183,6 +185,7 @@ def test_a_relay_is_placed_where_the_closed_form_puts_it():
     assert hg.power(result.network).total == pytest.approx(power, rel=1e-7)
 
 
+@pytest.mark.slow
 def test_powers_and_amplifications_agree():
     """The same network by amplifications, as a function, and by powers, by name."""
 

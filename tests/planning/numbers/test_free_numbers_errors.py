@@ -30,6 +30,7 @@ CONSTANT = {"p": (1.0, 1e-3, 9.0), "q": (1.0, 1e-3, 9.0)}
 UNSTABLE = hg.LinearPlant([[1.2, 0.2], [0.0, 0.7]], np.diag([0.1, 0.3]), [1.0, 2.0], np.eye(2))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("build", "free", "error"),
     [
@@ -42,6 +43,7 @@ def test_gradients_of_every_error_are_those_of_differences(build, free, error):
     check_gradients(NumberProblem(build, as_numbers(free), error))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("free", "options"),
     [

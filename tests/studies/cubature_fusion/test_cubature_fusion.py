@@ -34,6 +34,8 @@ from tests.oracles import cubature_fusion as oracle
 from tests.oracles import relayed_machine
 from tests.studies.verdicts import both, check_verdicts
 
+pytestmark = pytest.mark.slow
+
 FILTERS = {"open_loop", "mean_gain", "extended_polytope", "cubature_printed", "cubature_tight", "cubature_polytope",
            "cubature_zero_mean"}  # fmt: skip
 BOUNDED = FILTERS - {"open_loop", "mean_gain"}

@@ -21,6 +21,8 @@ from heliograph_studies.demo.twin import Design, channel_less
 from tests.oracles.range_only import cubature_oracle
 from tests.widths import Widths
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[3]
 PLAZA2 = robot.DRIVES["plaza2"]
 

@@ -18,6 +18,8 @@ from heliograph_studies.h_infinity_fusion import (
 )
 from heliograph_studies.h_infinity_fusion.setting import Setting, dynamics
 
+pytestmark = pytest.mark.slow
+
 pytest.importorskip("cvxpy")
 SETTING = Setting()
 

@@ -30,6 +30,8 @@ from tests.studies.h_infinity_fusion.verdicts import VERDICTS
 from tests.studies.readme import said_of
 from tests.studies.verdicts import check_verdicts
 
+pytestmark = pytest.mark.slow
+
 RECURSIVE = example.RECURSIVE
 SETTING = Setting(runs=128, seed=1)
 pytest.importorskip("cvxpy")

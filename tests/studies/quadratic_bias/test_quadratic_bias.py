@@ -14,6 +14,8 @@ from tests.oracles import quadratic_bias as oracle
 from tests.studies.readme import README, said_of
 from tests.studies.verdicts import both, check_verdicts
 
+pytestmark = pytest.mark.slow
+
 # Means over t = 31 ... 100 by a separate implementation (enumerated monomials in NumPy), for what the oracle lacks.
 EXPECTED = {"memory": (0.0419766, 0.0393043), "cubic": (0.0328326, 0.0333223), "quartic": (0.0312705, 0.0326232)}
 

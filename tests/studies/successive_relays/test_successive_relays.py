@@ -15,6 +15,8 @@ from tests.oracles import successive_relays as oracle
 from tests.studies.readme import said_of
 from tests.studies.verdicts import both, check_verdicts
 
+pytestmark = pytest.mark.slow
+
 RUNS = 600
 
 
