@@ -37,13 +37,12 @@ def export(
     from heliograph.export.measure import cost
     from heliograph.export.text import claim_of
     from heliograph.files.network_file import load_network
-    from heliograph.files.recording import received_names
 
     check_place(out)
     loaded = load_network(network)
     chosen = node_of(loaded, filter, node)
     item = loaded.nodes[chosen].filters[filter]
-    names = received_names(loaded.nodes[chosen])[: item.received]
+    names = loaded.nodes[chosen].received_names[: item.received]
     written = export_named(item, out, precision, names)
     measured = cost(written.header, written.source, item.received, len(item.inputs), PRECISIONS[precision])
     claim = claim_of(item, PRECISIONS[precision])
