@@ -151,7 +151,8 @@ def test_a_lost_covariance_is_reported_with_its_step():
     network = hg.Network(
         plant, {"n": hg.Node(sensor, hg.perfect(), {"f": hg.cubature_filter(plant, sensor, hg.perfect())})}
     )
-    record = hg.run(network, {"n": np.full((12, 1), np.nan)})
+    with pytest.warns(UserWarning, match="the prediction to its time is no finite number"):
+        record = hg.run(network, {"n": np.full((12, 1), np.nan)})
     (line,) = record.failures()
     assert line.startswith("n/f: no valid covariance from step ")
     step = int(line.split("step ")[1].split()[0])

@@ -17,7 +17,7 @@ from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.lowering import like
 from heliograph.codegen.machine import target
 from heliograph.codegen.program import lower
-from heliograph.numerics.check import fail
+from heliograph.numerics.check import fail, shown
 from heliograph.numerics.types import PyTree
 
 Code = TypeVar("Code")
@@ -49,6 +49,8 @@ def engine_of(function: Callable[..., PyTree], *arguments: PyTree) -> str:
     Raises:
         ValueError: an engine that is none.
     """
+    if not callable(function):
+        raise fail("function of one run", "a function of arrays", shown(function))
     choice = chosen(function, jax.tree.map(np.asarray, arguments), [True] * len(arguments))
     return f"xla: {choice.why}" if choice.code is None else f"native: {choice.code.code.operations} operations"
 

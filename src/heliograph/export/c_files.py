@@ -77,6 +77,8 @@ def check_place(path: str | Path) -> Path:
     Raises:
         ValueError: a path that does not end in .c, is no name in C or cannot be written.
     """
+    if not isinstance(path, str | Path):
+        raise fail("path of the source", "a file that ends in .c", shown(path))
     source = Path(path)
     check_output(source, (".c",))
     check_output(source.with_suffix(".h"), (".h",))

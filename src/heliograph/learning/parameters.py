@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.learning.transforms import from_line, size, slope, to_line, unlink, unlink_slope
+from heliograph.learning.transforms import from_line, size, slope, to_line, unlink_slope
 from heliograph.numerics.domain import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
@@ -42,8 +42,6 @@ class Parameter:
 
     def values(self, x: Float[np.ndarray, " size"]) -> Float[np.ndarray, " entries"]:
         """The entries at a point of the line."""
-        if self.domain.kind == "interval":
-            return np.asarray(unlink(self.domain, x))
         with jax.enable_x64(True):
             return np.asarray(self._read_at(jnp.asarray(x)))
 

@@ -50,7 +50,8 @@ class Judges:
     def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
         """Why each of these is implausible, by its place among them, those that are.
 
-        Of a plant with inputs among these the first alone: what comes after it was judged with it.
+        Of a plant with inputs among these the first alone: what comes after it was judged with it. Of several events
+        of one node in one row the largest alone, since the row was judged as a whole; one without numbers never.
         """
         if not taken:
             return {}
@@ -61,13 +62,23 @@ class Judges:
         for i in np.flatnonzero(flagged).tolist():
             one = taken[i]
             if one.event.place >= 0:
-                why = why_values(told[i][self._columns[one.event.place]])
+                why = why_values(told[i][self._columns[one.event.place]]) if _size(one.event) >= 0 else None
             elif why := why_inputs(told[i][self._every]):
                 first = spoilt.setdefault(one.plant.name, i)
                 spoilt[one.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
             if why:
                 found[i] = why
-        return {i: why for i, why in found.items() if spoilt.get(taken[i].plant.name, i) == i}
+        largest: dict[tuple[int, int], int] = {}
+        for i in found:
+            place = taken[i].row.slot, taken[i].event.place
+            largest[place] = max(largest.get(place, i), i, key=lambda j: _size(taken[j].event))
+        first_of_plant = {i: why for i, why in found.items() if spoilt.get(taken[i].plant.name, i) == i}
+        return {i: why for i, why in first_of_plant.items() if i in largest.values()}
+
+
+def _size(event: Known) -> float:
+    """The largest number of an event, -1 where it has none."""
+    return float(np.max(np.abs(event.values), initial=-1.0, where=~np.isnan(event.values)))
 
 
 def _columns(places: Sequence[Place]) -> np.ndarray:

@@ -20,6 +20,7 @@ from heliograph.simulation.record import Record
 Result = TypeVar("Result")
 
 
+@readable
 class OfStep(NamedTuple):
     """What is kept of one step of one run: what is summed over runs, in which runs it was ever so, what is collected.
 
