@@ -12,6 +12,7 @@ from heliograph_studies.outcome import Inline, Unlisted
 from heliograph_studies.stages import Stages
 
 HALF = slice(STEPS // 2, None)  # the steps that are averaged
+Errors = Mapping[str, float | np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class Late:
     true_se: float
     claimed_over_time: np.ndarray
     true_over_time: np.ndarray
-    before_data: Inline[Mapping[str, float | np.ndarray]]
+    before_data: Inline[Errors]
 
     @property
     def error(self) -> float:
@@ -116,7 +117,8 @@ def before_data(simulated: Mapping[str, Late]) -> dict[str, Late]:
     for node in ("untold", "none"):
         for name, item in late_filters()[node].items():
             true = hg.filters.true_error(item, PLANT, SENSOR, LINKS[node], STEPS).true[:, 0, 0]
-            errors = {"true_before_data": float(true[HALF].mean()), "true_before_data_over_time": true}
+            mean = float(true[HALF].mean())
+            errors: Errors = {"true_before_data": mean, "true_before_data_over_time": true}
             result[name] = replace(simulated[name], before_data=errors)
     return result
 

@@ -3,6 +3,7 @@
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -44,7 +45,7 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
     """Everything."""
     # First: what memory the process has had at most is of all that came before.
     of_many = stages(f"{setting.tree_nodes} nodes in a tree, {setting.many} nodes", lambda: scale(setting))
-    cases = {name: stages(what, lambda name=name: one_case(name, setting.steps)) for name, what in CASES.items()}
+    cases = {name: stages(what, partial(one_case, name, setting.steps)) for name, what in CASES.items()}
     simulated = stages("simulating three rooms", lambda: measured(setting))
     of_tree, levels, root = stages("a tree of relays", lambda: tree(setting))
     sent = stages("choosing what is sent", lambda: traffic(setting))
