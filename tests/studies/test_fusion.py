@@ -5,22 +5,21 @@ from itertools import pairwise
 
 import pytest
 
-from heliograph_studies.fusion import compute, example, machine
+from heliograph_studies import fusion
+from heliograph_studies.fusion import compute
 
 pytestmark = pytest.mark.slow
 
 RULES = ["matrix", "matrix_with_mean", "all_reports", "central"]
 
 
-def test_the_summary_has_every_rule_in_its_order(tmp_path, monkeypatch, fits):
+def test_the_summary_has_every_rule_in_its_order(tmp_path, fits):
     # One number of steps, and as many nodes as the tree has leaves: what is compiled for one serves the others.
-    small = {"STEPS": 60, "MANY": 12, "MANY_STEPS": 60, "MEASURED_STEPS": 60, "RUNS": 64, "TREE_NODES": 30, "DEGREE": 5}
-    for name, value in (
-        small | {"STRONG_RUNS": 4, "INTERVALS": (1, 2), "THRESHOLDS": (0.3,), "TRAFFIC_STEPS": 8}
-    ).items():
-        monkeypatch.setattr(compute, name, value)
-    monkeypatch.setattr(machine, "OUTPUTS", machine.OUTPUTS[:2])
-    example(tmp_path, 0)
+    setting = fusion.Setting(
+        steps=60, many=12, many_steps=60, measured_steps=60, runs=64, tree_nodes=30, degree=5, machine_runs=4,
+        machine_nodes=2, intervals=(1, 2), thresholds=(0.3,), traffic_steps=8,
+    )  # fmt: skip
+    fusion.run(setting, tmp_path)
     fits(tmp_path / "fusion" / "report.html")
     found = json.loads((tmp_path / "fusion" / "summary.json").read_text())
     for case in compute.CASES:

@@ -9,13 +9,15 @@ from heliograph.cli import main
 from heliograph.live.timeline import Timeline
 from heliograph.report.figures import svg
 from heliograph_studies.demo.recording import read_recording
-from heliograph_studies.late_data import moving, plaza
-from heliograph_studies.late_data.compute import SYNTHETIC, Outcome, through_moving, through_plaza
+from heliograph_studies.late_data import Setting, example, plaza
+from heliograph_studies.late_data.compute import Outcome, Trace, through_moving, through_plaza
+from heliograph_studies.late_data.figures import figures
 from heliograph_studies.late_data.packets import Packets, statistics
-from heliograph_studies.late_data.page import late_data_figures, late_data_page
 from heliograph_studies.late_data.plaza import fates_by_node
 from heliograph_studies.late_data.synthetic import synthetic_packets
 from heliograph_studies.late_data.trace import SLOT, read_trace
+from heliograph_studies.stages import Stages
+from heliograph_studies.study import no_progress
 
 pytestmark = pytest.mark.slow
 
@@ -93,7 +95,8 @@ def test_a_log_too_short_is_told_in_one_line(tmp_path, capsys):
 
 def test_another_example_takes_no_trace(tmp_path, capsys):
     assert main(["example", "fusion", "--out", str(tmp_path), "--trace", "x"]) == 2
-    assert "--trace: expected an example that takes one, such as late-data, got fusion" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "--set: expected one of runs, steps," in error and "got 'trace'" in error
 
 
 def test_the_synthetic_network_has_the_published_statistics():
@@ -104,15 +107,15 @@ def test_the_synthetic_network_has_the_published_statistics():
     assert abs(found.delay_95 - 2.2) < 0.2 and found.delay_max < 85.5 and abs(found.out_of_order - 0.24) < 0.05
 
 
-def test_rewinding_is_honest_and_taking_data_as_current_is_not(monkeypatch):
+def test_rewinding_is_honest_and_taking_data_as_current_is_not():
     """One path of two minutes: 120 moments whose errors are correlated over a few, so NEES within 0.3 of 1."""
-    monkeypatch.setattr(moving, "DURATION", 120.0)
-    found = through_moving(synthetic_packets(500.0, 0), 0, lambda what: None, runs=1)
-    rmse = {name: score.rmse for name, score in found.scores.items()}
+    setting = Setting(runs=1, duration=120.0)
+    found = through_moving(synthetic_packets(500.0, 0), setting, Stages("late-data", no_progress))
+    rmse = found.rmse
     assert rmse["lag_10s"] <= rmse["lag_2s"] < rmse["rewound"] <= rmse["late_dropped"] < rmse["used_as_current"]
     assert rmse["no_delay"] < rmse["rewound"]
-    for name, score in found.scores.items():
-        assert (abs(score.nees - 1) < 0.3) == (name != "used_as_current"), name
+    for name, nees in found.nees.items():
+        assert (abs(nees - 1) < 0.3) == (name != "used_as_current"), name
     assert found.counts["used"] > 150 and found.counts["duplicate"] > 0
 
 
@@ -129,24 +132,25 @@ def test_the_mower_through_a_network(mower, tmp_path, fits):
     recording = mower.first(150)
     packets = synthetic_packets(1000.0, 0)
     at_once = Packets(packets.node, packets.sequence, packets.sent, packets.sent)
-    late, lost = through_plaza(recording, packets)
-    ideal, as_many = through_plaza(recording, at_once, ("rewound", "no_delay", "late_dropped"))
-    assert lost == as_many > 0
-    assert ideal.scores["rewound"] == ideal.scores["no_delay"] == ideal.scores["late_dropped"]
-    assert late.scores["no_delay"] == ideal.scores["no_delay"]
-    assert late.scores["used_as_current"].rmse > 2 * late.scores["rewound"].rmse
-    outcome = Outcome(None, 0, statistics(packets), late, late, lost)
-    drawings = {name: svg(figure) for name, figure in late_data_figures(outcome).items()}
-    (tmp_path / "report.html").write_text(late_data_page(outcome, drawings).html(), encoding="utf-8")
+    late = through_plaza(recording, packets)
+    ideal = through_plaza(recording, at_once, ("rewound", "no_delay", "late_dropped"))
+    assert late.lost_ranges == ideal.lost_ranges > 0
+    for there, here in ((late.through.rmse, ideal.through.rmse), (late.through.nees, ideal.through.nees)):
+        assert here["rewound"] == here["no_delay"] == here["late_dropped"] == there["no_delay"]
+    assert late.through.rmse["used_as_current"] > 2 * late.through.rmse["rewound"]
+    outcome = Outcome(Trace(statistics(packets), None, True, 0), late.through, late)
+    drawings = {name: svg(figure) for name, figure in figures(outcome).items()}
+    page = example.make_page(Setting(), outcome, {}, drawings)
+    (tmp_path / "report.html").write_text(page.html(), encoding="utf-8")
     fits(tmp_path / "report.html")
-    titles = [section.title for section in late_data_page(outcome, drawings).sections]
+    titles = [section.title for section in page.sections]
     assert titles == ["A point that moves", "A recorded drive", "The network", "How to run this again"]
 
 
 def test_the_whole_drive_is_what_readme_says(mower):
     """To its three digits, which another order of rounding does not reach."""
     told = "late_dropped", "rewound", "lag_2s"
-    found, _ = through_plaza(mower, synthetic_packets(SYNTHETIC, 0), told)
-    dropped, rewound, later = (f"{found.scores[name].rmse:.3f} m" for name in told)
+    found = through_plaza(mower, synthetic_packets(Setting().network_s, 0), told).through
+    dropped, rewound, later = (f"{found.rmse[name]:.3f} m" for name in told)
     row = f"| {dropped}: late ones dropped | {rewound}; {later} two seconds later | `heliograph example late-data --out"
     assert row in (Path(__file__).parents[2] / "README.md").read_text()

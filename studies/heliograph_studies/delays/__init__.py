@@ -1,6 +1,8 @@
 """Data that come late, told or not, and clocks that are wrong: what filters claim, and what is true."""
 
-from heliograph_studies.delays.run import example as run_example
-from heliograph_studies.old import Old
+from heliograph_studies.delays import compute, figures
+from heliograph_studies.delays.setting import Setting as Setting
+from heliograph_studies.study import Study
 
-example = Old(run_example)
+example = Study("delays", Setting, compute.compute, 4, figures.figures, figures.words)
+run = example.run

@@ -1,124 +1,158 @@
 """What the example computes: claimed and true errors over time, before data where gains depend on none."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies.delays.setting import (
-    CLOCK_STEPS,
-    LINK,
-    LINKS,
-    NOISE,
-    PLANT,
-    SENSOR,
-    STEPS,
-    listeners,
-    moving,
-)
+from heliograph_studies.delays.setting import CLOCK_STEPS, LINK, LINKS, NOISE, PLANT, SENSOR, STEPS, Setting, listeners
+from heliograph_studies.delays.setting import moving as moving_plant
+from heliograph_studies.outcome import Inline, Unlisted
+from heliograph_studies.stages import Stages
 
-RUNS = {"delays": 4096, "clocks": 1024}
-STAGES = 4
+HALF = slice(STEPS // 2, None)  # the steps that are averaged
+Errors = Mapping[str, float | np.ndarray]
 
 
 @dataclass(frozen=True)
-class Score:
-    """Variances over time: claimed (mean over the runs), mean square errors, and these before any data if known.
+class Late:
+    """Variance of the position: claimed and mean square error, means over the second half of the steps, and over time.
 
-    Numbers are means from step `begin` on; `true_se` is the standard error of that of `true`.
+    true_se: the standard error of `true`; before_data: the errors before any data, where no gain depends on them.
     """
 
     claim: str
-    claimed: np.ndarray
-    true: np.ndarray
+    claimed: float
+    true: float
     true_se: float
-    begin: int
-    before: np.ndarray | None = None
+    claimed_over_time: np.ndarray
+    true_over_time: np.ndarray
+    before_data: Inline[Errors]
 
-    def mean(self, values: np.ndarray) -> float:
-        """From step `begin` on."""
-        return float(values[self.begin :].mean())
+    @property
+    def error(self) -> float:
+        """Mean square error, before data where that is known, else as simulated."""
+        return float(self.before_data.get("true_before_data", self.true))
+
+    @property
+    def error_over_time(self) -> np.ndarray:
+        """The same at each step."""
+        return np.asarray(self.before_data.get("true_before_data_over_time", self.true_over_time))
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Root mean square error and claimed deviation at the last step, and at all of them."""
+
+    true: float
+    claimed: float
+    true_over_time: Unlisted[np.ndarray]
+    claimed_over_time: Unlisted[np.ndarray]
+
+
+Clocks = dict[str, dict[str, Deviation]]  # by filter, of position, offset and drift
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of the position: filters behind late links; of position, offset and drift: filters of clocks, by situation."""
+    """Filters behind late links, what one of past states claims, and filters of clocks by situation."""
 
-    delays: dict[str, Score]
-    clocks: dict[str, dict[str, dict[str, Score]]]
+    runs: dict[str, int]
+    steps: dict[str, int]
+    delays: dict[str, Late]
+    past_states_claim: float
+    clocks: dict[str, Clocks]
 
 
-def compute(seed: int, advance: Callable[[str], None]) -> Outcome:
-    """Everything, from the first seed of the runs."""
-    advance("links that are late")
-    delays = _late(seed)
-    advance("a wrong clock, in motion")
-    plant, sensors = moving(1.0)
-    in_motion = _clocks(plant, sensors, listeners(plant, sensors), seed)
-    advance("at rest")
-    still, _ = moving(0.0, noise=0.0, spread=(0.0, 0.0))
-    believed = listeners(*moving(0.0, spread=(1.0, 0.1)))
-    at_rest = _clocks(still, sensors, believed, seed)
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Everything."""
+    simulated = stages("links that are late", lambda: late_scores(setting))
+    in_motion = stages("a wrong clock, in motion", lambda: moving_clocks(setting))
+    at_rest = stages("at rest", lambda: resting_clocks(setting))
+    delays, claim = stages("before data", lambda: (before_data(simulated), trap()))
     alone = {name.removesuffix("_alone"): score for name, score in in_motion.items() if name.endswith("_alone")}
-    kinds = {"moving": in_motion, "at_rest": at_rest}
-    clocks = {kind: {n: s for n, s in found.items() if not n.endswith("_alone")} for kind, found in kinds.items()}
-    advance("before data")
-    return Outcome(_before(delays), clocks | {"no_true_clock": alone})
+    clocks = {"moving": in_motion, "at_rest": at_rest}
+    clocks = {kind: {n: s for n, s in scores.items() if not n.endswith("_alone")} for kind, scores in clocks.items()}
+    return Outcome(
+        {"delays": setting.late_runs, "clocks": setting.clock_runs}, {"delays": STEPS, "clocks": CLOCK_STEPS},
+        delays, claim, clocks | {"no_true_clock": alone},
+    )  # fmt: skip
 
 
 def late_filters() -> dict[str, dict[str, hg.filters.AbstractFilter]]:
     """What listens behind each link."""
-    own: dict[str, dict[str, hg.filters.AbstractFilter]] = {
+    filters: dict[str, dict[str, hg.filters.AbstractFilter]] = {
         name: {name: hg.linear_filter(PLANT, SENSOR, link)} for name, link in LINKS.items()
     }
-    own["untold"]["as_current"] = hg.filters.as_current_filter(PLANT, SENSOR, LINKS["untold"])
-    return own
+    filters["untold"]["as_current"] = hg.filters.as_current_filter(PLANT, SENSOR, LINKS["untold"])
+    return filters
 
 
-def _late(seed: int) -> dict[str, Score]:
+def late_scores(setting: Setting) -> dict[str, Late]:
+    """Of each filter behind a late link, as simulated."""
     nodes = {name: hg.Node(SENSOR, LINKS[name], filters) for name, filters in late_filters().items()}
-    record = hg.monte_carlo(hg.Network(PLANT, nodes), STEPS, RUNS["delays"], seed)
-    return {
-        name: _score(record.errors(node, name)[..., 0], record.estimates[node][name], 0, STEPS // 2)
-        for node, filters in record.estimates.items()
-        for name in filters
-    }
-
-
-def _before(simulated: Mapping[str, Score]) -> dict[str, Score]:
-    """The same with true errors before any data, of filters whose gains depend on none."""
-    result = dict(simulated)
-    for node, filters in late_filters().items():
-        for name, item in filters.items():
-            if node in ("untold", "none"):
-                truth = hg.filters.true_error(item, PLANT, SENSOR, LINKS[node], STEPS)
-                result[name] = Score(**{**vars(simulated[name]), "before": truth.true[:, 0, 0]})
+    record = hg.monte_carlo(hg.Network(PLANT, nodes), STEPS, setting.late_runs, setting.seed)
+    result = {}
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            squares, claimed = variances(record, node, name, 0)
+            by_run, true = squares[:, HALF].mean(axis=1), squares.mean(axis=0)
+            error = float(by_run.std() / np.sqrt(len(by_run)))
+            means = float(claimed[HALF].mean()), float(true[HALF].mean())
+            result[name] = Late(estimate.claim, *means, error, claimed, true, {})
     return result
 
 
-def _clocks(
+def variances(record: hg.Record, node: str, name: str, state: int) -> tuple[np.ndarray, np.ndarray]:
+    """Squared errors of a state (runs, steps), and the variance that is claimed of it, its mean over the runs."""
+    squares = record.errors(node, name)[..., state] ** 2
+    claimed = np.asarray(record.estimates[node][name].covariance)[..., state, state]
+    return squares, np.broadcast_to(claimed, squares.shape).mean(axis=0)
+
+
+def before_data(simulated: Mapping[str, Late]) -> dict[str, Late]:
+    """The same with true errors before any data, of filters whose gains depend on none."""
+    result = dict(simulated)
+    for node in ("untold", "none"):
+        for name, item in late_filters()[node].items():
+            true = hg.filters.true_error(item, PLANT, SENSOR, LINKS[node], STEPS).true[:, 0, 0]
+            mean = float(true[HALF].mean())
+            errors: Errors = {"true_before_data": mean, "true_before_data_over_time": true}
+            result[name] = replace(simulated[name], before_data=errors)
+    return result
+
+
+def moving_clocks(setting: Setting) -> Clocks:
+    """Of all filters, in motion."""
+    plant, sensors = moving_plant(1.0)
+    return clock_scores(plant, sensors, listeners(plant, sensors), setting)
+
+
+def resting_clocks(setting: Setting) -> Clocks:
+    """Of filters that believe in motion, at rest."""
+    plant, sensors = moving_plant(0.0, noise=0.0, spread=(0.0, 0.0))
+    return clock_scores(plant, sensors, listeners(*moving_plant(0.0, spread=(1.0, 0.1))), setting)
+
+
+def clock_scores(
     plant: hg.LinearPlant,
     sensors: Mapping[str, hg.model.AbstractSensor],
     filters: Mapping[str, hg.filters.AbstractFilter],
-    seed: int,
-) -> dict[str, dict[str, Score]]:
+    setting: Setting,
+) -> Clocks:
     """Of each filter: position, present offset and drift."""
     nodes = {name: hg.Node(sensor, hg.perfect(), {}) for name, sensor in sensors.items()}
-    record = hg.monte_carlo(hg.Network(plant, nodes, filters), CLOCK_STEPS, RUNS["clocks"], seed)
-    parts, end = {"position": 0, "offset": 2, "drift": 3}, CLOCK_STEPS - 1
-    return {
-        name: {part: _score(record.errors("fused", name)[..., i], estimate, i, end) for part, i in parts.items()}
-        for name, estimate in record.estimates["fused"].items()
-    }
+    record = hg.monte_carlo(hg.Network(plant, nodes, filters), CLOCK_STEPS, setting.clock_runs, setting.seed)
+    parts = {"position": 0, "offset": 2, "drift": 3}
+    return {name: {part: deviation(record, name, i) for part, i in parts.items()} for name in record.estimates["fused"]}
 
 
-def _score(errors: np.ndarray, estimate: hg.model.Estimate, state: int, begin: int) -> Score:
-    squares = errors**2
-    claimed = np.broadcast_to(np.asarray(estimate.covariance)[..., state, state], squares.shape)
-    by_run = squares[:, begin:].mean(axis=1)
-    error = float(by_run.std() / np.sqrt(len(by_run)))
-    return Score(estimate.claim, claimed.mean(axis=0), squares.mean(axis=0), error, begin)
+def deviation(record: hg.Record, name: str, state: int) -> Deviation:
+    """Of one state and filter."""
+    squares, claimed = variances(record, "fused", name, state)
+    true, claims = np.sqrt(squares.mean(axis=0)), np.sqrt(claimed)
+    return Deviation(float(true[-1]), float(claims[-1]), true, claims)
 
 
 def trap() -> float:

@@ -1,10 +1,12 @@
 """The example's two worlds: a link that is late by chance, and two nodes of which one has a wrong clock."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import check_count, check_seed
 
 STEPS = 60
 LAW = hg.Discrete([0, 1, 2], [0.4, 0.35, 0.25])
@@ -23,6 +25,20 @@ CLOCK_STEPS, STEP = 300, 0.5
 CLOCK = hg.model.Clock(offset=0.5, drift=2e-3)
 SPEED_NOISE = 0.02 * np.array([[STEP**3 / 3, STEP**2 / 2], [STEP**2 / 2, STEP]])
 POSITION = hg.LinearSensor([[1.0, 0.0]], 0.04)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How much is simulated: runs of links that are late, and of clocks."""
+
+    late_runs: int = 4096
+    clock_runs: int = 1024
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("late_runs", self.late_runs, 2)
+        check_count("clock_runs", self.clock_runs, 2)
+        check_seed("seed", self.seed)
 
 
 def moving(

@@ -1,5 +1,6 @@
 """An induction machine heard by four nodes through relays of strong signals; filters that are not linear."""
 
+from collections.abc import Mapping
 from functools import cache
 
 import jax
@@ -55,8 +56,8 @@ def cubature(node: int) -> GaussianFilter:
     return hg.cubature_filter(plant(), sensor(node), channel(), hg.filters.ZeroMean(), *start)
 
 
-def network(own: str, fused: dict[str, hg.Fusion | hg.filters.AbstractFilter]) -> hg.Network:
-    """Four nodes with one filter each, the given fusions of it, and the filter "central" that hears all nodes."""
-    filters = [cubature(i) for i in range(len(OUTPUTS))]
-    nodes = {f"node {i + 1}": hg.Node(sensor(i), channel(), {own: item}) for i, item in enumerate(filters)}
-    return hg.Network(plant(), nodes, fused | {"central": hg.filters.sequential_filter(filters)})
+def network(local: str, fused: Mapping[str, hg.Fusion | hg.filters.AbstractFilter], count: int) -> hg.Network:
+    """Nodes with one filter each, the given fusions of it, and the filter "central" that hears all nodes."""
+    filters = [cubature(i) for i in range(count)]
+    nodes = {f"node {i + 1}": hg.Node(sensor(i), channel(), {local: item}) for i, item in enumerate(filters)}
+    return hg.Network(plant(), nodes, {**fused, "central": hg.filters.sequential_filter(filters)})

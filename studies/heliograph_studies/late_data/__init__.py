@@ -1,6 +1,8 @@
 """Packets that a recorded radio network delivered late, out of order and twice, and what a filter makes of them."""
 
-from heliograph_studies.late_data.run import example as run_example
-from heliograph_studies.old import Old
+from heliograph_studies.late_data import compute, figures
+from heliograph_studies.late_data.setting import Setting as Setting
+from heliograph_studies.study import Study
 
-example = Old(run_example)
+example = Study("late-data", Setting, compute.compute, 3, figures.figures, figures.words)
+run = example.run

@@ -10,7 +10,7 @@ from heliograph_studies.late_data.packets import Packets
 
 PUSH = 0.1  # m^2/s^3, density of the white acceleration, each axis
 VARIANCE = 0.25  # m^2, each axis
-BEGIN, DURATION = 300.0, 900.0  # s of the packets
+BEGIN = 300.0  # s of the packets
 STEP = 1.0  # s between the moments that are judged
 
 
@@ -33,21 +33,21 @@ network = hg.Network(
 )
 
 
-def packets_of(packets: Packets) -> Packets:
+def packets_of(packets: Packets, duration: float) -> Packets:
     """Those that were sent in the stretch that is used, from its beginning."""
-    used = packets.among((packets.sent >= BEGIN) & (packets.sent < BEGIN + DURATION))
+    used = packets.among((packets.sent >= BEGIN) & (packets.sent < BEGIN + duration))
     return Packets(used.node, used.sequence, used.sent - BEGIN, used.received - BEGIN)
 
 
-def moments() -> np.ndarray:
+def moments(duration: float) -> np.ndarray:
     """Those that are judged."""
-    return np.arange(STEP, DURATION + STEP / 2, STEP)
+    return np.arange(STEP, duration + STEP / 2, STEP)
 
 
-def world(packets: Packets, seed: int) -> tuple[list[Event], np.ndarray, np.ndarray]:
+def world(packets: Packets, duration: float, seed: int) -> tuple[list[Event], np.ndarray, np.ndarray]:
     """What the packets hold, and the true position at each of the times returned beside it."""
     generator = np.random.default_rng(seed)
-    times = np.unique(np.concatenate([packets.sent, moments(), [0.0]]))
+    times = np.unique(np.concatenate([packets.sent, moments(duration), [0.0]]))
     state, path = generator.normal(size=(2, 2)), np.zeros((len(times), 2))  # (position and velocity, axis)
     for i, dt in enumerate(np.diff(times, prepend=0.0)):
         one = PUSH * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])

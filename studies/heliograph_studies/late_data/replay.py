@@ -16,7 +16,7 @@ METHODS = ("used_as_current", "late_dropped", "rewound", *LAGS, "no_delay")
 
 
 @dataclass(frozen=True)
-class Heard:
+class Estimated:
     """Estimates at moments, (moment, n) and (moment, n, n), and the moments that they are of."""
 
     time: np.ndarray
@@ -35,7 +35,7 @@ def every_method(
     known: Sequence[Event],
     moments: np.ndarray,
     methods: Collection[str] = METHODS,
-) -> tuple[dict[str, Heard], dict[str, int]]:
+) -> tuple[dict[str, Estimated], dict[str, int]]:
     """What each of `methods` says at these moments, and the verdicts on the events where they are rewound.
 
     `events` come from the first node of the network, whose first filter is asked; in the order of their arrival.
@@ -46,12 +46,12 @@ def every_method(
     at_once = [event._replace(arrival=event.time) for event in events]
     others = {"used_as_current": (now, WINDOW), "late_dropped": (events, 0.0), "no_delay": (at_once, WINDOW)}
     lags = {name: lag for name, lag in LAGS.items() if name in methods}
-    found, counts = _played(network, [*known, *events], WINDOW, moments, lags)
-    found["rewound"] = found.pop("now")
-    for name, (heard, window) in others.items():
+    result, counts = _played(network, [*known, *events], WINDOW, moments, lags)
+    result["rewound"] = result.pop("now")
+    for name, (coming, window) in others.items():
         if name in methods:
-            found[name] = _played(network, [*known, *heard], window, moments)[0]["now"]
-    return {name: found[name] for name in METHODS if name in methods}, counts
+            result[name] = _played(network, [*known, *coming], window, moments)[0]["now"]
+    return {name: result[name] for name in METHODS if name in methods}, counts
 
 
 def _played(
@@ -60,49 +60,35 @@ def _played(
     window: float,
     moments: np.ndarray,
     lags: Mapping[str, float] | None = None,
-) -> tuple[dict[str, Heard], dict[str, int]]:
+) -> tuple[dict[str, Estimated], dict[str, int]]:
     """Estimates of now, and of `lags` before, at each moment; and the verdicts on what the first node sent."""
     timeline, wanted = Timeline(network, window), {} if lags is None else lags
     coming = sorted(events, key=arrival_of)  # stable: else as they were heard
     node, at = network.names[0], 0
-    found: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *wanted)}
+    result: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *wanted)}
     for moment in moments:
         while at < len(coming) and arrival_of(coming[at]) <= moment:
             timeline.push(*coming[at])
             at += 1
         timeline.advance(float(moment))
-        found["now"].append((moment, _first(timeline.estimates()[node])))
+        result["now"].append((moment, _first(timeline.estimates()[node])))
         for name, lag in wanted.items():
             if moment - lag >= 0:
-                found[name].append((moment - lag, _first(timeline.lagged(lag)[node])))
-    return {name: _stacked(part) for name, part in found.items()}, {v: timeline.counts[node][v] for v in VERDICTS}
+                result[name].append((moment - lag, _first(timeline.lagged(lag)[node])))
+    return {name: _stacked(part) for name, part in result.items()}, {v: timeline.counts[node][v] for v in VERDICTS}
 
 
 def _first(filters: Mapping[str, Estimate]) -> Estimate:
     return next(iter(filters.values()))
 
 
-def _stacked(parts: Sequence[tuple[float, Estimate]]) -> Heard:
+def _stacked(parts: Sequence[tuple[float, Estimate]]) -> Estimated:
     means, spreads = np.array([e.mean for _, e in parts]), np.array([e.covariance for _, e in parts])
-    return Heard(np.array([time for time, _ in parts]), means, spreads)
+    return Estimated(np.array([time for time, _ in parts]), means, spreads)
 
 
-@dataclass(frozen=True)
-class Score:
-    """Of a position in the plane: root of the mean squared error, and the mean of e' P^-1 e / 2, honestly 1."""
-
-    rmse: float
-    nees: float
-
-
-def squared_errors(heard: Heard, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def squared_errors(estimated: Estimated, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """|e|^2 and e' P^-1 e / 2 of the first two states at each moment; truth (moment, 2)."""
-    error = (heard.mean[:, :2] - truth)[:, :, None]
-    weighted = np.linalg.solve(heard.covariance[:, :2, :2], error)
+    error = (estimated.mean[:, :2] - truth)[:, :, None]
+    weighted = np.linalg.solve(estimated.covariance[:, :2, :2], error)
     return np.sum(error**2, axis=(1, 2)), np.sum(error * weighted, axis=(1, 2)) / 2
-
-
-def score(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> Score:
-    """Over all moments of several runs, from their squared errors."""
-    squared, nees = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return Score(float(np.sqrt(squared.mean())), float(nees.mean()))

@@ -1,4 +1,4 @@
-"""The example's figures: what each rule reaches, the tree with what each of its places knows, traffic against error."""
+"""Figures: what each rule reaches, the tree with what each of its places knows, traffic against error; and labels."""
 
 from collections.abc import Mapping
 
@@ -33,7 +33,7 @@ PLACES = 0, 2  # the states drawn: where the point is in either direction
 LEFT_OUT = ("scalar", "central")  # one is far off, the other is what all are divided by
 
 
-def fusion_figures(outcome: Outcome) -> dict[str, Figure]:
+def figures(outcome: Outcome) -> dict[str, Figure]:
     """All of them, by name."""
     return {
         "traces": traces_picture(outcome.cases),
@@ -111,3 +111,11 @@ def traffic_picture(outcome: Outcome) -> Figure:
     axes.set(xlabel="reports per step and node", ylabel="mean square error", yscale="log")
     axes.legend(frameon=False, fontsize=9)
     return figure
+
+
+def words(outcome: Outcome) -> dict[str, object]:
+    """Labels and colours."""
+    machine = {rule: LABELS.get(rule, "equal intersection") for rule in outcome.strong["claimed"]}
+    colours = {"vermilion": VERMILION, "blue": BLUE, "purple": PURPLE}
+    return {"labels": {**LABELS, "root": "root of the tree"}, "networks": NETWORKS, "kinds": KINDS, "machine": machine,
+            **colours}  # fmt: skip
