@@ -127,8 +127,24 @@ def test_interrupted_writing_leaves_what_was_there(tmp_path, monkeypatch, name, 
     assert (tmp_path / name).read_text() == "before"
 
 
-def test_error_between_rows_leaves_nothing(tmp_path):
-    ragged = {"time": np.arange(100_000.0), "a": np.arange(99_999.0)}
+def test_error_between_rows_leaves_nothing(tmp_path, monkeypatch):
+    class Breaking:
+        def __init__(self, column):
+            self.column = column
+
+        def tolist(self):
+            yield from self.column.tolist()[:-1]
+            assert [path.stat().st_size > 0 for path in tmp_path.iterdir()] == [True]  # rows are in a partial file
+            raise RuntimeError("between rows")
+
+    monkeypatch.setattr("heliograph.files.table._plain", Breaking)
+    with pytest.raises(RuntimeError, match="between rows"):
+        write_table({"time": np.arange(100_000.0)}, tmp_path / "out.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_columns_of_unlike_lengths_write_nothing(tmp_path):
+    ragged = {"time": np.arange(3.0), "a": np.arange(2.0)}
     with pytest.raises(ValueError, match="all of one length"):
         write_table(ragged, tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())

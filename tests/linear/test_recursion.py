@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.linear.recursion import solve_innovation
+from heliograph.linear.recursion import covariance_step, solve_innovation
 from heliograph_studies.quadratic_bias import printed
 from tests.oracles import quadratic_bias as oracle
 from tests.relay_bias import model, two_sensors
@@ -26,6 +26,23 @@ def test_scalar_recursion_by_hand():
     schedule = hg.linear.lmmse(scalar())
     np.testing.assert_allclose(schedule.gains.covariance[:, 0, 0], expected, rtol=1e-14)
     np.testing.assert_allclose(schedule.gains.gain[:, 0, 0], expected, rtol=1e-14)  # R = 1: the gain is P
+
+
+def test_slow_covariance_is_not_taken_for_its_limit():
+    """a = 1 - 1e-5, begun 4e-10 above the limit: 100 steps change 8e-13 of it, and 5000 steps fifty times as much."""
+    a, r, horizon = 1 - 1e-5, 1e6, 5000
+    q, one = 1 - a**2, np.ones((horizon, 1, 1))
+    half = (q + r * (1 - a**2)) / (2 * a**2)
+    limit = np.sqrt(half**2 + r * q / a**2) - half
+    steps = hg.linear.Steps(a * one, 0 * one[:, 0], q * one, one, 0 * one[:, 0], r * one)
+    system = hg.linear.LinearSystem(steps, [0.0], [[limit * (1 + 4e-10)]], [[1.0]])
+    p, expected = system.covariance, []
+    for k in range(horizon):
+        p = covariance_step(p, system.step(k)).covariance
+        expected.append(p[0, 0])
+    assert 1 - expected[-1] / expected[100] > 1e-11  # it moves: a covariance that stood still at step 100 is seen
+    claimed = hg.linear.lmmse(system).gains.covariance[:, 0, 0]
+    np.testing.assert_allclose(claimed, expected, rtol=1e-12)  # what may be left: the same arithmetic
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])

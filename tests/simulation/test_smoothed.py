@@ -1,9 +1,12 @@
 """Smoothing beside the filters: in Monte Carlo, in bounded memory, and of recordings."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.model.estimate import Estimate
 
 PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]])
 SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.02)
@@ -73,6 +76,18 @@ def test_in_bounded_memory_with_gains_known_before_data():
     _, low, high = found.nees_per_dimension(0.9999)
     assert found.claim == "exact" and low < 1 < high
     assert found.rmse()[0] < 0.97 * statistics["node"]["linear"].rmse()[0]
+
+
+def test_a_smoothed_estimate_that_is_no_number_is_a_failure_of_its_record(record):
+    estimate = record.smoothed.estimates["node 0.6"]["linear"]
+    covariance = np.array(estimate.covariance)
+    covariance[..., 3, :, :] = np.nan
+    broken = Estimate(estimate.mean, covariance, estimate.claim)
+    smoothed = replace(record.smoothed, estimates={"node 0.6": {"linear": broken}})
+    runs = record.runs
+    expected = [f"smoothed node 0.6/linear: no valid covariance from step 3 in {runs} of {runs} runs"]
+    assert record.failures() == []
+    assert replace(record, smoothed=smoothed).failures() == expected
 
 
 def test_a_recording_is_smoothed_from_a_fixed_point_on():

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory, fits):
+def told(tmp_path_factory, widths):
     """Fewer cases than the example's; what other tests compute (the demonstration) and a long descent stand in."""
     out = tmp_path_factory.mktemp("out")
     designs = {
@@ -31,7 +31,7 @@ def told(tmp_path_factory, fits):
         patch.setattr(compute, "circuit", lambda: Circuit(2.0, 1.5, 0.75))
         run.example(out)
     folder = out / "network-design"
-    fits(folder / "report.html")
+    widths(folder / "report.html")
     return json.loads((folder / "summary.json").read_text()), (folder / "report.html").read_text()
 
 

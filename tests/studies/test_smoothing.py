@@ -18,10 +18,10 @@ RELAYS = {"0": (5.2417, 5.2899), "1": (2.6024, 2.5493), "2": (1.9132, 1.8996), "
 
 
 @pytest.fixture(scope="module")
-def summary(tmp_path_factory, fits):
+def summary(tmp_path_factory, widths):
     out = tmp_path_factory.mktemp("example")
     smoothing.run(smoothing.Setting(runs=400), out)
-    fits(out / "smoothing" / "report.html")
+    widths(out / "smoothing" / "report.html")
     assert {"report.html", "errors.svg", "deviations.svg"} <= {p.name for p in (out / "smoothing").iterdir()}
     return json.loads((out / "smoothing" / "summary.json").read_text())
 

@@ -60,7 +60,7 @@ def row_of(lowering: Lowering, x: Value, place: Node, ndim: int) -> Value:
     """The part of an argument that a row of the result needs."""
     if isinstance(x, InMemory):
         return x.row(place)
-    return x[0] if x.ndim == ndim and ndim else x
+    return x[:1].reshape(x.shape[1:]) if x.ndim == ndim and ndim else x
 
 
 def like_row(equation: JaxprEqn, **params: Any) -> Any:

@@ -13,8 +13,11 @@ from heliograph.numerics.small_matrix import PRECISE, with_rounding
 from heliograph.numerics.types import Float
 
 RANK_TOLERANCE = 1e-12  # of the innovation's correlation matrix: directions below are known without measuring
-SPAN, STILL = 100, 1e-12  # steps over which a covariance that changes by less, relatively, has settled
+SPAN, STILL = 100, 1e-12  # steps between comparisons, and what may be left, relatively, of a covariance's way
 DIGITS_TOLERANCE = 1e-6  # relative rounding error of a claimed variance above which it is nominal
+
+
+Pair = tuple[Float[np.ndarray, "N N"], Float[np.ndarray, "N N"]]  # a covariance and its rounding
 
 
 class Corrected(NamedTuple):
@@ -69,11 +72,11 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     instance("system", system, LinearSystem, "a LinearSystem")
     spread, want, parts = system.covariance, system.want, []
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
-    steady = system.steady_from
+    steady, transition = system.steady_from, np.eye(len(spread))
     last: tuple[np.ndarray, np.ndarray] | None = None
     for k in range(system.horizon):
         if k > steady and (k - steady) % SPAN == 0:
-            if last is not None and _is_still(spread, last[0]) and _is_still(rounding, last[1]):
+            if last is not None and _is_still((spread, rounding), last, transition):
                 break  # what follows is the same, to rounding
             last = spread, rounding
         s = system.step(k)
@@ -94,10 +97,23 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     return Schedule(gains, system.mean, _supported(claim, worst, when))
 
 
-def _is_still(after: Float[np.ndarray, "N N"], before: Float[np.ndarray, "N N"]) -> bool:
-    """Whether covariances differ by less than rounding adds up to over SPAN steps."""
-    unit = np.sqrt(np.abs(np.diag(after)))
-    return bool(np.all(np.abs(after - before) <= STILL * np.outer(unit, unit)))
+def _is_still(after: Pair, before: Pair, loop: Float[np.ndarray, "N N"]) -> bool:
+    """Whether a covariance and its rounding stay, to STILL of each entry's own scale, from what SPAN steps changed.
+
+    A difference D obeys D+ = F D F' with the loop F = (I - G C) A, so that SPAN steps shrink it by r = rho(F)^(2 SPAN)
+    and a change d leaves d r / (1 - r) to come. Without any change a recursion repeats itself, whatever rho is.
+    """
+    changes = [np.abs(a - b) for a, b in zip(after, before, strict=True)]
+    if not any(np.any(change) for change in changes):
+        return True
+    ratio = float(np.max(np.abs(np.linalg.eigvals(loop)), initial=0.0)) ** (2 * SPAN)
+    if ratio >= 1:
+        return False
+    left = max(1.0, ratio / (1 - ratio))
+    units = [np.sqrt(np.abs(np.diag(a))) for a in after]
+    return all(
+        np.all(left * change <= STILL * np.outer(unit, unit)) for change, unit in zip(changes, units, strict=True)
+    )
 
 
 def _supported(claim: Claim, lost: float, step: int) -> Claim:

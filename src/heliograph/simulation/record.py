@@ -153,9 +153,9 @@ class Record(Saved):
         """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
 
         The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
-        for each uplink that saturated.
+        for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
         """
-        lines = []
+        lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.estimates.items():
             for name, estimate in filters.items():
                 bad = ~is_sound(estimate)

@@ -94,9 +94,9 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
     def failures(self) -> list[str]:
         """One line for each filter whose estimate was no number, or its covariance none, in some run, as of a record.
 
-        One line more for each uplink that saturated.
+        One line more for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
         """
-        lines = []
+        lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():
             lines += [f"{node}/{name}: {found.failure}" for name, found in filters.items() if found.failed_runs]
             for name, found in filters.items():
