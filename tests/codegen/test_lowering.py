@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
+from heliograph.codegen.engine import engine_of
 from heliograph.codegen.graph import Graph, Unsupported
 from heliograph.codegen.lowering import Lowering, traced
 from heliograph.codegen.program import lower, needed, scalars
@@ -98,3 +99,10 @@ def test_a_product_with_zero_is_zero_only_of_finite_numbers():
 def test_what_is_not_lowered_is_refused_with_its_operation_and_place():
     with pytest.raises(Unsupported, match=r"svd.* at .*test_lowering\.py:\d+"):
         lower(lambda x: jnp.linalg.svd(x)[1], X)
+
+
+def test_a_loop_mapped_over_entries_is_left_to_xla():
+    def doubled(x):
+        return jax.vmap(lambda v: jax.lax.while_loop(lambda c: c < 3.0, lambda c: 2 * c, v))(x)
+
+    assert engine_of(doubled, np.ones((2, 3))).startswith("xla: a condition for each entry of an array at ")

@@ -62,7 +62,10 @@ class Lowering:
 
     def scalar(self, value: Value) -> Node:
         """A value of no axes as its node."""
-        node: Node = self.nodes(value).item()
+        nodes = self.nodes(value)
+        if nodes.size != 1:
+            raise Unsupported("a condition for each entry of an array")
+        node: Node = nodes.item()
         return node
 
     def known(self, number: Any) -> Value:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import wraps
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -22,7 +23,7 @@ def _of_joint(weights: Weights) -> Weights:
     """Weights that refuse what is no joint covariance."""
 
     @wraps(weights)
-    def call(joint: Array, *rest: Array) -> Float[Array, "n node n"]:
+    def call(joint: Array, *rest: Array) -> Any:
         shape = np.shape(joint) if isinstance(joint, np.ndarray | jax.Array) else ()
         if len(shape) != 4 or shape[:2] != shape[2:]:
             raise fail("joint covariance", "an array of shape (nodes, n, nodes, n)", shape or shown(joint))

@@ -131,7 +131,8 @@ def as_fates(value: object) -> Fates:
     Raises:
         ValueError: anything but 0, 1 and NaN, or nothing that is known.
     """
-    items: list[Any] = list(value) if isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) else [value]
+    listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
+    items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
     several = len(items) > 0 and all(rank("fates", item) == 1 for item in items)
     parts = [array("fates", part, (None,), missing=True) for part in (items if several else [cast(ArrayLike, value)])]
     for part in parts:
