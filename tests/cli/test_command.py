@@ -55,6 +55,13 @@ def test_a_long_message_stays_on_one_line(folder, capsys, monkeypatch):
     refused(folder, capsys, ["demo", "--out", "results"], "heliograph: thing: expected one, got two")
 
 
+def test_version_and_help(capsys):
+    assert cli.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{h.__version__}\n"
+    assert cli.main(["run", "--help"]) == 0
+    assert "--measurements" in capsys.readouterr().out
+
+
 def test_an_output_that_takes_nothing_is_named(capsys, monkeypatch):
     with open("/dev/full", "w") as full:
         monkeypatch.setattr(sys, "stdout", full)
@@ -80,13 +87,6 @@ def test_a_bug_keeps_its_traceback(folder, monkeypatch, bug):
     stub_study(monkeypatch, broken)
     with pytest.raises(type(bug), match="bug"):
         cli.main(["demo", "--out", "results"])
-
-
-def test_version_and_help(capsys):
-    assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"{h.__version__}\n"
-    assert cli.main(["run", "--help"]) == 0
-    assert "--measurements" in capsys.readouterr().out
 
 
 def without_jax(arguments) -> str:
