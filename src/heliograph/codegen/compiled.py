@@ -3,6 +3,7 @@
 import os
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from copy import copy
 from functools import cache
 from types import MappingProxyType
 from typing import Any
@@ -82,13 +83,26 @@ class Alone:
     """
 
     def __init__(self, program: Program, in_place: Mapping[int, int] = MappingProxyType({})):
-        code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
-        self.code, self.machine, self.tree = code, Machine(code.blocks), program.tree
-        self.inputs = [np.zeros(b.shape, DTYPES[b.type]) for b in program.inputs]
-        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in code.outputs]
-        self.outputs = [self.inputs[in_place[k]] if k in in_place else x for k, x in enumerate(fresh)]
-        self.scratch = aligned(code.scratch)
-        self.pointers = pointers_to([*self.inputs, *code.tables, *self.outputs, aligned(code.shared)])
+        self.code = written(program, [True] * len(program.inputs), 1, features()[2], True, in_place)
+        self.machine, self.tree, self._in_place = Machine(self.code.blocks), program.tree, in_place
+        self._arguments = [(b.shape, DTYPES[b.type]) for b in program.inputs]
+        self._place([])
+
+    def again(self, first: Sequence[np.ndarray]) -> "Alone":
+        """The same code with memory of its own; the first arguments are these arrays, which a call only reads."""
+        new = copy(self)
+        new._place(first)
+        return new
+
+    def _place(self, first: Sequence[np.ndarray]) -> None:
+        """Memory for a call."""
+        kinds = self._arguments
+        self.inputs = [np.ascontiguousarray(x, t).reshape(s) for x, (s, t) in zip(first, kinds, strict=False)]
+        self.inputs += [np.zeros(*kind) for kind in kinds[len(first) :]]
+        fresh = [np.zeros(b.shape, DTYPES[b.type]) for b in self.code.outputs]
+        self.outputs = [self.inputs[self._in_place[k]] if k in self._in_place else x for k, x in enumerate(fresh)]
+        self.scratch, self._shared = aligned(self.code.scratch), aligned(self.code.shared)
+        self.pointers = pointers_to([*self.inputs, *self.code.tables, *self.outputs, self._shared])
         self._call = self.machine.run, self.pointers.ctypes.data, self.scratch.ctypes.data
 
     def __call__(self) -> None:

@@ -1,0 +1,151 @@
+"""A filter's step on live data, judged and refused in one program: native code where it takes the filter, else XLA."""
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.codegen.compiled import Alone
+from heliograph.codegen.engine import attempted, setting
+from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.program import lower
+from heliograph.filters.base import AbstractFilter
+from heliograph.live.mould import Mould
+from heliograph.numerics.compiler import understood
+from heliograph.numerics.types import Float, PyTree
+
+Leaves = list[np.ndarray]
+
+
+class NativeStepper:
+    """One filter's state, stepped in its place by native code."""
+
+    def __init__(self, code: Alone, numbers: Leaves, state: Leaves):
+        self._code = code.again(numbers)
+        places, outputs, n = self._code.inputs[len(numbers) :], self._code.outputs, len(state)
+        self._state, (self._z, self._u, self._k) = places[:n], places[n:]
+        self.judgement: Float[np.ndarray, " parts"] = outputs[0]
+        self._flagged, self._after, self._estimate = outputs[1], outputs[2 : 2 + n], outputs[2 + n : len(outputs) - n]
+        self.put(state)
+
+    @property
+    def state(self) -> Leaves:
+        """Copies of the leaves of the filter's state."""
+        return [leaf.copy() for leaf in self._state]
+
+    def put(self, leaves: Sequence[np.ndarray]) -> None:
+        """Take these leaves as the filter's state."""
+        for place, leaf in zip(self._state, leaves, strict=True):
+            place[...] = leaf
+
+    def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
+        """Compute a step; False, and the state as it was, where data are not finite or something is implausible."""
+        self._z[...], self._u[...], self._k[...] = z, u, k
+        self._code()
+        return not self._flagged
+
+    def accept(self) -> None:
+        """Take the state after a step that was flagged."""
+        self.put(self._after)
+
+    @property
+    def estimate(self) -> Leaves:
+        """The estimate's leaves after the step."""
+        return [leaf.copy() for leaf in self._estimate]
+
+
+class XlaStepper:
+    """The same by a program of XLA."""
+
+    def __init__(self, run: Any, numbers: list[jax.Array], state: PyTree):
+        self._run, self._numbers = run, numbers
+        self._state, tree = jax.tree.flatten(state)
+        self._tree: Any = tree
+
+    @property
+    def state(self) -> Leaves:
+        """The leaves of the filter's state."""
+        return [np.asarray(leaf) for leaf in self._state]
+
+    def put(self, leaves: Sequence[np.ndarray]) -> None:
+        """Take these leaves as the filter's state."""
+        with jax.enable_x64(True):
+            self._state = [jnp.array(leaf) for leaf in leaves]
+
+    def step(self, z: np.ndarray, u: np.ndarray, k: int) -> bool:
+        """Compute a step; False, and the state as it was, where data are not finite or something is implausible."""
+        with jax.enable_x64(True):
+            state = self._tree.unflatten(self._state)
+            judged, flagged, self._after, self._estimate = self._run(self._numbers, state, z, u, np.asarray(k))
+        self.judgement: Float[np.ndarray, " parts"] = np.asarray(judged)
+        if flagged:
+            return False
+        self.accept()
+        return True
+
+    def accept(self) -> None:
+        """Take the state after a step that was flagged."""
+        self._state = self._after
+
+    @property
+    def estimate(self) -> Leaves:
+        """The estimate's leaves after the step."""
+        return [np.asarray(leaf) for leaf in self._estimate]
+
+
+def _judged(
+    mould: Mould, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
+) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
+    """A step of every filter that differs in numbers alone: judgement, whether it is to be refused, state, estimate."""
+    item: AbstractFilter = mould.filled(numbers)
+    after, estimate, judgement = item.step_judged(state, z, u, k)
+    spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
+    flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
+    return jnp.stack(judgement), flagged, jax.tree.leaves(after), jax.tree.leaves(estimate)
+
+
+@lru_cache
+def by_xla(mould: Mould) -> Any:
+    """(numbers, state, z, u, k) to (judgement, whether it is to be refused, leaves of the state, of the estimate)."""
+
+    def step(*data: PyTree) -> PyTree:
+        return _judged(mould, *data)
+
+    return jax.jit(step, compiler_options=understood())
+
+
+def natively(mould: Mould, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Alone | None:
+    """Code whose arguments are the leaves of numbers, state and data, z, u and k; None where XLA steps.
+
+    Raises:
+        ValueError: an engine that is none, or native code asked for of a filter that it does not take.
+    """
+    leaves, tree = jax.tree.flatten(state)
+    shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
+    return _made(mould, shapes, (len(numbers), len(leaves)), tree, setting())
+
+
+@lru_cache
+def _made(
+    mould: Mould, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
+) -> Alone | None:
+    """The code, made once for each engine that is forced."""
+    numbers, state = counts
+
+    def step(*leaves: jax.Array) -> PyTree:
+        before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
+        judged, flagged, after, estimate = _judged(mould, leaves[:numbers], tree.unflatten(before), z, u, k)
+        if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
+            raise Unsupported("a state whose shape or type changes")
+        placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]
+        return judged, flagged, after, estimate, placed  # what takes the state's place comes last
+
+    def made() -> Alone:
+        program = lower(step, *(np.zeros(shape, kind) for shape, kind in shapes))
+        first = len(program.outputs) - state
+        return Alone(program, {first + i: numbers + i for i in range(state)})
+
+    return attempted(made)
