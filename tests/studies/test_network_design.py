@@ -1,42 +1,37 @@
-"""The example's designs beside the numbers that are known of them, and the page that tells them."""
+"""The example's designs beside the numbers that are known of them, and the page that shows them."""
 
 import json
 
 import numpy as np
 import pytest
 
-from heliograph_studies.demo.scores import Score
-from heliograph_studies.demo.twin import Design
-from heliograph_studies.network_design import compute, page, published, run
+from heliograph_studies import network_design
+from heliograph_studies.network_design import compute, figures, published
 from heliograph_studies.network_design.published import Circuit, packets
 
 pytestmark = pytest.mark.slow
 
+SETTING = network_design.Setting(one_hop=(2.0,), two_hops=(6.0,), front=(0.3, 1.0), periods=(1, 2, 3))
+
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory, widths):
+def results(tmp_path_factory, widths):
     """Fewer cases than the example's; what other tests compute (the demonstration) and a long descent stand in."""
     out = tmp_path_factory.mktemp("out")
-    designs = {
-        name: Design(power, power, [Score(1.0, 1.0, 1.0, 0.95)])
-        for name, power in (("as_it_is", 2500.0), ("centred", 600.0), ("centred_thousandth", 0.6))
-    }
+    powers = {"as_it_is": 5000.0, "centred": 1200.0, "centred_thousandth": 1.2}
+    designs = {name: {"rmse": 1.0, "claimed": 1.0, "power": power} for name, power in powers.items()}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(compute, "ONE_HOP", (2.0,))
-        patch.setattr(compute, "TWO_HOPS", (6.0,))
-        patch.setattr(compute, "FRONT", (0.3, 1.0))
-        patch.setattr(compute, "PERIODS", range(1, 4))
-        patch.setattr(page, "EVEN", 6)
-        patch.setattr(compute, "demonstration", lambda seed: designs)
-        patch.setattr(compute, "circuit", lambda: Circuit(2.0, 1.5, 0.75))
-        run.example(out)
+        patch.setattr(figures, "POINTS", 6)
+        patch.setattr(compute, "demonstration", lambda *_: designs)
+        patch.setattr(compute, "circuit", lambda: Circuit(25.0, 25.0))
+        network_design.run(SETTING, out)
     folder = out / "network-design"
     widths(folder / "report.html")
     return json.loads((folder / "summary.json").read_text()), (folder / "report.html").read_text()
 
 
-def test_one_hop_is_the_convex_optimum(told):
-    found = told[0]["one_hop"]["2"]
+def test_one_hop_is_the_convex_optimum(results):
+    found = results[0]["one_hop"]["2"]
     assert found["equal"] == pytest.approx(0.91212826, abs=5e-9)
     assert found["best"] == pytest.approx(0.87632288, abs=5e-9)
     assert found["powers"] == pytest.approx([0.42275, 0.60692, 0, 0.44522, 0, 0.52510], abs=1e-5)
@@ -44,8 +39,8 @@ def test_one_hop_is_the_convex_optimum(told):
     assert found["gap"] < 1e-9
 
 
-def test_two_hops_are_between_the_bound_and_the_best_known(told):
-    found = told[0]["two_hops"]["6"]
+def test_two_hops_are_between_the_bound_and_the_best_known(results):
+    found = results[0]["two_hops"]["6"]
     assert found["equal"] == pytest.approx(1.56566806, abs=5e-9)
     assert found["bound"] <= found["best"] <= 1.36438856
     assert found["bound"] > 1.3333
@@ -54,8 +49,8 @@ def test_two_hops_are_between_the_bound_and_the_best_known(told):
     assert found["least_power_bound"] <= found["least_power"] <= found["least_power_same_paths"] < 3.5971
 
 
-def test_schedules_and_sites_are_the_known_ones(told):
-    schedules, sites = told[0]["schedules"], told[0]["sites"]
+def test_schedules_and_sites_are_the_known_ones(results):
+    schedules, sites = results[0]["schedules"], results[0]["sites"]
     assert [schedules["by_period"][p] for p in "123"] == pytest.approx([1.167, 1.043, 1.006], abs=5e-4)
     assert schedules["bound"] == pytest.approx(0.972, abs=5e-4)
     assert schedules["greedy"] == pytest.approx(1.024, abs=5e-4)
@@ -69,8 +64,8 @@ def test_schedules_and_sites_are_the_known_ones(told):
     assert (far["noise"], far["direct"]) == (pytest.approx(20, rel=1e-6), pytest.approx(21, rel=1e-12))
 
 
-def test_the_page_tells_what_is_saved(told):
-    summary, html = told
+def test_the_page_says_what_is_saved(results):
+    summary, html = results
     assert summary["circuit"] == {"error_saved_percent": 25.0, "power_saved_percent": 25.0}
     assert set(summary["demonstration"]) == {"as_it_is", "centred", "centred_thousandth"}
     for words in (
@@ -86,7 +81,7 @@ def test_the_page_tells_what_is_saved(told):
 
 @pytest.mark.parametrize(("times", "silent"), [(1.1, 52), (3.0, 61)])
 def test_a_relay_for_packets_saves_half_and_more(times, silent):
-    """By plain iteration of the bound on the told filter's mean error."""
+    """By plain iteration of the bound on the informed filter's mean error."""
     found = packets(times)
     assert found["silent"] == pytest.approx(silent, abs=0.5)
     a, c = np.array(published.PLANT.matrix), np.array([[1.0, 1.0]])

@@ -1,6 +1,8 @@
 """Networks that are designed: powers, relays, sites and schedules, each beside what nothing can beat."""
 
-from heliograph_studies.network_design.run import example as run_example
-from heliograph_studies.old import Old
+from heliograph_studies.network_design import compute, figures
+from heliograph_studies.network_design.setting import Setting as Setting
+from heliograph_studies.study import Study
 
-example = Old(run_example)
+example = Study("network-design", Setting, compute.compute, 7, figures.figures, figures.words)
+run = example.run

@@ -1,123 +1,123 @@
 """What the example computes: designs of six sensors, the demonstration's twin, published networks, schedules, sites."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 import heliograph as hg
-from heliograph.planning import DesignProblem, PowerDesign, error_over_power
 from heliograph.planning.comparisons import Front
+from heliograph.planning.paths.model import path_information
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import networks as demo_networks
 from heliograph_studies.demo.compute import one_trial
-from heliograph_studies.demo.recording import read_recording
-from heliograph_studies.demo.twin import Design, as_it_is, twins
-from heliograph_studies.network_design import setting
+from heliograph_studies.demo.recording import find_recording, read_recording
+from heliograph_studies.demo.twin import as_it_is, twins
+from heliograph_studies.network_design import setting as models
+from heliograph_studies.network_design import theory
 from heliograph_studies.network_design.published import Circuit, circuit, packets
-from heliograph_studies.network_design.theory import (
-    Bursts,
-    Choice,
-    RelayLine,
-    SendingSchedule,
-    best_relays,
-    best_schedule,
-    burst_sending,
-    choose_sensors,
-    relay_line,
-)
+from heliograph_studies.network_design.setting import Setting
+from heliograph_studies.outcome import Inline
+from heliograph_studies.stages import Stages
 
-ONE_HOP, TWO_HOPS = (2.0, 10.0, 50.0), (6.0, 30.0)  # total powers
-FRONT = (2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
-PERIODS = range(1, 6)
-ON = 6.0  # power of the one sensor that sends at a step
-SEEDS = 5
-LOSSES = (1.1, 3.0)  # times the error without losses
-RHOS = (1.0, 4.0, 8.0, 20.0, 60.0)  # noise of the whole way over the power
-EXPONENT = 3.0
-STAGES = len(ONE_HOP) + len(TWO_HOPS) + len(FRONT) + 6
+Case = dict[str, Any]
+CHOSEN = (1, 2, 3)  # how many of the sensors
+MOST, FADING = 8, 1.02  # relays on a line, and E g^2 / (E g)^2 of its hops
 
 
-class Case(NamedTuple):
-    """One total power: the error of equal powers, the best found, and the least power for the error of equal ones."""
+@dataclass(frozen=True)
+class Schedules:
+    """One sensor at each step, bursts over two hops, and sensors that are chosen once, by their number."""
 
-    equal: float
-    best: PowerDesign
-    least: PowerDesign
-    narrow: PowerDesign  # the least power on the paths of the best
+    turns: Inline[theory.SendingSchedule]
+    bursts: theory.Bursts
+    sensors: dict[int, theory.Choice]
 
 
-class Outcome(NamedTuple):
-    """All that was found."""
+@dataclass(frozen=True)
+class Outcome:
+    """Designs by total power, and what each part of the example finds; sites by the noise of the whole way."""
 
     one_hop: dict[float, Case]
     two_hops: dict[float, Case]
     front: Front
-    demonstration: dict[str, Design]
+    demonstration: dict[str, dict[str, float]]
     circuit: Circuit
     packets: dict[float, dict[str, float]]
-    schedule: SendingSchedule
-    bursts: Bursts
-    lines: dict[float, tuple[RelayLine, RelayLine]]  # one relay, and the best number of them with fading
-    sensors: dict[int, Choice]
+    schedules: Schedules
+    sites: dict[float, dict[str, dict[str, float]]]
+
+
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Everything."""
+    find_recording()  # what is missing is said before the work starts
+
+    def cases(name: str, relayed: bool, totals: tuple[float, ...]) -> dict[float, Case]:
+        return {p: stages(name, partial(case, relayed, p), done, len(totals)) for done, p in enumerate(totals)}
+
+    return Outcome(
+        cases("six sensors over one hop", False, setting.one_hop),
+        cases("six sensors over two hops", True, setting.two_hops),
+        stages("the least error over power", lambda: front(setting, stages)),
+        stages("the demonstration's relays", lambda: demonstration(setting, stages)),
+        *stages("published designs", lambda: (circuit(), {times: packets(times) for times in setting.losses})),
+        stages("schedules", lambda: schedules(setting)),
+        stages("sites", lambda: {rho: sites(rho, setting.exponent) for rho in setting.rho}),
+    )
 
 
 def case(relayed: bool, total: float) -> Case:
-    """Equal powers, the best, and the least power at the error of equal powers."""
-    network = setting.six(relayed)
-    best = hg.design(network, budget=total)
-    equal = equal_error(network, total)
-    least = hg.design(network, target_error=equal)
-    sending = [name for name, power in path_powers(best).items() if power > 1e-9 * total]
-    narrow = least if not relayed else hg.design(setting.six(relayed, sending), target_error=equal)
-    return Case(equal, best, least, narrow)
+    """The error of equal powers, the best, and the least power for the error of equal powers, with what is proven."""
+    network = models.six(relayed)
+    paths = hg.planning.paths_of(network, hg.planning.Error())[0]
+    hops = paths.kappa.shape
+    equal = theory.steady_error(paths, path_information(paths, np.full(hops, total / hops[1])).information)
+    best, least = hg.design(network, budget=total), hg.design(network, target_error=equal)
+    hop_powers = [float(power[0]) for power in best.powers.values()]
+    powers = np.bincount(paths.path, hop_powers)
+    result = {"equal": equal, "best": best.error, "powers": powers, "least_power": least.total}
+    if not relayed:
+        return {**result, "gap": best.certificate.gap}
+    sending = [name for name, power in zip(models.NAMES, powers, strict=True) if power > 1e-9 * total]
+    narrow = hg.design(models.six(relayed, sending), target_error=equal)
+    proven = {"bound": best.bound, "least_power_bound": least.bound}
+    return {**result, **proven, "hop_powers": hop_powers, "least_power_same_paths": narrow.total}
 
 
-def equal_error(network: hg.Network, total: float) -> float:
-    """The error where all transmitters send the same, and together the total."""
-    names = list(hg.power(network).mean)
-    each = {name: np.array([total / len(names)]) for name in names}
-    designed = hg.planning.designed_network(network, each, hg.planning.Error())
-    return hg.design(designed, budget=total, starts=1).present  # whatever is found
+def front(setting: Setting, stages: Stages) -> Front:
+    """Least errors of two hops, at several total powers."""
+    problem, done = hg.planning.DesignProblem(models.six(True)), iter(range(len(setting.front)))
+    return hg.planning.error_over_power(
+        problem, setting.front, lambda _: stages.progress(next(done), len(setting.front))
+    )
 
 
-def path_powers(design: PowerDesign) -> dict[str, float]:
-    """Mean power of all transmitters of each sensor's path."""
-    found: dict[str, float] = {}
-    for name, power in design.powers.items():
-        path = name.partition(".")[0]
-        found[path] = found.get(path, 0.0) + float(np.mean(power))
-    return found
+def demonstration(setting: Setting, stages: Stages) -> dict[str, dict[str, float]]:
+    """The demonstration's relays as they are, and less the ranges at the start: means over the seeds."""
+    recording, seeds = read_recording(), range(setting.seed, setting.seed + setting.seeds)
+    network, plain = demo_networks(robot.DRIVES[recording.name], 1.0), []
+    for done, seed in enumerate(seeds):
+        stages.progress(done, len(seeds))
+        plain.append(one_trial(recording, network, seed).scores["relay_aware"])
+    designs = {"as_it_is": as_it_is(recording, plain), **twins(recording, seeds)}
+    return {name: {"rmse": d.rmse, "claimed": d.claimed, "power": d.power} for name, d in designs.items()}
 
 
-def demonstration(seed: int) -> dict[str, Design]:
-    """The demonstration's relays as they are, and less the ranges at the start."""
-    recording = read_recording()
-    network = demo_networks(robot.DRIVES[recording.name], 1.0)
-    seeds = range(seed, seed + SEEDS)
-    plain = [one_trial(recording, network, one).scores["relay_aware"] for one in seeds]
-    return {"as_it_is": as_it_is(recording, plain), **twins(recording, seeds)}
+def schedules(setting: Setting) -> Schedules:
+    """Who of the six sensors sends when, heard directly, and how seldom over two hops."""
+    paths = hg.planning.paths_of(models.six(False), hg.planning.Error())[0]
+    turns = theory.best_schedule(paths, setting.on, setting.periods)
+    bursts = theory.burst_sending(models.slow_state(), 0.5)
+    return Schedules(turns, bursts, {k: theory.choose_sensors(paths, k, setting.chosen) for k in CHOSEN})
 
 
-def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Outcome:
-    """Everything; `advance` is told what begins."""
-    cases: dict[bool, dict[float, Case]] = {False: {}, True: {}}
-    for relayed, totals in ((False, ONE_HOP), (True, TWO_HOPS)):
-        for total in totals:
-            advance(f"six sensors over {'two hops' if relayed else 'one hop'}, power {total:g}")
-            cases[relayed][total] = case(relayed, total)
-    front = error_over_power(DesignProblem(setting.six(True)), FRONT, advance)
-    advance("the demonstration's relays")
-    told_less = demonstration(seed)
-    advance("published designs")
-    saved = {times: packets(times) for times in LOSSES}
-    advance("the published circuit")
-    found = circuit()
-    advance("schedules")
-    paths = setting.six_paths()
-    schedule = best_schedule(paths, ON, PERIODS)
-    bursts = burst_sending(setting.slow_state(), [0.5, 0.5])
-    advance("sites")
-    lines = {rho: (relay_line(rho, EXPONENT), best_relays(rho, EXPONENT, 8, 1.02)[0]) for rho in RHOS}
-    sensors = {k: choose_sensors(paths, k, 2.0) for k in (1, 2, 3)}
-    return Outcome(cases[False], cases[True], front, told_less, found, saved, schedule, bursts, lines, sensors)
+def sites(rho: float, exponent: float) -> dict[str, dict[str, float]]:
+    """One relay without fading, and the best number of relays with a little of it."""
+    line, best = theory.relay_line(rho, exponent), theory.best_relays(rho, exponent, MOST, FADING)[0]
+    return {
+        "one_relay": {
+            "site": float(line.sites[0]), "noise": line.noise, "midpoint": line.even, "direct": line.direct,
+        },
+        "with_fading": {"relays": len(best.lengths) - 1, "noise": best.noise, "direct": best.direct},
+    }  # fmt: skip

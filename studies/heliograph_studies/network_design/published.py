@@ -14,28 +14,17 @@ CLOSE = 1e-4  # of the published error, to which it is reached
 
 
 class Circuit(NamedTuple):
-    """Steady errors (sum of both slots) and powers of the published relays, and of designed ones."""
+    """What designed relays save beside the published ones: error at their power, power at their error."""
 
-    published: float
-    same_power: float
-    share: float  # of the published power, with which the error is the published one
-
-    @property
-    def error_saved_percent(self) -> float:
-        """At the published power."""
-        return 100 * (1 - self.same_power / self.published)
-
-    @property
-    def power_saved_percent(self) -> float:
-        """At the published error."""
-        return 100 * (1 - self.share)
+    error_saved_percent: float
+    power_saved_percent: float
 
 
 def circuit() -> Circuit:
     """Relays designed for the best receiver behind them, not each for its own error, in the published network."""
     network = setting.circuit()
-    own = hg.relays.periodic_own_error_design(network)
-    power, published = own.total_power(), float(own.trace("receiver")[1:].sum())
+    as_published = hg.relays.periodic_own_error_design(network)
+    power, published = as_published.total_power(), float(as_published.trace("receiver")[1:].sum())
     start = {name: np.zeros((2, 3, 1)) for name in setting.QUIET}
     for name, (slot, gains) in setting.QUIET.items():
         start[name][slot, :, 0] = gains
@@ -50,24 +39,24 @@ def circuit() -> Circuit:
         (a, low), (b, high) = tried[-2:]
         following = b + (published - high) * (b - a) / (high - low)
         tried.append((following, error(1 / following)))
-    return Circuit(published, tried[0][1], 1 / tried[-1][0])
+    return Circuit(100 * (1 - tried[0][1] / published), 100 * (1 - 1 / tried[-1][0]))
 
 
 def packets(times: float) -> dict[str, float]:
     """Mean power saved by a relay halfway where the error may be so many times that without losses, in percent.
 
     A packet over a length d with power p arrives with probability exp(-d^3 / p). `silent`: the relay sends only what
-    came; `always`: it sends at each step. Bounded is the mean error of the filter that is told of losses, of which
+    came; `always`: it sends at each step. Bounded is the mean error of the filter that knows of losses, of which
     packets with arrival q leave what a path of noise D = 1 / q does.
     """
 
     def error(arrival: float) -> float:
-        found = hg.planning.feedback_limit(PLANT, SENSOR, [hg.hop(1.0, 1 / arrival - 1)], 1.0).predicted
-        return np.inf if found is None else float(np.trace(found))
+        predicted = hg.planning.feedback_limit(PLANT, SENSOR, [hg.hop(1.0, 1 / arrival - 1)], 1.0).predicted
+        return np.inf if predicted is None else float(np.trace(predicted))
 
     lowest = 1 - 1 / float(np.max(np.abs(np.linalg.eigvals(PLANT.matrix)))) ** 2
-    wanted = times * error(1.0)
-    arrival = brentq(lambda q: min(error(q), 1e6) - wanted, lowest + 1e-6, 1.0, xtol=1e-12)
+    target = times * error(1.0)
+    arrival = brentq(lambda q: min(error(q), 1e6) - target, lowest + 1e-6, 1.0, xtol=1e-12)
     loss = -np.log(arrival)
 
     def silent(share: float) -> float:

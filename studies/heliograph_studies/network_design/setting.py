@@ -1,10 +1,12 @@
 """The networks: six sensors over one hop or two, a seldom seen state, packets, and a published circuit."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import check_count, check_seed, scalar
 from heliograph.planning.paths.model import Paths
 
 TRANSITION = np.array([[0.95, 0.1, 0.0], [0.0, 0.9, 0.2], [0.0, -0.1, 0.8]])
@@ -19,6 +21,39 @@ NAMES = tuple("abcdef")
 VARIANCE = 4e-6  # of the circuit's noises
 SPREAD = 0.01  # of its gains
 QUIET = {"relay_1": (1, (0.39, -0.21, 0.033)), "relay_2": (0, (0.84, -0.42, 0.13))}  # the slot and gains to begin from
+
+
+@dataclass(frozen=True)
+class Setting:
+    """What is designed.
+
+    one_hop, two_hops, front: total powers of the six sensors. on: power of the sensor that sends at a step, chosen: of
+    those that are chosen once. losses: errors of the packets' filter, times that without losses. rho: noise of the
+    whole way over the power, exponent: of the path loss. seeds: of the demonstration's relays, from `seed` on.
+    """
+
+    one_hop: tuple[float, ...] = (2.0, 10.0, 50.0)
+    two_hops: tuple[float, ...] = (6.0, 30.0)
+    front: tuple[float, ...] = (2.0, 4.0, 8.0, 15.0, 30.0, 60.0)
+    periods: tuple[int, ...] = (1, 2, 3, 4, 5)
+    on: float = 6.0
+    chosen: float = 2.0
+    losses: tuple[float, ...] = (1.1, 3.0)
+    rho: tuple[float, ...] = (1.0, 4.0, 8.0, 20.0, 60.0)
+    exponent: float = 3.0
+    seeds: int = 5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_seed(f"last of {self.seeds} seeds", check_seed("seed", self.seed) + check_count("seeds", self.seeds) - 1)
+        for name in ("one_hop", "two_hops", "front", "on", "chosen", "rho"):
+            for power in np.atleast_1d(getattr(self, name)):
+                scalar(name, power, np.finfo(float).tiny)
+        for period in self.periods:
+            check_count("periods", period)
+        for times in self.losses:
+            scalar("losses", times, 1.0)
+        scalar("exponent", self.exponent, 1.0)
 
 
 def gain(kappa: float, length: float) -> hg.Discrete:
@@ -39,11 +74,6 @@ def six(relayed: bool, names: Sequence[str] = NAMES) -> hg.Network:
         nodes[name] = hg.Node(sensor, hg.amplify_and_forward(hops), {})
     plant = hg.LinearPlant(TRANSITION, PROCESS, np.zeros(3), np.eye(3))
     return hg.Network(plant, {name: nodes[name] for name in names})
-
-
-def six_paths() -> Paths:
-    """The same sensors, heard directly, as plain numbers."""
-    return hg.planning.independent_paths(TRANSITION, PROCESS, ROWS, NOISES, KAPPA, NEAR**3 / KAPPA)
 
 
 def slow_state() -> Paths:

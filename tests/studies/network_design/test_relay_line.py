@@ -5,7 +5,8 @@ import pytest
 from scipy.optimize import minimize
 
 from heliograph.numerics.check import InputError
-from heliograph_studies.network_design.theory import best_relays, path_noise, relay_line
+from heliograph.planning import split_power
+from heliograph_studies.network_design.theory import best_relays, relay_line
 
 
 def searched(rho, exponent, hops):
@@ -47,12 +48,18 @@ def test_the_number_of_relays_follows_from_what_each_costs():
     np.testing.assert_allclose(relay_line(20.0, 3.0, 2).lengths, [0.056, 0.056, 0.887], atol=5e-4)
 
 
-def test_no_hop_is_shorter_than_the_path_loss_is_known_for():
-    line = relay_line(20.0, 3.0, 2, nearest=0.1)
-    assert np.min(line.lengths) == pytest.approx(0.1, rel=1e-6)
-    assert line.noise == pytest.approx(path_noise(20.0 * line.lengths**3, 1.0), rel=1e-12)
-    assert len(best_relays(20.0, 3.0, 9, nearest=0.4)) == 2
-    with pytest.raises(InputError, match=r"relays: expected hops of 0\.4 of the way each, got 3 of them"):
-        relay_line(20.0, 3.0, 2, nearest=0.4)
-    with pytest.raises(InputError, match="kappa: expected a number from 1"):
+def test_a_line_is_the_chain_of_hops_that_planning_knows():
+    """Its noise is that of `split_power`'s best powers, which do not know that they are the lengths."""
+    for rho, exponent, relays in ((20.0, 3.0, 2), (2.0, 2.4, 1), (0.0, 3.0, 1)):
+        line = relay_line(rho, exponent, relays)
+        alpha = rho * line.lengths**exponent
+        powers = split_power(alpha, 1.0)
+        through = np.prod(1 + np.divide(alpha, powers, out=np.zeros_like(alpha), where=alpha > 0))
+        assert line.noise == pytest.approx(through, rel=1e-12)
+
+
+def test_what_cannot_be_is_refused():
+    with pytest.raises(InputError, match="kappa: expected a number of at least 1"):
         relay_line(1.0, 3.0, kappa=0.5)
+    with pytest.raises(InputError, match="rho: expected a number of at least 0"):
+        relay_line(-1.0, 3.0)

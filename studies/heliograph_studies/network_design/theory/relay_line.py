@@ -13,28 +13,21 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from heliograph.numerics.check import check_count, fail, scalar
-from heliograph.numerics.readable import readable
-from heliograph.numerics.types import ArrayLike, Float
-from heliograph.planning.paths.relaxation import split_power
-from heliograph_studies.network_design.theory.splits import path_noise
+from heliograph.numerics.check import check_count, scalar
+from heliograph.numerics.types import Float
 
 GRID = 400  # lengths of the short hops that are tried, evenly and on a logarithmic scale
 SHORTEST = 1e-9  # of the way
 
-LARGE = 1e6  # a kappa of more is a hop of which nothing arrives
 
-
-@readable
 class RelayLine(NamedTuple):
     """Relays on a line.
 
-    lengths: of each hop, parts of the way. shares: of the total power. noise: K F, as that of the path is s K F - t.
-    even: the same for hops of equal length and power. direct: without a relay.
+    lengths: of each hop, parts of the way, and the shares of the total power. noise: K F, as that of the path is
+    s K F - t. even: the same for hops of equal length. direct: without a relay.
     """
 
     lengths: Float[np.ndarray, "H"]
-    shares: Float[np.ndarray, "H"]
     noise: float
     even: float
     direct: float
@@ -44,66 +37,47 @@ class RelayLine(NamedTuple):
         """Where the relays stand: parts of the way from the sensor."""
         return np.cumsum(self.lengths)[:-1]
 
-    @property
-    def words(self) -> str:
-        """Whether relays help, in a line."""
-        count = len(self.lengths) - 1
-        relays = {0: "no relay", 1: "one relay"}.get(count, f"{count} relays")
-        return f"{relays}: noise {self.noise:.6g}, {self.even:.6g} with equal hops, {self.direct:.6g} without a relay"
 
+def relay_line(rho: float, exponent: float, relays: int = 1, kappa: float = 1.0) -> RelayLine:
+    """Best sites of so many relays, and the noise with them.
 
-def relay_line(
-    rho: ArrayLike, exponent: ArrayLike, relays: int = 1, kappa: ArrayLike = 1.0, nearest: ArrayLike = 0.0
-) -> RelayLine:
-    """The best sites of so many relays, and the best powers with them.
-
-    rho: noise Var m / (E g^2 P) of one hop over the whole way with all the power; exponent e of the path loss; kappa of
-    each hop. No hop is shorter than `nearest`, a part of the way: there a power law would promise signals without end.
-    One relay stands best at the midpoint for rho <= 2^e (e / 2 - 1) only, beyond gradually nearer to one end: with
-    e = 3 at x (1 - x) = 1 / rho, where the noise is rho, 1 + rho without it. The midpoint is better than no relay for
-    rho < 4^(e - 1) - 2^e.
+    rho: noise Var m / (E g^2 P) of one hop over the whole way with all the power; exponent e of the path loss, at least
+    1; kappa of each hop. One relay stands best at the midpoint for rho <= 2^e (e / 2 - 1) only, beyond gradually nearer
+    to one end: with e = 3 at x (1 - x) = 1 / rho, where the noise is rho, 1 + rho without it. The midpoint is better
+    than no relay for rho < 4^(e - 1) - 2^e.
 
     Raises:
-        ValueError: a negative rho, kappa below 1, hops that are longer together than the way.
+        ValueError: a negative rho, an exponent or kappa below 1.
     """
-    r, e = float(scalar("rho", rho, 0.0)), float(scalar("path loss exponent", exponent, 0.0))
-    k, least = float(scalar("kappa", kappa, 1.0, LARGE)), float(scalar("nearest", nearest, 0.0, 1.0))
+    for name, value, least in (("rho", rho, 0.0), ("path loss exponent", exponent, 1.0), ("kappa", kappa, 1.0)):
+        scalar(name, value, least)
     hops = check_count("relays", relays, 0) + 1
-    if hops * least > 1:
-        raise fail("relays", f"hops of {least:g} of the way each", f"{hops} of them")
-    shortest = max(least, SHORTEST) if hops > 1 else 1.0
-    equal = np.full(hops, 1 / hops)
-    even = path_noise(r * equal**e, 1.0)
-    tried = [_lengths(hops, short) for short in (_short(r, e, hops, shortest), min(shortest, 1 / hops))]
-    lengths = min((equal, *tried), key=lambda d: path_noise(r * d**e, 1.0))
-    shares = split_power(r * lengths**e, 1.0) if r else lengths.copy()
-    return RelayLine(lengths, shares, k**hops * path_noise(r * lengths**e, 1.0), k**hops * even, k * (1 + r))
+    equal, best = np.full(hops, 1 / hops), _lengths(hops, _short(rho, exponent, hops))
+    noise, even = (kappa**hops * float(np.exp(_log_noise(rho, exponent, d))) for d in (best, equal))
+    return RelayLine(best if noise < even else equal, min(noise, even), even, kappa * (1 + rho))
 
 
-def best_relays(
-    rho: ArrayLike, exponent: ArrayLike, most: int, kappa: ArrayLike = 1.0, nearest: ArrayLike = 0.0
-) -> tuple[RelayLine, ...]:
-    """The best lines of 0, 1, ..., `most` relays, the best of them first.
+def best_relays(rho: float, exponent: float, most: int, kappa: float = 1.0) -> list[RelayLine]:
+    """Best lines of 0, 1, ..., `most` relays, the best of them first.
 
     Without fading (kappa = 1) and with e > 2 more relays are always better; kappa above 1 makes each one cost.
 
     Raises:
         ValueError: what `relay_line` refuses.
     """
-    nearest_ = float(scalar("nearest", nearest, 0.0, 1.0))
-    counts = [n for n in range(check_count("most relays", most, 0) + 1) if (n + 1) * nearest_ <= 1]
-    return tuple(sorted((relay_line(rho, exponent, n, kappa, nearest_) for n in counts), key=lambda line: line.noise))
+    lines = [relay_line(rho, exponent, n, kappa) for n in range(check_count("most relays", most, 0) + 1)]
+    return sorted(lines, key=lambda line: line.noise)
 
 
-def _short(rho: float, exponent: float, hops: int, least: float) -> float:
-    """The length of all hops but one that makes the noise least."""
-    if hops == 1 or least >= 1 / hops:
-        return 1 / hops
+def _short(rho: float, exponent: float, hops: int) -> float:
+    """Length of all hops but one that makes the noise least."""
+    if hops == 1:
+        return 1.0
 
     def noise(short: float) -> float:
-        return float(np.log1p(rho * _lengths(hops, short) ** (exponent - 1)).sum())
+        return _log_noise(rho, exponent, _lengths(hops, short))
 
-    tried = np.unique(np.append(np.geomspace(least, 1 / hops, GRID), np.linspace(least, 1 / hops, GRID)))
+    tried = np.unique(np.append(np.geomspace(SHORTEST, 1 / hops, GRID), np.linspace(SHORTEST, 1 / hops, GRID)))
     values = np.array([noise(x) for x in tried])
     at = int(np.argmin(values))
     low, high = tried[max(at - 1, 0)], tried[min(at + 1, len(tried) - 1)]
@@ -114,3 +88,8 @@ def _short(rho: float, exponent: float, hops: int, least: float) -> float:
 def _lengths(hops: int, short: float) -> Float[np.ndarray, "H"]:
     """All hops but one of this length."""
     return np.append(np.full(hops - 1, short), 1 - (hops - 1) * short)
+
+
+def _log_noise(rho: float, exponent: float, lengths: Float[np.ndarray, "H"]) -> float:
+    """log F with shares of the power that are the lengths."""
+    return float(np.log1p(rho * lengths ** (exponent - 1)).sum())
