@@ -5,7 +5,8 @@ import json
 import pytest
 
 import heliograph as hg
-from heliograph_studies.range_bearing import compute, example
+from heliograph_studies import range_bearing
+from heliograph_studies.range_bearing import compute
 from heliograph_studies.range_bearing.setting import close_by, passing
 
 pytestmark = pytest.mark.slow
@@ -24,11 +25,9 @@ def few(network: hg.Network) -> hg.Network:
 
 
 def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path, monkeypatch, fits):
-    for name, value in {"RUNS": 64, "FADING_RUNS": 192}.items():
-        monkeypatch.setattr(compute, name, value)
     monkeypatch.setattr(compute, "passing", lambda *which, **how: few(passing(*which, **how)))
-    monkeypatch.setattr(compute, "close_by", lambda: few(close_by()))
-    example(tmp_path, 0)
+    monkeypatch.setattr(compute, "close_by", lambda setting: few(close_by(setting)))
+    range_bearing.run(range_bearing.Setting(runs=64, fading_runs=192), tmp_path)
     found = json.loads((tmp_path / "range-bearing" / "summary.json").read_text())
     for name in ("quiet_cubature", "quiet_extended"):
         elsewhere, across, line = (found[case][name] for case in compute.CASES)

@@ -1,19 +1,44 @@
 """The two settings: a robot that drives past a station, and a target that passes close to one."""
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
+from heliograph.numerics.check import check_count, check_seed, scalar
 
 SPEED, TURN = 1.0, 0.02  # m and rad a step
-STEPS = 40
-BEARING = 0.02  # rad, standard deviation
 CHAIN = hg.random_affine.MarkovChain([[0.9, 0.1], [0.3, 0.7]])
 QUIET = hg.parallel([hg.hop(1.0, 0.1), hg.hop(1.0, 1e-4)])
 NOISY = hg.parallel([hg.hop(1.0, 4.0), hg.hop(1.0, 1e-2)])
 LINK = hg.random_affine.Modes(CHAIN, [QUIET, NOISY])
-ARRIVAL = 0.8
+
+
+@dataclass(frozen=True)
+class Setting:
+    """How much is simulated past the two stations, and close by behind the relay that fades.
+
+    bearing: its standard deviation in rad. arrival: probability that a packet of the two stations arrives.
+    """
+
+    runs: int = 2000
+    steps: int = 40
+    fading_runs: int = 1000
+    fading_steps: int = 80
+    bearing: float = 0.02
+    arrival: float = 0.8
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_count("runs", self.runs, 2)
+        check_count("fading_runs", self.fading_runs, 10)  # as many as there are classes of runs
+        check_count("steps", self.steps)
+        check_count("fading_steps", self.fading_steps)
+        scalar("bearing", self.bearing, 0.0)
+        scalar("arrival", self.arrival, 0.0, 1.0)
+        check_seed("seed", self.seed)
 
 
 def move(x: jax.Array, u: jax.Array) -> jax.Array:
@@ -26,11 +51,11 @@ def look(x: jax.Array) -> jax.Array:
     return jnp.stack([jnp.hypot(x[0], x[1]), jnp.arctan2(x[1], x[0])])
 
 
-def passing(side: float, circular: bool = True) -> hg.Network:
+def passing(setting: Setting, side: float, circular: bool = True) -> hg.Network:
     """A robot that drives past two stations at one place, east of them (side 1) or west (-1), where bearings cross pi.
 
-    Node "quiet" hears through Gaussian noise, node "bursts" through noise that is larger for a while; both lose one
-    packet in five. Not `circular`: numbers on a line, as without angles.
+    Node "quiet" receives through Gaussian noise, node "bursts" through noise that is larger for a while; both lose
+    packets. Not `circular`: numbers on a line, as without angles.
     """
     plant = hg.Plant(
         move,
@@ -42,7 +67,7 @@ def passing(side: float, circular: bool = True) -> hg.Network:
         circular=["heading"] if circular else [],
     )
     angles = ["bearing"] if circular else []
-    sensor = hg.Sensor(look, np.diag([0.5**2, BEARING**2]), outputs=("range", "bearing"), circular=angles)
+    sensor = hg.Sensor(look, np.diag([0.5**2, setting.bearing**2]), outputs=("range", "bearing"), circular=angles)
     direct = hg.cubature_filter(plant, sensor, QUIET)
     noisy = hg.cubature_filter(plant, sensor, LINK)
     quiet: dict[str, hg.filters.AbstractFilter] = {
@@ -61,17 +86,13 @@ def passing(side: float, circular: bool = True) -> hg.Network:
         "central": hg.filters.sequential_filter([direct, noisy]),
     }
     nodes = {
-        "quiet": hg.Node(sensor, hg.erasure(QUIET, ARRIVAL), quiet),
-        "bursts": hg.Node(sensor, hg.erasure(LINK, ARRIVAL), bursts),
+        "quiet": hg.Node(sensor, hg.erasure(QUIET, setting.arrival), quiet),
+        "bursts": hg.Node(sensor, hg.erasure(LINK, setting.arrival), bursts),
     }
     return hg.Network(plant, nodes, fused)
 
 
-FADE = hg.Rayleigh(0.8)
-FADING_STEPS = 80
-
-
-def close_by() -> hg.Network:
+def close_by(setting: Setting) -> hg.Network:
     """A target that passes a station; its range comes through two hops that fade, its bearing as it is."""
     step, drift = np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(2)), np.kron([[1 / 3, 1 / 2], [1 / 2, 1.0]], np.eye(2))
     plant = hg.LinearPlant(
@@ -81,8 +102,8 @@ def close_by() -> hg.Network:
         np.diag([20.0, 20.0, 2.0, 2.0]) ** 2,
         states=("x", "y", "vx", "vy"),
     )
-    sensor = hg.Sensor(look, np.diag([1.0, BEARING**2]), outputs=("range", "bearing"), circular=["bearing"])
-    relay = hg.amplify_and_forward([hg.hop(FADE, 0.02), hg.hop(FADE, 0.02)])
+    sensor = hg.Sensor(look, np.diag([1.0, setting.bearing**2]), outputs=("range", "bearing"), circular=["bearing"])
+    relay = hg.amplify_and_forward([hg.hop(hg.Rayleigh(0.8), 0.02) for _ in range(2)])
     channel = hg.parallel([relay, hg.hop(1.0, 1e-4)])
     rules = {"second_order": 2, "four_points": 3, "seven_points": 6}  # degree; but for 2 one point more a direction
     filters: dict[str, hg.filters.AbstractFilter] = {
