@@ -1,6 +1,8 @@
 """Links that fade slowly: what a filter without memory claims and errs, what memory and being told are worth."""
 
-from heliograph_studies.links_with_memory.run import example as run_example
-from heliograph_studies.old import Old
+from heliograph_studies.links_with_memory import compute, figures
+from heliograph_studies.links_with_memory.setting import Setting as Setting
+from heliograph_studies.study import Study
 
-example = Old(run_example)
+example = Study("links-with-memory", Setting, compute.compute, 6, figures.figures, figures.words)
+run = example.run

@@ -6,121 +6,116 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph_studies.links_with_memory.setting import (
-    CLASSES,
-    DRIFTING_PLANT,
-    DRIFTING_SENSOR,
-    PLANT,
-    SENSOR,
-    TWO_SENSORS,
-    bursts,
-    correlated,
-    drifting,
-    lossy,
-)
+from heliograph_studies.links_with_memory import setting as models
+from heliograph_studies.links_with_memory.setting import PLANT, SENSOR, TWO_SENSORS, Setting, bursts
+from heliograph_studies.outcome import Unlisted
+from heliograph_studies.stages import Stages
 
-RUNS = {"e1": 2048, "e2": 2048}
-PARTICLE_RUNS = 128
 STEPS = {"e1": (300, 100), "e2": (100, 50)}  # horizon, and the first step that counts
-LAGS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
+CORRELATIONS = (0.0, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)  # of the gain over a step
 LONG = 1000  # steps after which nothing changes any more
-STAGES = 6
+
+Progress = Callable[[int, int], None]
+Places = Mapping[str, tuple[hg.random_affine.AbstractRandomAffine, Mapping[str, hg.filters.AbstractFilter]]]
 
 
 @dataclass(frozen=True)
 class Score:
-    """Claimed variance of the first state and its mean square error, means over the steps that count.
-
-    exact: the true error before any data, where gains depend on none. over_time: mean square error at each step.
-    """
+    """Claimed variance of the first state and its mean square error: means over the steps that count, and over time."""
 
     claim: str
     claimed: float
     true: float
     true_se: float
-    exact: float | None
-    claimed_over_time: np.ndarray
-    true_over_time: np.ndarray
+    claimed_over_time: Unlisted[np.ndarray]
+    true_over_time: Unlisted[np.ndarray]
+
+
+@dataclass(frozen=True)
+class Known(Score):
+    """With the true error before any data, where gains depend on none."""
+
+    true_before_data: float
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Scores by example and filter; of being told; variances in one shadow; true over claimed by correlation."""
+    """Scores by example and filter, and with side information; variances where two links fade together.
 
+    curve: true over claimed variance by correlation of the gain. memory_test: memory that a recording shows, to lag 3.
+    """
+
+    runs: dict[str, int]
+    steps: dict[str, dict[str, int]]
     e1: dict[str, Score]
     e2: dict[str, Score]
     told: dict[str, Score]
-    shadow: dict[str, float]
-    lags: np.ndarray
-    ratios: np.ndarray
-    memory: hg.simulation.MemoryTest
+    one_shadow: dict[str, float]
+    curve: dict[str, list[float]]
+    memory_test: dict[str, float | np.ndarray]
 
 
-Place = tuple[hg.random_affine.AbstractRandomAffine, Mapping[str, hg.filters.AbstractFilter]]
+def compute(setting: Setting, stages: Stages) -> Outcome:
+    """Everything."""
+    fading, drifting = bursts(setting), models.drifting()
+    plants = {"e1": (PLANT, SENSOR, fading), "e2": (models.DRIFTING_PLANT, models.DRIFTING_SENSOR, drifting)}
+    e1 = stages("fading in bursts", lambda: scores("e1", *plants["e1"], setting, stages.progress))
+    e2 = stages("two hops that drift", lambda: scores("e2", *plants["e2"], setting, stages.progress))
+    informed = stages("what telling is worth", lambda: with_side_information(setting, stages.progress))
+    together = stages("links that fade together", lambda: fading_together(setting))
+    ratios = stages("correlation over time", lambda: [too_sure(setting, value) for value in CORRELATIONS])
+    return Outcome(
+        dict.fromkeys(STEPS, setting.runs),
+        {name: {"horizon": horizon, "from": begin} for name, (horizon, begin) in STEPS.items()},
+        e1, e2, informed, together, {"lambda": list(CORRELATIONS), "ratio": ratios},
+        stages("memory found in data", lambda: memory_in_data(setting)),
+    )  # fmt: skip
 
 
-def compute(seed: int, advance: Callable[[str], None]) -> Outcome:
-    """Everything, from the first seed of the runs."""
-    advance("fading in bursts")
-    e1 = _scores("e1", PLANT, SENSOR, bursts(), seed)
-    advance("two hops that drift")
-    e2 = _scores("e2", DRIFTING_PLANT, DRIFTING_SENSOR, drifting(), seed)
-    advance("what telling is worth")
-    told = _told(seed)
-    advance("one shadow")
-    shadow = _shadow()
-    advance("correlation over time")
-    ratios = np.array([_memoryless_truth(correlated(lag)).ratio[-1, 0] for lag in LAGS])
-    advance("memory found in data")
-    return Outcome(e1, e2, told, shadow, np.array(LAGS), ratios, _found(seed))
-
-
-def _scores(
+def scores(
     which: str,
     plant: hg.LinearPlant,
     sensor: hg.LinearSensor,
     channel: hg.random_affine.AbstractRandomAffine,
-    seed: int,
+    setting: Setting,
+    progress: Progress,
 ) -> dict[str, Score]:
     """Every filter of one example."""
-    own = (plant, sensor, channel)
-    linear = {
-        "memoryless": hg.filters.memoryless_filter(plant, sensor, channel),
-        "exact": hg.linear_filter(*own),
-    }
+    model = (plant, sensor, channel)
+    linear = {"memoryless": hg.filters.memoryless_filter(*model), "exact": hg.linear_filter(*model)}
     weighing = {
-        "gpb1": hg.filters.gpb1_filter(*own),
-        "imm": hg.filters.imm_filter(*own),
-        "gpb2": hg.filters.gpb2_filter(*own),
+        "gpb1": hg.filters.gpb1_filter(*model),
+        "imm": hg.filters.imm_filter(*model),
+        "gpb2": hg.filters.gpb2_filter(*model),
     }
-    places: dict[str, Place] = {
+    places: Places = {
         "nothing told": (channel, {**linear, **weighing}),
-        "late": (hg.model.with_flag(channel, late=True), {"mode_late": hg.filters.mode_late_filter(*own)}),
-        "now": (hg.model.with_flag(channel), {"mode_known": hg.filters.mode_known_filter(*own)}),
+        "late": (hg.model.with_flag(channel, late=True), {"mode_late": hg.filters.mode_late_filter(*model)}),
+        "now": (hg.model.with_flag(channel), {"mode_known": hg.filters.mode_known_filter(*model)}),
     }
     horizon, begin = STEPS[which]
-    truths = {name: hg.filters.true_error(item, plant, sensor, channel, horizon) for name, item in linear.items()}
-    scores = _simulated(plant, sensor, places, horizon, begin, RUNS[which], seed)
-    particles: dict[str, Place] = {"particles": (channel, {"particle": hg.filters.particle_filter(*own)})}
-    scores |= _simulated(plant, sensor, particles, horizon, begin, PARTICLE_RUNS, seed)
-    for name, truth in truths.items():
-        exact = float(truth.true[begin:, 0, 0].mean())
-        scores[name] = Score(**{**vars(scores[name]), "exact": exact})
-    return scores
+    result = simulated(plant, sensor, places, which, setting.runs, setting.seed, progress)
+    particles = {"particles": (channel, {"particle": hg.filters.particle_filter(*model)})}
+    result |= simulated(plant, sensor, particles, which, setting.particle_runs, setting.seed, progress)
+    for name, item in linear.items():
+        truth = hg.filters.true_error(item, *model, horizon)
+        result[name] = Known(**vars(result[name]), true_before_data=float(truth.true[begin:, 0, 0].mean()))
+    return result
 
 
-def _simulated(
+def simulated(
     plant: hg.LinearPlant,
     sensor: hg.LinearSensor,
-    places: Mapping[str, Place],
-    horizon: int,
-    begin: int,
+    places: Places,
+    which: str,
     runs: int,
     seed: int,
+    progress: Progress,
 ) -> dict[str, Score]:
     """Scores of the filters at each place, by filter."""
+    horizon, begin = STEPS[which]
     nodes = {name: hg.Node(sensor, channel, filters) for name, (channel, filters) in places.items()}
-    record = hg.monte_carlo(hg.Network(plant, nodes), horizon, runs, seed)
+    record = hg.monte_carlo(hg.Network(plant, nodes), horizon, runs, seed, progress=progress)
     result = {}
     for name, (_, filters) in places.items():
         for item in filters:
@@ -128,38 +123,28 @@ def _simulated(
             estimate = record.estimates[name][item]
             claimed = np.broadcast_to(estimate.covariance[..., 0, 0], squares.shape).mean(axis=0)
             by_run = squares[:, begin:].mean(axis=1)
-            error = float(by_run.std() / np.sqrt(runs))
-            averages = float(claimed[begin:].mean()), float(by_run.mean()), error
-            result[item] = Score(estimate.claim, *averages, None, claimed, squares.mean(axis=0))
+            averages = float(claimed[begin:].mean()), float(by_run.mean()), float(by_run.std() / np.sqrt(runs))
+            result[item] = Score(estimate.claim, *averages, claimed, squares.mean(axis=0))
     return result
 
 
-def _told(seed: int) -> dict[str, Score]:
+def with_side_information(setting: Setting, progress: Progress) -> dict[str, Score]:
     """Fading in bursts: losses that depend on the mode and are told, and classes of the signal's strength."""
-    channel = bursts()
-    places: dict[str, Place] = {
-        "losses": (lossy(), {"losses": hg.linear_filter(PLANT, SENSOR, lossy())}),
-        "classes": (
-            hg.model.with_flag(channel, CLASSES),
-            {"classes": hg.filters.told_filter(PLANT, SENSOR, channel, CLASSES)},
-        ),
+    channel, losing = bursts(setting), models.lossy(setting)
+    by_class = hg.filters.told_filter(PLANT, SENSOR, channel, models.CLASSES)
+    places: Places = {
+        "losses": (losing, {"losses": hg.linear_filter(PLANT, SENSOR, losing)}),
+        "classes": (hg.model.with_flag(channel, models.CLASSES), {"classes": by_class}),
     }
-    horizon, begin = STEPS["e1"]
-    return _simulated(PLANT, SENSOR, places, horizon, begin, RUNS["e1"] // 4, seed)
+    return simulated(PLANT, SENSOR, places, "e1", setting.runs // 4, setting.seed, progress)
 
 
-def _memoryless_truth(channel: hg.random_affine.AbstractRandomAffine) -> hg.filters.TrueError:
-    item = hg.filters.memoryless_filter(PLANT, SENSOR, channel)
-    return hg.filters.true_error(item, PLANT, SENSOR, channel, LONG)
-
-
-def _shadow() -> dict[str, float]:
-    """Two sensors in one shadow: the best filter, and that for two shadows, claimed and true."""
-    chain = [bursts(name="road") for _ in range(2)]
-    together, apart = hg.parallel(chain), hg.parallel([bursts(), bursts()])
+def fading_together(setting: Setting) -> dict[str, float]:
+    """Two sensors whose links fade together: the best filter, and that for separate fades, claimed and true."""
+    together, apart = (hg.parallel([bursts(setting, name=name) for _ in range(2)]) for name in ("road", None))
     best, wrong = (
-        hg.filters.true_error(hg.linear_filter(PLANT, TWO_SENSORS, c), PLANT, TWO_SENSORS, together, LONG)
-        for c in (together, apart)
+        hg.filters.true_error(hg.linear_filter(PLANT, TWO_SENSORS, channel), PLANT, TWO_SENSORS, together, LONG)
+        for channel in (together, apart)
     )
     return {
         "shared": float(best.true[-1, 0, 0]),
@@ -168,8 +153,19 @@ def _shadow() -> dict[str, float]:
     }
 
 
-def _found(seed: int) -> hg.simulation.MemoryTest:
-    """What one recording of 10,000 steps tells the filter without memory."""
-    item = hg.filters.memoryless_filter(PLANT, SENSOR, bursts())
-    record = hg.monte_carlo(hg.Network(PLANT, {"node": hg.Node(SENSOR, bursts(), {"it": item})}), 10_000, 1, seed)
-    return hg.simulation.memory_test(record.measurements["node"][0], item)
+def too_sure(setting: Setting, correlation: float) -> float:
+    """True over claimed variance of the filter without memory in the long run, where gains have this correlation."""
+    channel = bursts(setting, correlation)
+    item = hg.filters.memoryless_filter(PLANT, SENSOR, channel)
+    return float(hg.filters.true_error(item, PLANT, SENSOR, channel, LONG).ratio[-1, 0])
+
+
+def memory_in_data(setting: Setting) -> dict[str, float | np.ndarray]:
+    """What one recording of 10,000 steps says of the link, by the innovations of the filter without memory."""
+    channel = bursts(setting)
+    item = hg.filters.memoryless_filter(PLANT, SENSOR, channel)
+    network = hg.Network(PLANT, {"node": hg.Node(SENSOR, channel, {"it": item})})
+    record = hg.monte_carlo(network, 10_000, 1, setting.seed)
+    test = hg.simulation.memory_test(record.measurements["node"][0], item)
+    numbers = {"correlation": test.correlation[:3], "standard_error": test.standard_error[:3]}
+    return {**numbers, "p_value": test.p_value, "predictable": test.predictable}
