@@ -137,8 +137,10 @@ class Study(Generic[Setting, Outcome]):
         words = [f"heliograph {'reproduce' if self.publication else 'example'} {self.name} --out out"]
         for name in REPEATED:
             value = getattr(setting, name, None)
-            if value is not None and (self.publication or value != getattr(self.setting(), name)):
-                words.append(f"--{name} {value}")
+            if value is None or not (self.publication or value != getattr(self.setting(), name)):
+                continue
+            option = self.publication or name == "seed"  # examples have no --runs
+            words.append(f"--{name} {value}" if option else f"--set {name}={value}")
         for name, (_, here) in self._changed(setting).items():
             words.append(f"--set {name}={here.strip('[]').replace(' ', '')}")
         return " ".join(words)

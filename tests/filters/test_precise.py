@@ -205,3 +205,15 @@ def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
     with jax.enable_x64(True):
         slope = jax.grad(variance)(0.0)
         np.testing.assert_allclose(slope, variance(1e-5) / 1e-5, rtol=1e-4)
+
+
+def test_data_without_noise_leave_a_variance_above_the_rounding_of_the_mean():
+    """Of a state that moves and is seen without noise the claim covers what rounding leaves, smoothed too."""
+    plant = hg.LinearPlant([[0.9]], 0.0, [0.0], 1.034)
+    sensor, channel = hg.LinearSensor([[0.349], [-0.639]], np.zeros((2, 2))), hg.perfect(2)
+    network = hg.Network(plant, {"a": hg.Node(sensor, channel, {"f": hg.linear_filter(plant, sensor, channel)})})
+    record = hg.monte_carlo(network, 12, 200, 1, smooth=hg.smoothing.FixedInterval())
+    for part in (record, record.smoothed):
+        squared = (part.estimates["a"]["f"].mean - record.truth) ** 2
+        assert (squared.mean(axis=0)[:, 0] <= np.reshape(part.estimates["a"]["f"].covariance, (-1, 12))[0]).all()
+        assert squared.max() < 1e-30  # a few units of rounding of a state of size 1, squared

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import Signal, known_gain_covariance
@@ -29,7 +30,7 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, times, times_vector, transpose
+from heliograph.numerics.small_matrix import congruence, diagonal, own, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.second_moments import SecondOrder, has_known_mean
@@ -89,6 +90,8 @@ class LinearFilter(AbstractFilter):
         y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
+        # No variance is below the rounding of the mean itself, however often noise-free data say the same again.
+        bound = above_rounding(bound, state.state_mean, state.state_covariance)
         mean, covariance, expected = used(
             state.mean,
             state.covariance,
@@ -143,6 +146,18 @@ def moved(
 ) -> tuple[jax.Array, jax.Array]:
     """A m + b and A P A' + Q."""
     return times_vector(matrix, mean) + shift, congruence(matrix, spread) + noise
+
+
+@runs_last
+def above_rounding(covariance: jax.Array, state_mean: jax.Array, state_covariance: jax.Array) -> jax.Array:
+    """P + diag(((n + 2) eps)^2 E[x_i^2]) where P_ii is not zero: what a mean of such a size cannot say.
+
+    Data without noise would else shrink P at each step by eps^2, to where a smoother divides the rounding of an
+    innovation by it.
+    """
+    unit = (len(covariance) + 2) * float(np.finfo(covariance.dtype).eps)
+    second = own(state_covariance) + state_mean**2
+    return covariance + diagonal(jnp.where(own(covariance) > 0, unit**2 * second, 0.0))
 
 
 @runs_last
