@@ -119,16 +119,16 @@ def looked_up(x):
 )
 def test_it_computes_what_the_function_does(function, tmp_path):
     """To a few units of rounding of libm's functions, some 300 times over in a loop."""
-    found, right = compiled(function, X, tmp_path), expected(function, X)
-    np.testing.assert_allclose(found, right, rtol=1e-13, atol=1e-14)
+    result, right = compiled(function, X, tmp_path), expected(function, X)
+    np.testing.assert_allclose(result, right, rtol=1e-13, atol=1e-14)
 
 
 @needs_compiler
 @pytest.mark.parametrize("function", [arithmetic, functions, guarded, looked_up])
 def test_in_single_precision(function, tmp_path):
     """To that many units of rounding of 6e-8."""
-    found, right = compiled(function, X, tmp_path, "float"), expected(function, X)
-    np.testing.assert_allclose(found, right, rtol=2e-5, atol=1e-6)
+    result, right = compiled(function, X, tmp_path, "float"), expected(function, X)
+    np.testing.assert_allclose(result, right, rtol=2e-5, atol=1e-6)
     body, tables, _ = written(function, X, "float")
     assert "double" not in "".join(body + tables), "a device without double precision would emulate it"
 

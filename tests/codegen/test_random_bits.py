@@ -62,9 +62,9 @@ def same(function: Callable[..., Any], *arguments: Any) -> None:
     """The function's results as JAX has them, bit for bit."""
     with jax.enable_x64(True):
         expected = jax.tree.leaves(jax.jit(function)(*arguments))
-    for found, true in zip(computed(function, *arguments), expected, strict=True):
+    for item, true in zip(computed(function, *arguments), expected, strict=True):
         true = np.asarray(jax.random.key_data(true) if _is_key(true) else true)
-        np.testing.assert_array_equal(found, true.ravel())
+        np.testing.assert_array_equal(item, true.ravel())
 
 
 def key_of(first: int, second: int) -> jax.Array:
@@ -145,7 +145,7 @@ def test_the_compiled_hash() -> None:
     )
     engine = engine_of(text)
     given = np.random.default_rng(0).integers(0, 2**32, (4, WIDTH), dtype=np.uint32)
-    found = np.empty(WIDTH, dtype=np.uint64)
+    result = np.empty(WIDTH, dtype=np.uint64)
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)(engine.get_function_address("all"))
-    call(given.ctypes.data, found.ctypes.data)
-    np.testing.assert_array_equal(found, [hashed(*map(int, column)) for column in given.T])
+    call(given.ctypes.data, result.ctypes.data)
+    np.testing.assert_array_equal(result, [hashed(*map(int, column)) for column in given.T])

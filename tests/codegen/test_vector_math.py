@@ -72,9 +72,9 @@ TRUE = {
 }  # fmt: skip
 
 
-def _units(found: np.ndarray, true: np.ndarray) -> np.ndarray:
+def _units(result: np.ndarray, true: np.ndarray) -> np.ndarray:
     """Differences in units of rounding of the true value."""
-    return np.abs(found - true) / np.spacing(np.abs(true.astype(float)))
+    return np.abs(result - true) / np.spacing(np.abs(true.astype(float)))
 
 
 @pytest.mark.skipif(not ROUNDED, reason="this machine has no number longer than a double to compare with")
@@ -109,11 +109,11 @@ def test_numbers_of_any_size(compiled: Compiled, numbers: list[float]) -> None:
 def test_special_values_are_those_of_jax(compiled: Compiled, name: str) -> None:
     with jax.enable_x64(True):
         expected = np.asarray(jax.jit(getattr(jax.lax, name))(SPECIAL))
-    found = compiled(name, SPECIAL)
+    result = compiled(name, SPECIAL)
     # JAX's functions are a few units off, its lgamma(2) is 9e-16; here zeros, signs, infinities and NaN count.
-    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15 if name == "lgamma" else 1e-307)
-    zero = (found == 0) & (expected == 0)
-    np.testing.assert_array_equal(np.signbit(found[zero]), np.signbit(expected[zero]))
+    np.testing.assert_allclose(result, expected, rtol=1e-13, atol=1e-15 if name == "lgamma" else 1e-307)
+    zero = (result == 0) & (expected == 0)
+    np.testing.assert_array_equal(np.signbit(result[zero]), np.signbit(expected[zero]))
 
 
 @pytest.mark.parametrize("name", ["atan2", "pow"])
@@ -121,9 +121,9 @@ def test_special_pairs_are_those_of_jax(compiled: Compiled, name: str) -> None:
     y, x = (a.ravel() for a in np.meshgrid(SPECIAL, SPECIAL))
     with jax.enable_x64(True):
         expected = np.asarray(jax.jit(getattr(jnp, {"atan2": "arctan2", "pow": "power"}[name]))(y, x))
-    found = compiled(name, y, x)
-    np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-307)
-    np.testing.assert_array_equal(np.signbit(found[found == 0]), np.signbit(expected[found == 0]))
+    result = compiled(name, y, x)
+    np.testing.assert_allclose(result, expected, rtol=1e-13, atol=1e-307)
+    np.testing.assert_array_equal(np.signbit(result[result == 0]), np.signbit(expected[result == 0]))
 
 
 def test_denormal_numbers(compiled: Compiled) -> None:

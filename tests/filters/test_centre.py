@@ -18,13 +18,13 @@ def test_where_the_state_is_does_not_matter_behind_a_known_gain(build, mean):
     """x - mean has the same law wherever the mean is; 1e8 itself is known to 1e-8 only."""
     z = 0.3 * np.sin(np.arange(12.0))
 
-    def found(start, gain):
+    def evaluate(start, gain):
         plant, sensor = hg.LinearPlant([[1.0]], EITHER, [start], 1.0), hg.LinearSensor([[1.0]], SKEWED)
         item = build(plant, sensor, hg.hop(gain, 0.0), 12, 2)
         assert item.claim == "exact"
         return last(item, gain * (start + z))
 
-    near, far = found(0.0, 0.5), found(mean, 0.5)
+    near, far = evaluate(0.0, 0.5), evaluate(mean, 0.5)
     np.testing.assert_allclose(far.covariance, near.covariance, rtol=1e-12)
     np.testing.assert_allclose(far.mean - mean, near.mean, atol=1e-15 * mean + 1e-14)
 
@@ -69,9 +69,9 @@ def test_far_from_zero_behind_a_random_gain_the_claim_is_lowered():
     ids=lambda law: type(law).__name__,
 )
 def test_a_law_about_its_mean(law):
-    for found in (about_mean(law), AboutMean(law)):
-        np.testing.assert_allclose(found.mean, 0.0, atol=1e-15)
-        np.testing.assert_allclose(found.covariance, law.covariance)
-        assert found.moment((1, 0)) == pytest.approx(0.0, abs=1e-14)
-        assert found.moment((1, 1)) == pytest.approx(law.covariance[0, 1], abs=1e-14)
-        assert found.moment((2, 1)) == pytest.approx(about_mean(law).moment((2, 1)), abs=1e-12)
+    for item in (about_mean(law), AboutMean(law)):
+        np.testing.assert_allclose(item.mean, 0.0, atol=1e-15)
+        np.testing.assert_allclose(item.covariance, law.covariance)
+        assert item.moment((1, 0)) == pytest.approx(0.0, abs=1e-14)
+        assert item.moment((1, 1)) == pytest.approx(law.covariance[0, 1], abs=1e-14)
+        assert item.moment((2, 1)) == pytest.approx(about_mean(law).moment((2, 1)), abs=1e-12)

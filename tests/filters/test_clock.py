@@ -39,14 +39,14 @@ def at_the_end(world, joint, filters):
     return result
 
 
-def deviations(found):
+def deviations(result):
     """Root mean square errors, and claims."""
-    errors, covariances = found
+    errors, covariances = result
     return np.sqrt((errors**2).mean(axis=0)), np.sqrt(np.diagonal(covariances.mean(axis=0)))
 
 
-def nees(found, part):
-    errors, covariances = found[0][:, part], found[1][:, part, part]
+def nees(result, part):
+    errors, covariances = result[0][:, part], result[1][:, part, part]
     return np.einsum("ra,rab,rb->r", errors, np.linalg.inv(covariances), errors).mean() / errors.shape[1]
 
 
@@ -112,10 +112,10 @@ def test_stamps_taken_as_true_cost_five_times_what_is_claimed(moving):
 )
 def test_what_cannot_be_observed_is_not_claimed(trap, filters, request):
     """The plain filter claims less than half of its error; the one that asks keeps what was known before."""
-    found = request.getfixturevalue(trap)
-    true, claimed = deviations(found["plain" + filters])
+    result = request.getfixturevalue(trap)
+    true, claimed = deviations(result["plain" + filters])
     assert true[2] > 2.5 * claimed[2]
-    true, claimed = deviations(found["guarded" + filters])
+    true, claimed = deviations(result["guarded" + filters])
     np.testing.assert_allclose(claimed[2:], DEVIATION, rtol=1e-9)
     assert np.all(true[[0, 2, 3]] < (1 + 3 / np.sqrt(2 * RUNS)) * claimed[[0, 2, 3]])
 
@@ -146,9 +146,9 @@ def test_two_wrong_clocks_may_be_wrong_together():
 def test_a_plant_given_as_functions_has_the_same_clocks():
     plant, _, joint, channel = seen_by("ab")
     step = np.array(F)
-    own = hg.Plant(lambda x, u: step @ x, Q, [0.0, 1.0], np.diag([1.0, 0.01]))
+    local = hg.Plant(lambda x, u: step @ x, Q, [0.0, 1.0], np.diag([1.0, 0.01]))
     position = hg.Sensor(lambda x: x[:1], 0.04)
-    other, sensors = with_clocks(own, {"a": position, "b": position}, CLOCKS, lambda x: np.array(MOTION) @ x, DT)
+    other, sensors = with_clocks(local, {"a": position, "b": position}, CLOCKS, lambda x: np.array(MOTION) @ x, DT)
     pair = [
         clock_filter(plant, joint, channel, ["b"]),
         clock_filter(other, hg.model.joint_sensor(sensors), channel, ["b"]),

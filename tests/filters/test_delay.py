@@ -19,7 +19,7 @@ PLANT, SENSOR = hg.LinearPlant(A, Q, START, SPREAD), hg.LinearSensor(C, R)
 WEIGHTS, STEPS = np.array([0.4, 0.35, 0.25]), 30
 LAW = hg.Discrete([0, 1, 2], WEIGHTS)
 LINK = hg.hop(1.0, N)
-UNTOLD, TOLD, FIXED = hg.hop(1.0, N, delay=LAW), hg.model.delayed(LINK, LAW, told=True), hg.hop(1.0, N, delay=2)
+UNTOLD, TOLD, FIXED = hg.hop(1.0, N, delay=LAW), hg.model.delayed(LINK, LAW, timestamped=True), hg.hop(1.0, N, delay=2)
 PARTS = oracle.signals(A, Q, C, R, START, SPREAD, STEPS)
 delayed, true_error = hg.model.delayed, hg.filters.true_error
 
@@ -45,21 +45,21 @@ def in_chain(initial, rows):
 def filters():
     """One of each kind."""
     chosen = {"untold": UNTOLD, "told": TOLD, "fixed": FIXED}
-    found = {name: hg.linear_filter(PLANT, SENSOR, channel) for name, channel in chosen.items()}
-    return found | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNTOLD)}
+    results = {name: hg.linear_filter(PLANT, SENSOR, channel) for name, channel in chosen.items()}
+    return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNTOLD)}
 
 
 def test_not_told_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
-    heard = oracle.of_untold(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
-    found = true_error(filters["untold"], PLANT, SENSOR, UNTOLD, STEPS)
-    best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, STEPS + 1)])
-    np.testing.assert_allclose(found.claimed, best, rtol=1e-11, atol=1e-11 * np.abs(best).max())
-    np.testing.assert_allclose(found.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
-    assert found.true[-1, 0, 0] == pytest.approx(0.649, abs=5e-4)
+    received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
+    result = true_error(filters["untold"], PLANT, SENSOR, UNTOLD, STEPS)
+    best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, STEPS + 1)])
+    np.testing.assert_allclose(result.claimed, best, rtol=1e-11, atol=1e-11 * np.abs(best).max())
+    np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
+    assert result.true[-1, 0, 0] == pytest.approx(0.649, abs=5e-4)
     wrong = true_error(filters["as_current"], PLANT, SENSOR, UNTOLD, STEPS)
     weights, offset, claimed = oracle.kalman(A, Q, C, R + N, START, SPREAD, STEPS)
     np.testing.assert_allclose(wrong.claimed[-1], claimed, rtol=1e-11)
-    np.testing.assert_allclose(wrong.true[-1], oracle.error_of(PARTS, heard, weights, offset, STEPS), rtol=1e-10)
+    np.testing.assert_allclose(wrong.true[-1], oracle.error_of(PARTS, received, weights, offset, STEPS), rtol=1e-10)
     assert wrong.claimed[-1, 0, 0] == pytest.approx(0.199, abs=5e-4)
     assert wrong.true[-1, 0, 0] == pytest.approx(0.896, abs=5e-4)
     assert [filters[name].claim for name in ("untold", "told", "fixed")] == ["exact"] * 3
@@ -111,22 +111,22 @@ def test_not_told_the_claim_is_the_best_linear_error_of_any_problem(a, c, seed):
 
 def check_that_it_is_the_best(a, c, r, q, weights, gains, noise):
     with jax.enable_x64(True):
-        found = np.asarray(claimed(a, c, r, q, weights, gains, np.array([[noise]])))[2::2]
+        result = np.asarray(claimed(a, c, r, q, weights, gains, np.array([[noise]])))[2::2]
     law = np.insert(weights, 2, 0.0)
     parts, second = oracle.signals(a, q, c, r, START, SPREAD, 8), np.mean(gains**2)
-    heard = oracle.of_untold(parts, independent(law), np.mean(gains), second, noise * (second + 1))
-    best = np.array([oracle.best_linear(parts, heard, k) for k in range(1, 9)])
-    np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
+    received = oracle.of_unknown(parts, independent(law), np.mean(gains), second, noise * (second + 1))
+    best = np.array([oracle.best_linear(parts, received, k) for k in range(1, 9)])
+    np.testing.assert_allclose(result, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
 
 
 def test_delays_that_are_a_chain():
     rows, initial = np.array([[0.8, 0.2, 0.0], [0.1, 0.7, 0.2], [0.0, 0.3, 0.7]]), np.array([0.5, 0.3, 0.2])
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), N, delay=hg.random_affine.MarkovChain(rows, initial))
-    found = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 10)
-    heard = oracle.of_untold(PARTS, in_chain(initial, rows), 0.75, 0.625, N)
-    best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, 11)])
-    np.testing.assert_allclose(found.claimed, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
-    np.testing.assert_allclose(found.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
+    result = true_error(hg.linear_filter(PLANT, SENSOR, channel), PLANT, SENSOR, channel, 10)
+    received = oracle.of_unknown(PARTS, in_chain(initial, rows), 0.75, 0.625, N)
+    best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, 11)])
+    np.testing.assert_allclose(result.claimed, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
+    np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -135,10 +135,10 @@ def test_told_the_claim_is_the_best_linear_error_given_the_delays(filters, seed)
     generator = np.random.default_rng(seed)
     delays = generator.choice(3, p=WEIGHTS, size=12)
     parts, state = oracle.signals(A, Q, C, R, START, SPREAD, 12), filters["told"].init()
-    heard = oracle.of_told(parts, delays, 1.0, 1.0, N)
+    received = oracle.of_known(parts, delays, 1.0, 1.0, N)
     for k, d in enumerate(delays):
         state, estimate = filters["told"].step(state, [generator.normal(), float(d)], k=k)
-        best = oracle.best_linear(parts, heard, k + 1)
+        best = oracle.best_linear(parts, received, k + 1)
         np.testing.assert_allclose(estimate.covariance, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
     unknown = filters["told"].correct(state, [0.3, np.nan], k=12)[0]
     np.testing.assert_array_equal(unknown.mean, state.mean)
@@ -156,9 +156,9 @@ def test_a_constant_delay_is_predicted_over(filters):
     for k in range(12):
         pairs = [item.step(state, z[k], u[k], k) for item, state in zip((late, larger), both, strict=True)]
         both = [state for state, _ in pairs]
-        (one, other) = (estimate for _, estimate in pairs)
-        np.testing.assert_allclose(one.mean, other.mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-12, atol=1e-13)
+        (single, other) = (estimate for _, estimate in pairs)
+        np.testing.assert_allclose(single.mean, other.mean, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(single.covariance, other.covariance, rtol=1e-12, atol=1e-13)
 
 
 LATE = [0.5, 0.3, 0.2]  # a relay's own delay
@@ -186,12 +186,12 @@ def simulated(filters):
 @pytest.mark.slow
 def test_simulated_errors_are_as_known_before(simulated):
     _, record = simulated
-    errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, own in record.estimates.items() for f in own}
+    errors = {(n, f): record.errors(n, f)[:, -1, 0] ** 2 for n, estimate in record.estimates.items() for f in estimate}
     known = {("untold", "untold"): 0.649, ("untold", "as_current"): 0.896, ("told", "told"): 0.460}
     for name, expected in known.items():
         assert abs(errors[name].mean() - expected) < 3 * errors[name].std() / 32
-    told = record.estimates["told"]["told"].covariance[:, -1, 0, 0]
-    assert abs(told.mean() - 0.460) < 3 * told.std() / 32
+    published = record.estimates["told"]["told"].covariance[:, -1, 0, 0]
+    assert abs(published.mean() - 0.460) < 3 * published.std() / 32
 
 
 @pytest.mark.slow
@@ -199,13 +199,13 @@ def test_relays_that_are_late_by_chance(simulated):
     """What a relay forwards twice has one noise: the relay's signal stands in the oracle as the sensor's does."""
     (network, record), generator = simulated, np.random.default_rng(0)
     item = network.nodes["relayed"].filters["exact"]
-    relay = oracle.of_untold(PARTS, independent([0.7, 0.3]), 0.9, 0.9, N)
+    relay = oracle.of_unknown(PARTS, independent([0.7, 0.3]), 0.9, 0.9, N)
     stage = (PARTS[0], relay[0], PARTS[2], *relay[1:])
     gains = np.array([0.98, 0.4 * 0.64 + 0.6 * 1.21])
-    heard = oracle.of_untold(stage, independent([0.0, *LATE]), *gains, 2 * N + N)
-    best = np.array([oracle.best_linear(PARTS, heard, k) for k in range(1, 13)])
-    found = np.asarray(item.planned(np.zeros((12, 0))).covariances)[2::2]
-    np.testing.assert_allclose(found, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
+    received = oracle.of_unknown(stage, independent([0.0, *LATE]), *gains, 2 * N + N)
+    best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, 13)])
+    result = np.asarray(item.planned(np.zeros((12, 0))).covariances)[2::2]
+    np.testing.assert_allclose(result, best, rtol=1e-10, atol=1e-11 * np.abs(best).max())
     assert hg.filters.as_current_filter(PLANT, SENSOR, network.nodes["relayed"].channel).claim == "nominal"
     squares = record.errors("relayed", "exact")[:, 11] ** 2
     assert np.all(np.abs(squares.mean(axis=0) - np.diag(best[-1])) < 3 * squares.std(axis=0) / 32)
@@ -221,11 +221,11 @@ def test_a_record_as_events(simulated):
     network, record = simulated
     known = hg.Record(record.time, record.states, None, {n: record.measurements[n] for n in ("told", "fixed")}, {})
     events = hg.simulation.arrivals(known, network, run=3)
-    told, z = [event for event in events if event[0] == "told"], record.measurements["told"][3]
+    published, z = [event for event in events if event[0] == "told"], record.measurements["told"][3]
     assert [event[-1] for event in events] == sorted(event[-1] for event in events)
-    assert [event[2] for event in told] == [k - d for k, d in enumerate(z[:, 1]) if k >= d]
-    np.testing.assert_array_equal([event[3][0] for event in told], [v for k, (v, d) in enumerate(z) if k >= d])
-    assert len({event[1] for event in told}) < len(told)
+    assert [event[2] for event in published] == [k - d for k, d in enumerate(z[:, 1]) if k >= d]
+    np.testing.assert_array_equal([event[3][0] for event in published], [v for k, (v, d) in enumerate(z) if k >= d])
+    assert len({event[1] for event in published}) < len(published)
     assert [(event[1], event[-1]) for event in events if event[0] == "fixed"] == [(k, k + 2.0) for k in range(28)]
     with pytest.raises(ValueError, match="delays of node 'untold'"):
         hg.simulation.arrivals(record, network)
@@ -241,7 +241,7 @@ REFUSED = {
     "one without delays": lambda: hg.cubature_filter(PLANT, SENSOR, UNTOLD),
     "a LinearPlant": lambda: hg.linear_filter(hg.Plant(lambda x, u: x, Q, START, SPREAD), SENSOR, UNTOLD),
     "one that forgets": lambda: hg.linear_filter(
-        PLANT, SENSOR, delayed(hg.gilbert_elliott(LINK, LINK, 0.1, 0.2), LAW, told=True)
+        PLANT, SENSOR, delayed(hg.gilbert_elliott(LINK, LINK, 0.1, 0.2), LAW, timestamped=True)
     ),
     "at most the filter's 2": lambda: hg.filters.part_filter(hg.linear_filter(PLANT, SENSOR, LINK), 3),
     "delay: expected a whole number": lambda: hg.filters.late_filter(hg.linear_filter(PLANT, SENSOR, LINK), -1),

@@ -67,8 +67,8 @@ def test_one_measurement_is_kalman_s(columns):
 
 def test_a_precise_measurement_keeps_its_digits():
     """In single precision, where P - K h' P would be zero: a variance of 1 measured with 1e-8 leaves 1e-8."""
-    rows, one = np.ones((1, 1), np.float32), np.ones(1, np.float32)
-    _, left, _ = measured(rows, one, one, np.float32(1e-8))
+    rows, item = np.ones((1, 1), np.float32), np.ones(1, np.float32)
+    _, left, _ = measured(rows, item, item, np.float32(1e-8))
     assert left.dtype == np.float32
     np.testing.assert_allclose(left, 1e-8, rtol=3e-7)  # two roundings of 6e-8 and that of 1e-8 itself
 

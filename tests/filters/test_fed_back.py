@@ -38,13 +38,13 @@ def test_claims_are_exact(statistics: dict[str, dict[str, hg.Statistics]], node:
 def test_the_covariance_is_that_of_the_formula(statistics: dict[str, dict[str, hg.Statistics]]) -> None:
     a, c, q = np.array(PLANT.matrix), np.array([[1.0, 0.5]]), np.diag([0.1, 0.2])
     mean, second = 0.15 + 0.4 + 0.42, 0.3 * 0.25 + 0.4 + 0.3 * 1.96
-    p, found = np.eye(2), []
+    p, results = np.eye(2), []
     for _ in range(HORIZON):
         p = a @ p @ a.T + q
         s = (c @ p @ c.T + 0.5).item()
         p = p - (p @ c.T @ c @ p) * mean**2 / (second * s + 0.3)
-        found.append(p)
-    np.testing.assert_allclose(statistics["sure"]["fed"].claimed(), found, rtol=1e-10)
+        results.append(p)
+    np.testing.assert_allclose(statistics["sure"]["fed"].claimed(), results, rtol=1e-10)
 
 
 def test_a_nonlinear_sensor_takes_off_what_it_sends_of_the_prediction() -> None:
@@ -64,9 +64,9 @@ def test_a_nonlinear_sensor_takes_off_what_it_sends_of_the_prediction() -> None:
     mean, second = 0.97, 0.3 * 0.25 + 0.4 + 0.3 * 1.96
     cross = mean * np.mean((points - m) * points**2)
     total = second * (spread + left**2) - (mean * left) ** 2 + 0.3
-    _, found = item.step(item.init(), [0.7])
-    np.testing.assert_allclose(found.mean, [m + cross / total * (0.7 - mean * left)], rtol=1e-12)
-    np.testing.assert_allclose(found.covariance, [[p - cross**2 / total]], rtol=1e-9)
+    _, result = item.step(item.init(), [0.7])
+    np.testing.assert_allclose(result.mean, [m + cross / total * (0.7 - mean * left)], rtol=1e-12)
+    np.testing.assert_allclose(result.covariance, [[p - cross**2 / total]], rtol=1e-9)
 
 
 def test_bad_nodes_are_one_clear_line() -> None:

@@ -282,14 +282,14 @@ def test_every_transform_is_the_same_for_linear_plants():
 
 
 @pytest.mark.parametrize(
-    "own", [{"initial_mean": [0.0]}, {"initial_covariance": [[1e-4]]}], ids=lambda o: next(iter(o))
+    "local", [{"initial_mean": [0.0]}, {"initial_covariance": [[1e-4]]}], ids=lambda o: next(iter(o))
 )
-def test_a_filter_with_an_initial_law_of_its_own_is_not_exact(own):
+def test_a_filter_with_an_initial_law_of_its_own_is_not_exact(local):
     plant, sensor = hg.LinearPlant([[0.95]], 0.01, [0.0], 1.0), hg.LinearSensor([[1.0]], 1.0)
     filters = {
-        "cubature": hg.cubature_filter(plant, sensor, hg.perfect(), **own),
-        "kalman": hg.kalman_filter(plant, sensor, **own),
-        "open": hg.filters.open_loop_filter(plant, **own),
+        "cubature": hg.cubature_filter(plant, sensor, hg.perfect(), **local),
+        "kalman": hg.kalman_filter(plant, sensor, **local),
+        "open": hg.filters.open_loop_filter(plant, **local),
     }
     central = hg.filters.sequential_filter([filters["kalman"], hg.kalman_filter(plant, sensor)])
     ahead = hg.filters.prediction_of(filters["cubature"])

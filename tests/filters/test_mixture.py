@@ -44,9 +44,9 @@ def test_first_step_is_bayes_rule_on_a_grid():
     )
     density /= density.sum()
     mean = density @ x
-    found = one_step(plant, sensor, channel, z)
-    assert found.mean[0] == pytest.approx(mean, rel=1e-9)
-    assert found.covariance[0, 0] == pytest.approx(density @ (x - mean) ** 2, rel=1e-9)
+    result = one_step(plant, sensor, channel, z)
+    assert result.mean[0] == pytest.approx(mean, rel=1e-9)
+    assert result.covariance[0, 0] == pytest.approx(density @ (x - mean) ** 2, rel=1e-9)
 
 
 def test_atoms_have_the_channels_moments():
@@ -63,8 +63,8 @@ def test_atoms_have_the_channels_moments():
 
 def test_a_missing_measurement_is_a_prediction():
     plant = hg.LinearPlant([[0.5]], 1.0, [2.0], 3.0)
-    found = one_step(plant, hg.LinearSensor([[1.0]], TWO), hg.perfect(), np.nan)
-    assert found.mean[0] == pytest.approx(1.0) and found.covariance[0, 0] == pytest.approx(0.25 * 3 + 1.0)
+    result = one_step(plant, hg.LinearSensor([[1.0]], TWO), hg.perfect(), np.nan)
+    assert result.mean[0] == pytest.approx(1.0) and result.covariance[0, 0] == pytest.approx(0.25 * 3 + 1.0)
 
 
 @pytest.mark.slow
@@ -72,8 +72,8 @@ def test_on_the_example_it_is_far_better_than_any_polynomial():
     s = model(oracle.paper_example(), 30, initial=0.01 * np.eye(2))
     cubic = hg.linear.lmmse(hg.linear.lifted_system(*s, 3, 30)).gains.covariance[15:, 0, 0].mean()
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, {"mixture": hg.mixture_filter(*s)})})
-    found = hg.monte_carlo(network, 30, 96, 0, keep=hg.Statistics())["node"]["mixture"]
-    assert found.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
+    result = hg.monte_carlo(network, 30, 96, 0, keep=hg.Statistics())["node"]["mixture"]
+    assert result.actual()[15:, 0, 0].mean() < 0.35 * cubic  # 0.0079 against 0.033
 
 
 def test_a_combination_without_randomness_is_believed_where_z_agrees_with_it_and_only_there():
@@ -90,9 +90,9 @@ def test_what_has_no_atoms_is_refused():
     plant, sensor = hg.LinearPlant([[0.5]], 1.0, [0.0], 1.0), hg.LinearSensor([[1.0]], TWO)
     with pytest.raises(ValueError, match="gains of finitely many values, got Rayleigh"):
         hg.mixture_filter(plant, sensor, hg.hop(hg.Rayleigh(1.0), 0.1))
-    many = hg.random_affine.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
+    count = hg.random_affine.FiniteSupport(np.arange(100.0)[:, None], np.full(100, 0.01))
     with pytest.raises(ValueError, match="at most 4,096 combinations of atoms, got 10,000"):
-        hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, many), hg.hop(1.0, many)]))
+        hg.mixture_filter(plant, sensor, hg.amplify_and_forward([hg.hop(1.0, count), hg.hop(1.0, count)]))
     moments = hg.random_affine.NoiseMoments([0.0, 1.0, 0.5, 2.0])
     with pytest.raises(ValueError, match="finite support or Gaussian, got NoiseMoments"):
         hg.mixture_filter(plant, hg.LinearSensor([[1.0]], moments), hg.perfect())
@@ -124,8 +124,8 @@ def test_modes_are_weighed_with_their_atoms():
                 g = c.gain[0, 0]
                 density = stats.norm.pdf(z, g * moved.mean[0] + c.offset[0], np.sqrt(g * p * g + c.noise[0, 0]))
                 likelihood[i] += c.weight * density
-        state, heard = item.correct(moved, [z], k)
-        np.testing.assert_allclose(heard.log_likelihood, np.log(law @ likelihood), rtol=1e-12)
+        state, innovation = item.correct(moved, [z], k)
+        np.testing.assert_allclose(innovation.log_likelihood, np.log(law @ likelihood), rtol=1e-12)
         law = law * likelihood / (law @ likelihood)
         np.testing.assert_allclose(state.law, law, rtol=1e-12)
 
@@ -141,9 +141,9 @@ def test_a_chain_that_forgets_is_a_mixture():
 
 def test_one_mode_is_the_filter_without_modes():
     data = (0.7, -1.1, 2.0)
-    one = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
+    record = run(hg.mixture_filter(PLANT, SENSOR, hg.markov_fading(MODES[:1], [[1.0]])), data)
     plain = run(hg.mixture_filter(PLANT, SENSOR, MODES[0]), data)
-    np.testing.assert_array_equal(one, plain)
+    np.testing.assert_array_equal(record, plain)
 
 
 def test_with_gaussian_noise_it_is_gpb1():
@@ -165,10 +165,10 @@ def test_a_value_that_no_combination_leaves_says_nothing(channel):
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     item = hg.mixture_filter(plant, sensor, channel)
     prior = item.predict(item.init())
-    after, heard = item.correct(prior, [0.5])
+    after, innovation = item.correct(prior, [0.5])
     np.testing.assert_array_equal(item.estimate(after).mean, item.estimate(prior).mean)
     np.testing.assert_array_equal(item.estimate(after).covariance, item.estimate(prior).covariance)
-    assert heard.log_likelihood == -np.inf
+    assert innovation.log_likelihood == -np.inf
     stream = hg.Stream(item)
     with pytest.raises(
         ValueError, match=r"measurement of step 0: expected a plausible one, got \[0.5\]: a value that the"

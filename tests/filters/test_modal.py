@@ -114,8 +114,8 @@ def test_it_is_the_best_over_all_paths(name):
 def test_maps_may_vary_while_the_chain_does_not():
     chain = hg.random_affine.MarkovChain(CHAIN_B, LAW_B)
     maps = [[hg.hop((1 + k) * g, 0.1 + 0.1 * k) for g in (0.3, -0.6, 1.2)] for k in range(STEPS)]
-    found = filtered(hg.model.over_time([Modes(chain, row) for row in maps]))
-    np.testing.assert_allclose(found, expected(LAW_B, [CHAIN_B] * 3, maps), **EXACT)
+    result = filtered(hg.model.over_time([Modes(chain, row) for row in maps]))
+    np.testing.assert_allclose(result, expected(LAW_B, [CHAIN_B] * 3, maps), **EXACT)
 
 
 def drifts(correlations, steps, points):
@@ -172,8 +172,8 @@ def test_drifting_gains_need_no_grid(name):
             else [t + weight * p for t, p in zip(total, parts, strict=True)]
         )
     channel = build(lambda i: hg.autoregressive_fading(1.1, 0.4, correlations[i], 0.2, name=f"drift {i}"))
-    found = errors(hg.linear_filter(hg.model.over_time(PLANTS), hg.model.over_time(SENSORS), channel), steps)
-    np.testing.assert_allclose(found, oracle.best_linear(SECOND[:steps, :steps], *total), **EXACT)
+    result = errors(hg.linear_filter(hg.model.over_time(PLANTS), hg.model.over_time(SENSORS), channel), steps)
+    np.testing.assert_allclose(result, oracle.best_linear(SECOND[:steps, :steps], *total), **EXACT)
 
 
 def test_a_gain_that_never_changes_but_is_unknown():

@@ -13,7 +13,7 @@ SENSOR = hg.LinearSensor([[1.0]], 0.05)
 CHAIN = [[0.95, 0.05], [0.03, 0.97]]
 LINK = hg.markov_fading([0.2, 1.0], CHAIN, noise=0.05)
 DATA = [0.3, -1.2, 0.8, 1.5, -0.4, 0.9]
-MANY = 20_000  # particles
+LARGE = 20_000  # particles
 WIDE = hg.LinearPlant([[0.9, 0.2], [-0.1, 0.8]], [[0.3, 0.1], [0.1, 0.2]], [1.0, -0.5], np.eye(2))
 BOTH = hg.LinearSensor([[1.0, 0.0], [1.0, 1.0]], 0.2 * np.eye(2))
 FILTERS = [hg.filters.gpb1_filter, hg.filters.imm_filter, hg.filters.gpb2_filter]
@@ -40,24 +40,24 @@ def exact(plant, sensor, links, data, arrival=(1.0, 1.0, 1.0)):
     paths = [(np.log(p), i, plant.initial_mean, plant.initial_covariance) for i, p in enumerate(law)]
     for k, z in enumerate(data):
         gains, noise, rows = steps[k]
-        heard = []
+        received = []
         for weight, i, m, p in paths:
             m, p = a @ m, a @ p @ a.T + q
             if np.isnan(z):
-                heard.append((weight + np.log(1 - arrival[i]), i, m, p))
+                received.append((weight + np.log(1 - arrival[i]), i, m, p))
                 continue
             weight = weight + np.log(arrival[i])
             g = gains[i] * c
             s = g @ p @ g.T + gains[i] ** 2 * r + noise
             gain = p @ g.T @ np.linalg.inv(s)
             likelihood = stats.multivariate_normal.logpdf(z, g @ m, s)
-            heard.append((weight + likelihood, i, m + gain @ (z - g @ m), p - gain @ g @ p))
-        paths = [(w + np.log(rows[i][j]), j, m, p) for w, i, m, p in heard for j in range(len(rows))]
-    weights = np.array([w for w, *_ in heard])
+            received.append((weight + likelihood, i, m + gain @ (z - g @ m), p - gain @ g @ p))
+        paths = [(w + np.log(rows[i][j]), j, m, p) for w, i, m, p in received for j in range(len(rows))]
+    weights = np.array([w for w, *_ in received])
     total = np.logaddexp.reduce(weights)
     share = np.exp(weights - total)
-    mean = share @ np.array([m for _, _, m, _ in heard])
-    spread = sum(w * (p + np.outer(m - mean, m - mean)) for w, (_, _, m, p) in zip(share, heard, strict=True))
+    mean = share @ np.array([m for _, _, m, _ in received])
+    spread = sum(w * (p + np.outer(m - mean, m - mean)) for w, (_, _, m, p) in zip(share, received, strict=True))
     return mean, spread, total
 
 
@@ -76,9 +76,9 @@ def test_until_something_is_merged_they_are_exact(build, steps):
     """GPB2 hears with every pair of modes before it merges: its second step is Bayes' rule."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * steps)
     mean, spread, total = exact(PLANT, SENSOR, link, DATA[:steps])
-    found, likelihood = stepped(build(PLANT, SENSOR, LINK), DATA[:steps])
-    np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
-    np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
+    result, likelihood = stepped(build(PLANT, SENSOR, LINK), DATA[:steps])
+    np.testing.assert_allclose(result.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(result.covariance, spread, rtol=1e-12)
     np.testing.assert_allclose(likelihood, total, rtol=1e-12)
 
 
@@ -89,20 +89,20 @@ def test_a_chain_that_varies_leads_from_each_step_to_the_next():
         [hg.markov_fading([0.5, 1.5], hg.random_affine.MarkovChain(r, law, "link"), noise=0.1) for r in rows]
     )
     mean, spread, _ = exact(PLANT, SENSOR, (law, [([0.5, 1.5], np.array([[0.1]]), r) for r in rows]), DATA[:2])
-    found, _ = stepped(hg.filters.gpb2_filter(PLANT, SENSOR, links), DATA[:2])
-    np.testing.assert_allclose(found.mean, mean, rtol=1e-12)
-    np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
+    result, _ = stepped(hg.filters.gpb2_filter(PLANT, SENSOR, links), DATA[:2])
+    np.testing.assert_allclose(result.mean, mean, rtol=1e-12)
+    np.testing.assert_allclose(result.covariance, spread, rtol=1e-12)
 
 
 def test_many_particles_are_close_to_bayes_rule():
     """20,000 particles over six steps, 64 paths: within 4 standard errors of the mean of as many draws."""
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(DATA))
     mean, spread, total = exact(PLANT, SENSOR, link, DATA)
-    found, likelihood = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY), DATA)
-    tolerance = 4 / np.sqrt(MANY) * np.sqrt(spread[0, 0])
-    assert abs(found.mean[0] - mean[0]) < tolerance
-    assert abs(found.covariance[0, 0] - spread[0, 0]) < tolerance
-    assert abs(likelihood - total) < 4 * len(DATA) / np.sqrt(MANY)
+    result, likelihood = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE), DATA)
+    tolerance = 4 / np.sqrt(LARGE) * np.sqrt(spread[0, 0])
+    assert abs(result.mean[0] - mean[0]) < tolerance
+    assert abs(result.covariance[0, 0] - spread[0, 0]) < tolerance
+    assert abs(likelihood - total) < 4 * len(DATA) / np.sqrt(LARGE)
 
 
 CURVED = hg.Plant(lambda x, u: x + 0.1 * np.array([1.0, -1.0]) * x**2, 0.01 * np.eye(2), [0.5, 1.0], np.eye(2))
@@ -112,12 +112,12 @@ PRODUCT = hg.Sensor(lambda x: x[:1] * x[1:], 0.1)
 @pytest.mark.slow
 @pytest.mark.parametrize("build", ALL)
 def test_one_mode_is_the_cubature_filter(build):
-    one = hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]])
-    found, likelihood = stepped(build(CURVED, PRODUCT, one), DATA)
+    single = hg.markov_fading([hg.hop(hg.Rayleigh(1.0), 0.1)], [[1.0]])
+    result, likelihood = stepped(build(CURVED, PRODUCT, single), DATA)
     item = hg.cubature_filter(CURVED, PRODUCT, hg.hop(hg.Rayleigh(1.0), 0.1))
     expected, total = stepped(item, DATA)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-10)
+    np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-10)
     np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
@@ -126,19 +126,19 @@ SQUARED = hg.Plant(lambda x, u: x + 0.1 * x**2, 0.01, [0.5], 1.0)
 
 @pytest.mark.parametrize("build", FILTERS)
 def test_a_linearized_one_is_the_extended_filter(build):
-    one = hg.markov_fading([hg.hop(0.8, 0.1)], [[1.0]])
-    found, _ = stepped(build(SQUARED, SENSOR, one, hg.filters.Linearization()), DATA)
+    item = hg.markov_fading([hg.hop(0.8, 0.1)], [[1.0]])
+    result, _ = stepped(build(SQUARED, SENSOR, item, hg.filters.Linearization()), DATA)
     expected, _ = stepped(hg.extended_filter(SQUARED, SENSOR, hg.hop(0.8, 0.1)), DATA)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-12)
 
 
 @pytest.mark.parametrize("build", FILTERS)
 def test_equal_maps_need_no_chain(build):
     same = hg.markov_fading([hg.hop(0.8, 0.1), hg.hop(0.8, 0.1)], CHAIN)
-    found, total = stepped(build(PLANT, SENSOR, same), DATA)
+    result, total = stepped(build(PLANT, SENSOR, same), DATA)
     expected, known = stepped(hg.linear_filter(PLANT, SENSOR, hg.hop(0.8, 0.1)), DATA)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-12)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-12)
     np.testing.assert_allclose(total, known, rtol=1e-12)
 
 
@@ -147,10 +147,10 @@ def test_equal_maps_need_no_chain(build):
 def test_permuting_modes_changes_nothing(build):
     data = np.random.default_rng(0).normal(size=(5, 2))
     data[2, 0] = np.nan
-    one, first = stepped(build(WIDE, BOTH, wide_link()), data)
+    item, first = stepped(build(WIDE, BOTH, wide_link()), data)
     other, second = stepped(build(WIDE, BOTH, wide_link((2, 0, 1))), data)
-    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-11)
-    np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-11, atol=1e-14)
+    np.testing.assert_allclose(item.mean, other.mean, rtol=1e-11)
+    np.testing.assert_allclose(item.covariance, other.covariance, rtol=1e-11, atol=1e-14)
     np.testing.assert_allclose(first, second, rtol=1e-11)
 
 
@@ -170,9 +170,9 @@ def test_a_drifting_gain_has_modes_of_its_own():
     three, five = (stepped(hg.filters.imm_filter(PLANT, SENSOR, drift, nodes=n), DATA)[0] for n in (3, 5))
     assert three.mean[0] != five.mean[0]
     still = hg.autoregressive_fading(1.0, 0.0, 0.95, 0.05)
-    found, _ = stepped(hg.filters.imm_filter(PLANT, SENSOR, still), DATA)
+    result, _ = stepped(hg.filters.imm_filter(PLANT, SENSOR, still), DATA)
     expected, _ = stepped(hg.linear_filter(PLANT, SENSOR, hg.hop(1.0, 0.05)), DATA)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-12)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +210,9 @@ def test_losses_say_something_of_the_mode(build, data):
     arrival = (0.3, 0.9)
     link = (steady_law(), [([0.2, 1.0], np.array([[0.05]]), np.array(CHAIN))] * len(data))
     mean, spread, _ = exact(PLANT, SENSOR, link, data, arrival)
-    found, _ = stepped(build(PLANT, SENSOR, losing(arrival)), data)
-    np.testing.assert_allclose(found.mean, mean, rtol=1e-12, atol=1e-15)
-    np.testing.assert_allclose(found.covariance, spread, rtol=1e-12)
+    result, _ = stepped(build(PLANT, SENSOR, losing(arrival)), data)
+    np.testing.assert_allclose(result.mean, mean, rtol=1e-12, atol=1e-15)
+    np.testing.assert_allclose(result.covariance, spread, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -227,9 +227,9 @@ def test_a_mode_that_losses_reveal_is_known():
     data = [0.3, np.nan, np.nan, 0.8, -0.2]
     expected, total = stepped(hg.linear_filter(PLANT, SENSOR, hg.hop(0.8, 0.1)), data)
     for build in ALL:
-        found, likelihood = stepped(build(PLANT, SENSOR, links), data)
-        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
-        np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+        result, likelihood = stepped(build(PLANT, SENSOR, links), data)
+        np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-10)
+        np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-10)
         np.testing.assert_allclose(likelihood, total, rtol=1e-10)
 
 
@@ -240,10 +240,10 @@ def test_what_varies_in_time_is_followed(build):
     plants = hg.model.over_time([hg.LinearPlant([[a]], 0.1, [1.0], 1.0) for a in (0.9, 0.5, -0.7)])
     sensors = hg.model.over_time([hg.LinearSensor([[c]], 0.1) for c in (1.0, 2.0, 0.5)])
     same = hg.markov_fading([hg.hop(0.8, 0.1), hg.hop(0.8, 0.1)], CHAIN)
-    found, _ = stepped(build(plants, sensors, same), DATA[:3])
+    result, _ = stepped(build(plants, sensors, same), DATA[:3])
     expected, _ = stepped(hg.linear_filter(plants, sensors, hg.hop(0.8, 0.1)), DATA[:3])
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-10)
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-10)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-10)
+    np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-10)
 
 
 @pytest.mark.slow
@@ -267,10 +267,10 @@ def test_a_count_of_particles_is_positive():
 
 
 def test_particles_depend_on_seed_and_data_alone():
-    item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY)
+    item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE)
     once, again = stepped(item, DATA)[0], stepped(item, DATA)[0]
     np.testing.assert_array_equal(once.mean, again.mean)
-    other = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=MANY, seed=1), DATA)[0]
+    other = stepped(hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=LARGE, seed=1), DATA)[0]
     assert other.mean[0] != once.mean[0]
 
 
@@ -278,11 +278,11 @@ def test_particles_depend_on_seed_and_data_alone():
 def test_particles_are_the_same_in_a_simulation_a_recording_and_a_stream(record):
     item = hg.filters.particle_filter(PLANT, SENSOR, LINK, particles=20)
     network = hg.Network(PLANT, {"node": hg.Node(SENSOR, LINK, {"particles": item})})
-    heard = record.measurements["node"][:3, :12]
+    received = record.measurements["node"][:3, :12]
     expected = record.estimates["node"]["particles"].mean[:3, :12]
     for run in range(3):
-        again = hg.run(network, {"node": heard[run]}).estimates["node"]["particles"].mean
+        again = hg.run(network, {"node": received[run]}).estimates["node"]["particles"].mean
         np.testing.assert_allclose(again, expected[run], rtol=1e-9)
     stream = hg.Stream(item)
-    for z, mean in zip(heard[0], expected[0], strict=True):
+    for z, mean in zip(received[0], expected[0], strict=True):
         np.testing.assert_allclose(stream.push(z).mean, mean, rtol=1e-9)

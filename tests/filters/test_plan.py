@@ -39,10 +39,10 @@ def test_its_steps_are_the_originals(name):
     a, b = original.init(), planned.init()
     for k, (z, u) in enumerate(zip(data, inputs, strict=True)):
         predicted = [item.estimate(item.predict(s, u, k)) for item, s in ((original, a), (planned, b))]
-        heard = [item.correct(item.predict(s, u, k), z, k)[1] for item, s in ((original, a), (planned, b))]
+        received = [item.correct(item.predict(s, u, k), z, k)[1] for item, s in ((original, a), (planned, b))]
         (a, left), (b, right) = original.step(a, z, u, k), planned.step(b, z, u, k)
-        for expected, found in ((left, right), predicted, heard, (left, planned.estimate(b))):
-            for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(found), strict=True):
+        for expected, single in ((left, right), predicted, received, (left, planned.estimate(b))):
+            for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(single), strict=True):
                 np.testing.assert_allclose(y, x, rtol=0, atol=1e-12 * max(1.0, np.abs(x).max()))
 
 
@@ -72,17 +72,17 @@ def test_it_is_made_inside_a_compiled_function_for_nodes_side_by_side():
 
     @eqx.filter_jit
     def first(arrays):
-        def one(part):
+        def single(part):
             planned = eqx.combine(part, eqx.filter(items[0], eqx.is_array, inverse=True)).planned(inputs)
             assert isinstance(planned, PlannedFilter)
             return planned.step(planned.init(), z, inputs[0], 0)[1].mean
 
-        return jax.vmap(one)(arrays)
+        return jax.vmap(single)(arrays)
 
     with jax.enable_x64(True):
-        found = np.asarray(first(stacked))
+        values = np.asarray(first(stacked))
     expected = [item.step(item.init(), z, inputs[0], 0)[1].mean for item in items]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-13)
 
 
 def test_missing_data_is_seen():

@@ -16,23 +16,23 @@ STEPS = 4
 def exact(transition, noise, measured, start):
     """Diagonals of P_1 ... P_STEPS in fractions, for one measured component with this variance."""
     a, q, p = ([[Fraction(x) for x in row] for row in m] for m in (transition, noise, start))
-    r, found = Fraction(measured), []
+    r, results = Fraction(measured), []
     for _ in range(STEPS):
         moved = [[sum(a[i][k] * p[k][j] for k in range(2)) for j in range(2)] for i in range(2)]
         p = [[sum(moved[i][k] * a[j][k] for k in range(2)) + q[i][j] for j in range(2)] for i in range(2)]
         total = p[0][0] + r
         p = [[p[i][j] - p[i][0] * p[0][j] / total for j in range(2)] for i in range(2)]
-        found.append([float(p[0][0]), float(p[1][1])])
-    return np.array(found)
+        results.append([float(p[0][0]), float(p[1][1])])
+    return np.array(results)
 
 
 def claimed(item):
     """The same of a filter."""
-    state, found = item.init(), []
+    state, results = item.init(), []
     for k in range(STEPS):
         state, _ = item.correct(item.predict(state, (), k), [0.0], k)
-        found.append(np.diag(np.asarray(item.estimate(state).covariance)))
-    return np.array(found)
+        results.append(np.diag(np.asarray(item.estimate(state).covariance)))
+    return np.array(results)
 
 
 @pytest.mark.parametrize(("wide", "precise"), [(1e4, 1e-9), (1e8, 1e-12), (1e6, 1e-3), (1e2, 1.0)])
@@ -76,8 +76,8 @@ def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
     z = np.array([[1.0], [2.0]])
     with jax.enable_x64(True):
         together = jax.jit(jax.grad(lambda z: jax.vmap(moved)(z).sum()))(z)
-        each = jax.jit(jax.vmap(jax.grad(moved)))(z)
-    np.testing.assert_allclose(together, each, rtol=1e-14)
+        items = jax.jit(jax.vmap(jax.grad(moved)))(z)
+    np.testing.assert_allclose(together, items, rtol=1e-14)
 
 
 WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
@@ -95,12 +95,12 @@ def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
         for precise in PRECISE:
             expected = exact(A, noise, precise, [[wide, 0.0], [0.0, wide]])
             item = hg.linear_filter(plant, hg.LinearSensor(C, precise), hg.perfect(1))
-            found = claimed(item)
+            result = claimed(item)
             if precise + 1e-9 >= 1e-11 * wide:
-                np.testing.assert_allclose(found, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
-            told = ~np.isnan(found)
-            lost += np.sum(~told)
-            np.testing.assert_allclose(found[told], expected[told], rtol=0.05, err_msg=f"{wide} {precise}")
+                np.testing.assert_allclose(result, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
+            known = ~np.isnan(result)
+            lost += np.sum(~known)
+            np.testing.assert_allclose(result[known], expected[known], rtol=0.05, err_msg=f"{wide} {precise}")
     assert 0 < lost < WIDE.size * PRECISE.size * STEPS
 
 
@@ -132,9 +132,9 @@ def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
     v, h = random.normal(size=3), random.normal(size=(outputs, 3))
     plant = hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), np.outer(v, v))
     item = hg.kalman_filter(plant, hg.LinearSensor(h, np.zeros((outputs, outputs))))
-    found = item.estimate(item.correct(item.init(), np.arange(1.0, 1 + outputs))[0])
-    np.testing.assert_allclose(found.mean, v / (h[0] @ v), rtol=1e-12)
-    assert 0 <= np.diagonal(found.covariance).max() < 1e-28
+    estimate = item.estimate(item.correct(item.init(), np.arange(1.0, 1 + outputs))[0])
+    np.testing.assert_allclose(estimate.mean, v / (h[0] @ v), rtol=1e-12)
+    assert 0 <= np.diagonal(estimate.covariance).max() < 1e-28
 
 
 def test_more_precise_outputs_than_are_unrolled():
@@ -142,10 +142,10 @@ def test_more_precise_outputs_than_are_unrolled():
     h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
     item = hg.kalman_filter(hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), 1.0), hg.LinearSensor(h, d * np.eye(9)))
     z = np.arange(9.0)
-    found = item.estimate(item.correct(item.init(), z)[0])
+    estimate = item.estimate(item.correct(item.init(), z)[0])
     left = d * np.linalg.inv(d * np.eye(3) + h.T @ h)
-    np.testing.assert_allclose(found.covariance, left, rtol=1e-9, atol=1e-12 * left.max())
-    np.testing.assert_allclose(found.mean, left @ h.T @ z / d, rtol=1e-9)
+    np.testing.assert_allclose(estimate.covariance, left, rtol=1e-9, atol=1e-12 * left.max())
+    np.testing.assert_allclose(estimate.mean, left @ h.T @ z / d, rtol=1e-9)
 
 
 def test_a_noise_free_output_has_a_gradient():
@@ -166,13 +166,13 @@ def test_a_noise_free_output_has_a_gradient():
 def test_a_premise_about_the_mean_is_not_used_where_the_law_is_known(channel, left):
     """Then nothing hangs on it: the same numbers, and of a noise-free reading no rounding of the prior either."""
     plant, sensor = hg.LinearPlant([[-1.2]], 1e-5, [-7e-4], 5e-6), hg.LinearSensor([[-6.5e-3]], 0.0)
-    found = []
+    results = []
     for update in (None, hg.filters.ZeroMean()):
         item = hg.cubature_filter(plant, sensor, channel, update)
-        found.append(item.estimate(item.correct(item.predict(item.init()), [4e-6])[0]))
-    np.testing.assert_array_equal(found[0].mean, found[1].mean)
-    np.testing.assert_array_equal(found[0].covariance, found[1].covariance)
-    assert 0 <= found[1].covariance[0, 0] < left * (1.2**2 * 5e-6 + 1e-5)  # of the prediction
+        results.append(item.estimate(item.correct(item.predict(item.init()), [4e-6])[0]))
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
+    assert 0 <= results[1].covariance[0, 0] < left * (1.2**2 * 5e-6 + 1e-5)  # of the prediction
 
 
 @pytest.mark.parametrize("noise", [[[1.0, 1.0], [1.0, 1.0]], [[0.1, 0.3], [0.3, 0.9]]])
@@ -184,8 +184,8 @@ def test_a_combination_free_of_noise_is_known(noise):
     plant, sensor = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0), hg.LinearSensor([[1.0], [2.0]], noise)
     items = {"linear": hg.linear_filter(plant, sensor, hg.perfect(2)), "kalman": hg.kalman_filter(plant, sensor)}
     network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(2), items)})
-    found = hg.monte_carlo(network, horizon=15, runs=20, key=1, smooth=hg.smoothing.FixedInterval())
-    for record in (found, found.smoothed):
+    outcome = hg.monte_carlo(network, horizon=15, runs=20, key=1, smooth=hg.smoothing.FixedInterval())
+    for record in (outcome, outcome.smoothed):
         assert record.failures() == []
         for name, estimate in record.estimates["a"].items():
             assert estimate.claim == "exact"

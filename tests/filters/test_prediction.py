@@ -18,15 +18,15 @@ def filtered():
 def test_it_is_the_step_ahead_of_the_filtered_estimate():
     base, z = filtered(), [[0.7], [np.nan], [-0.2], [1.1]]
     predicting = prediction_of(base)
-    state, own = predicting.init(), base.init()
+    state, local = predicting.init(), base.init()
     for k, value in enumerate(z):
-        expected = PLANT.matrix @ own.mean, PLANT.matrix @ own.covariance @ PLANT.matrix.T + 0.1 * np.eye(2)
+        expected = PLANT.matrix @ local.mean, PLANT.matrix @ local.covariance @ PLANT.matrix.T + 0.1 * np.eye(2)
         state, ahead = predicting.step(state, value, (), k)
-        own, _ = base.step(own, value, (), k)
+        local, _ = base.step(local, value, (), k)
         np.testing.assert_allclose(ahead.mean, expected[0], rtol=0, atol=1e-13)  # rounding of a few operations
         np.testing.assert_allclose(ahead.covariance, expected[1], rtol=0, atol=1e-13)
-        np.testing.assert_array_equal(state.belief.mean, own.mean)
-        np.testing.assert_array_equal(state.belief.covariance, own.covariance)
+        np.testing.assert_array_equal(state.belief.mean, local.mean)
+        np.testing.assert_array_equal(state.belief.covariance, local.covariance)
 
 
 def test_it_does_not_see_the_present_measurement():

@@ -56,9 +56,9 @@ def test_a_missing_component_is_a_channel_that_is_off(missing):
     s, data = model(two_sensors(), HORIZON), measurements(2)
     holes = data.copy()
     holes[:, missing] = np.nan
-    found = run(hg.polynomial_filter(*s, HORIZON), holes)
+    record = run(hg.polynomial_filter(*s, HORIZON), holes)
     expected = run(hg.polynomial_filter(*single(s, 1 - missing), HORIZON), data[:, [1 - missing]])
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(record, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-11 * np.abs(b).max())
 
 
@@ -144,8 +144,8 @@ def test_claims_hold_in_the_drivers_monte_carlo():
     filters = {f"degree {d}": hg.filters.scheduled_polynomial_filter(*s, horizon, d) for d in (2, 3)}
     filters["memory"] = hg.filters.memory_filter(*s, horizon)
     network = hg.Network(s.plant, {"node": hg.Node(s.sensor, s.channel, filters)})
-    found = hg.monte_carlo(network, horizon, 1024, 1, keep=hg.Statistics())["node"]
-    for name, statistics in found.items():
+    result = hg.monte_carlo(network, horizon, 1024, 1, keep=hg.Statistics())["node"]
+    for name, statistics in result.items():
         assert statistics.worst_direction().z < 4.0, name
         _, low, high = statistics.nees_per_dimension(0.999)
         assert low < 1 < high, name

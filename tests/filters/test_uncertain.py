@@ -26,11 +26,11 @@ def bound(channel, steps=STEPS):
 )
 def test_how_loose_it_is(radius, known, worst):
     """Not above the known bound, and not below the exact filter of the worst constant chain."""
-    found = bound(rough(radius))[1][-1]
+    result = bound(rough(radius))[1][-1]
     corners = [BURSTS + radius * np.array([[a, -a], [b, -b]]) for a in (-1, 1) for b in (-1, 1)]
     exact = max(variances(PLANT, SENSOR, bursts(c), STEPS)[-1, 0] for c in corners)
     assert exact == pytest.approx(worst, abs=0.0006)
-    assert exact < found < known + 0.0005
+    assert exact < result < known + 0.0005
 
 
 def test_a_radius_of_zero_is_the_exact_filter():
@@ -81,7 +81,7 @@ def test_two_rough_chains_together():
 
 
 def test_claims_of_other_filters():
-    assert hg.filters.told_filter(PLANT, SENSOR, rough(0.01), np.eye(2)).claim == "nominal"
+    assert hg.filters.side_information_filter(PLANT, SENSOR, rough(0.01), np.eye(2)).claim == "nominal"
     assert hg.filters.mode_late_filter(PLANT, SENSOR, rough(0.01)).claim == "nominal"
     assert hg.filters.mode_known_filter(PLANT, SENSOR, rough(0.01)).claim == "exact"
     assert hg.model.memory_matters(rough(0.01, [[0.4, 0.6], [0.4, 0.6]]))

@@ -63,10 +63,10 @@ def test_its_gradient_is_that_of_differences(bursts):
 
 
 def test_it_finds_the_modes_it_was_drawn_from(learned):
-    found = learned.laws["hidden"].shares()
+    result = learned.laws["hidden"].shares()
     for name, truth in {"good_loss": 0.05, "bad_loss": 0.7, "fail": 0.03, "recover": 0.15}.items():
-        assert found[name].low < truth < found[name].high
-        assert found[name].high - found[name].low < 0.4 * np.sqrt(truth)  # 4,000 packets tell something
+        assert result[name].low < truth < result[name].high
+        assert result[name].high - result[name].low < 0.4 * np.sqrt(truth)  # 4,000 packets tell something
 
 
 def test_the_profile_falls_by_half_the_chi_square_point_at_the_ends_of_an_interval(learned, bursts):
@@ -74,8 +74,8 @@ def test_the_profile_falls_by_half_the_chi_square_point_at_the_ends_of_an_interv
     runs, shares = Runs.of([bursts]), learned.laws["hidden"].shares()
     top = runs.likelihood(logit([s.estimate for s in shares.values()]))
     assert np.max(np.abs(top[1])) < 1e-2
-    for i, one in enumerate(shares.values()):
-        for end in (one.low, one.high):
+    for i, single in enumerate(shares.values()):
+        for end in (single.low, single.high):
             x = logit([s.estimate for s in shares.values()])
             x[i] = logit(end)
             for _ in range(30):  # Newton in the three others, by differences of the gradient
@@ -120,28 +120,28 @@ def test_the_running_rate_is_a_recursion(learned, bursts):
 
 
 def test_tests_of_memory_are_the_known_ones(bursts):
-    found = hg.learning.loss_memory(bursts)
+    result = hg.learning.loss_memory(bursts)
     table = hg.learning.MarkovLosses.fit(bursts).counts
     expected = chi2_contingency(table, correction=False, lambda_="log-likelihood")
-    assert found.likelihood_ratio == pytest.approx(expected.statistic, rel=1e-10)
-    assert found.found and found.runs_z < -5
+    assert result.likelihood_ratio == pytest.approx(expected.statistic, rel=1e-10)
+    assert result.result and result.runs_z < -5
 
 
 def test_tests_of_memory_find_none_where_there_is_none():
     """2,000 recordings of 300 independent losses: a test at 5 % rejects 5 %, to three standard errors."""
     drawn = (np.random.default_rng(1).random((2000, 300)) < 0.3).astype(float)
-    found = [hg.learning.loss_memory(one) for one in drawn]
+    results = [hg.learning.loss_memory(item) for item in drawn]
     for p in ("likelihood_p", "runs_p"):
-        assert np.mean([getattr(one, p) < 0.05 for one in found]) == pytest.approx(0.05, abs=0.0146)
+        assert np.mean([getattr(item, p) < 0.05 for item in results]) == pytest.approx(0.05, abs=0.0146)
 
 
 def test_nothing_that_varies_is_no_evidence():
-    found = hg.learning.loss_memory(np.zeros(20))
-    assert (found.likelihood_p, found.runs_p) == (1.0, 1.0)
+    result = hg.learning.loss_memory(np.zeros(20))
+    assert (result.likelihood_p, result.runs_p) == (1.0, 1.0)
 
 
 def test_the_law_that_foretells_best_is_chosen(learned):
-    said = {name: one.gain for name, one in learned.held_out.items()}
+    said = {name: item.gain for name, item in learned.held_out.items()}
     assert learned.best == "hidden"
     assert said["independent"] == 0 < said["markov"] < said["markov_4"] < said["hidden"]
     assert learned.held_out["hidden"].gain > 4 * learned.held_out["hidden"].gain_error
@@ -149,10 +149,10 @@ def test_the_law_that_foretells_best_is_chosen(learned):
 
 
 def test_independent_losses_are_told_from_bursts():
-    found = hg.learning.learn_losses((np.random.default_rng(2).random(600) < 0.2).astype(float))
-    assert not found.memory.found
-    assert abs(found.held_out["hidden"].gain) < 3 * found.held_out["hidden"].gain_error + 1e-3
-    assert found.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing
+    result = hg.learning.learn_losses((np.random.default_rng(2).random(600) < 0.2).astype(float))
+    assert not result.memory.result
+    assert abs(result.held_out["hidden"].gain) < 3 * result.held_out["hidden"].gain_error + 1e-3
+    assert result.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing
 
 
 @pytest.mark.parametrize("name", ["independent", "markov", "markov_4", "hidden"])

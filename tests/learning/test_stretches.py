@@ -9,8 +9,8 @@ def listed(fates):
 
 
 def test_gaps_are_losses_copies_are_dropped_and_restarts_begin_anew():
-    found = hg.learning.fates_of_sequence([4, 5, 5, 8, 300, 302, 301 - 300, 2])
-    assert listed(found) == [[0, 0, 1, 1, 0], [0, 1, 0], [0, 0]]
+    result = hg.learning.fates_of_sequence([4, 5, 5, 8, 300, 302, 301 - 300, 2])
+    assert listed(result) == [[0, 0, 1, 1, 0], [0, 1, 0], [0, 0]]
 
 
 def test_a_leap_of_just_under_the_limit_is_a_long_outage():
@@ -26,24 +26,24 @@ def test_times_of_sending_put_overtaken_packets_in_order():
 
 
 def test_each_sender_counts_for_itself():
-    found = hg.learning.fates_by_node(["a", "b", "a", "b"], [1, 10, 3, 11])
-    assert {name: listed(part) for name, part in found.items()} == {"a": [[0, 1, 0]], "b": [[0, 0]]}
+    result = hg.learning.fates_by_node(["a", "b", "a", "b"], [1, 10, 3, 11])
+    assert {name: listed(part) for name, part in result.items()} == {"a": [[0, 1, 0]], "b": [[0, 0]]}
 
 
 def test_a_hop_is_judged_by_what_reached_it():
-    found = hg.learning.fates_by_hop({"up": [1, 1, 0, 1], "down": [1, 0, 0, 1]})
-    assert listed(found["up"]) == [[0, 0, 1, 0]]
-    np.testing.assert_equal(found["down"][0], [0, 1, np.nan, 0])
+    result = hg.learning.fates_by_hop({"up": [1, 1, 0, 1], "down": [1, 0, 0, 1]})
+    assert listed(result["up"]) == [[0, 0, 1, 0]]
+    np.testing.assert_equal(result["down"][0], [0, 1, np.nan, 0])
     with pytest.raises(ValueError, match="arrivals behind 'down': expected packets that passed the hop before"):
         hg.learning.fates_by_hop({"up": [0, 1], "down": [1, 1]})
 
 
 def test_components_that_come_together_are_one_packet():
     nan = np.nan
-    found = hg.learning.fates_of_measurements({
+    result = hg.learning.fates_of_measurements({
         "near": [[1.0, 2.0], [nan, nan]], "far": [[1.0, nan, nan], [2.0, 3.0, nan]], "one": [nan, 1.0],
     })  # fmt: skip
-    assert {name: listed(part) for name, part in found.items()} == {
+    assert {name: listed(part) for name, part in result.items()} == {
         "near": [[0, 1]], "far.0": [[0, 0]], "far.1": [[1, 0]], "one": [[1, 0]],
     }  # fmt: skip
 

@@ -29,17 +29,17 @@ def enumerated(beta):
 
 @given(st.tuples(probability, probability, probability))
 def test_moments_equal_the_enumeration_of_all_dropouts(beta):
-    found = disturbed_gain(channel(beta))
+    result = disturbed_gain(channel(beta))
     mean, second = enumerated(beta)
-    np.testing.assert_allclose(found.mean, mean, atol=1e-15)
-    np.testing.assert_allclose(found.second, second, atol=1e-15)
+    np.testing.assert_allclose(result.mean, mean, atol=1e-15)
+    np.testing.assert_allclose(result.second, second, atol=1e-15)
 
 
 @given(st.tuples(probability, probability, probability))
 def test_spreads_reproduce_the_covariance(beta):
-    found = disturbed_gain(channel(beta))
-    spreads = found.spreads()
-    np.testing.assert_allclose(np.einsum("jab,jcd->abcd", spreads, spreads), found.covariance, atol=1e-12)
+    result = disturbed_gain(channel(beta))
+    spreads = result.spreads()
+    np.testing.assert_allclose(np.einsum("jab,jcd->abcd", spreads, spreads), result.covariance, atol=1e-12)
     assert len(spreads) <= 3
 
 
@@ -52,8 +52,8 @@ def test_signal_columns_agree_with_the_algebra():
         [hg.hop(hg.Rayleigh(1.0), np.diag([0.2, 0.1])), hg.hop(hg.random_affine.bernoulli(0.4), np.diag([0.3, 0.2]))]
     )
     for item in (relay, hg.dropout(relay, 0.7), hg.with_direct_link(relay, hg.hop(1.0, np.diag([0.1, 0.4])))):
-        found = disturbed_gain(item)
-        np.testing.assert_allclose(found.mean[:, : found.inputs], item.moments(1).mean[:-1, :-1], atol=1e-14)
+        result = disturbed_gain(item)
+        np.testing.assert_allclose(result.mean[:, : result.inputs], item.moments(1).mean[:-1, :-1], atol=1e-14)
 
 
 def test_noise_power_agrees_with_the_algebra_and_with_samples():
@@ -61,8 +61,8 @@ def test_noise_power_agrees_with_the_algebra_and_with_samples():
     item = hg.dropout(
         hg.amplify_and_forward([hg.hop(hg.Rayleigh(1.0), 0.2), hg.hop(hg.random_affine.bernoulli(0.4), 0.3)]), 0.7
     )
-    found = disturbed_gain(item)
-    power = np.einsum("abib->ai", found.second[:, found.inputs :, :, found.inputs :])[0, 0]
+    result = disturbed_gain(item)
+    power = np.einsum("abib->ai", result.second[:, result.inputs :, :, result.inputs :])[0, 0]
     np.testing.assert_allclose(power, item.moments(2).matrix[0, -1], rtol=1e-13)
     with jax.enable_x64(True):
         drawn = jax.jit(jax.vmap(item.sample))(jax.random.split(jax.random.key(0), 40_000))

@@ -33,26 +33,26 @@ def test_worst_cases_of_a_relay_are_those_of_brute_force():
     shift = max((g.moment(1) * x.moment(1) - mu) ** 2 for g, x in corners)
     noise = max(c**2 * x.moment(2) * 1e-3 + 1e-3 for _, x in corners)
     power = max(g.moment(2) * x.moment(2) for g, x in corners)
-    found = hg.random_affine.second_order(relay())
+    moments = hg.random_affine.second_order(relay())
     y = np.zeros((3, 3))
     y[0, 0] = 1.0
-    assert found.mean_gain[0, 0] == pytest.approx(c * mu, rel=1e-14)
-    assert evaluate(found.spread, y)[0, 0] == pytest.approx(c**2 * spread, rel=1e-12)
-    assert evaluate(found.shift, y)[0, 0] == pytest.approx(c**2 * shift, rel=1e-12)
-    assert evaluate(found.power, y)[0, 0] == pytest.approx(c**2 * power, rel=1e-12)
+    assert moments.mean_gain[0, 0] == pytest.approx(c * mu, rel=1e-14)
+    assert evaluate(moments.spread, y)[0, 0] == pytest.approx(c**2 * spread, rel=1e-12)
+    assert evaluate(moments.shift, y)[0, 0] == pytest.approx(c**2 * shift, rel=1e-12)
+    assert evaluate(moments.power, y)[0, 0] == pytest.approx(c**2 * power, rel=1e-12)
     y[0, 0], y[2, 2] = 0.0, 1.0
-    assert evaluate(found.spread, y)[0, 0] == pytest.approx(noise, rel=1e-12)
-    assert not np.any(found.spread.radius)  # one scalar gain: exact, no interval arithmetic
+    assert evaluate(moments.spread, y)[0, 0] == pytest.approx(noise, rel=1e-12)
+    assert not np.any(moments.spread.radius)  # one scalar gain: exact, no interval arithmetic
 
 
 def test_a_known_channel_has_its_own_second_moments():
-    found = hg.random_affine.second_order(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)))
-    assert not found.uncertain and not np.any(found.shift.center)
+    moments = hg.random_affine.second_order(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)))
+    assert not moments.uncertain and not np.any(moments.shift.center)
     y = np.array([0.5, -1.0])
     w = np.append(y, 1.0)
     second = conditional_moments(relay(hg.Rayleigh(1.0), hg.Nakagami(2.0)), y, 2)
-    mean = found.mean_gain @ y + found.offset
-    spread = evaluate(found.spread, np.outer(w, w))
+    mean = moments.mean_gain @ y + moments.offset
+    spread = evaluate(moments.spread, np.outer(w, w))
     np.testing.assert_allclose(
         spread + np.outer(mean, mean), [[second[0], second[1]], [second[1], second[3]]], rtol=1e-12
     )
@@ -77,29 +77,31 @@ def test_the_maps_dominate_every_possible_law(seed, components, direct):
 
 def check_that_maps_dominate(channel, rng):
     components = channel.inputs
-    found = hg.random_affine.second_order(channel)
+    moments = hg.random_affine.second_order(channel)
     a = rng.normal(size=(components + 1, components + 1))
     w = a @ a.T
 
     def corner(part):
         """One of its corner laws: that of every hop by itself."""
         if isinstance(part, hg.random_affine.Series | hg.random_affine.Stack):
-            return type(part)([corner(one) for one in part.maps])
+            return type(part)([corner(map_) for map_ in part.maps])
         options = part.extremes()
         return options[rng.integers(len(options))]
 
     for _ in range(4):
         extreme = corner(channel)
         assert extreme.corner_count() == 1 < channel.corner_count()
-        own = hg.random_affine.second_order(extreme)
-        shift = np.concatenate([own.mean_gain - found.mean_gain, (own.offset - found.offset)[:, None]], axis=1)
+        separate = hg.random_affine.second_order(extreme)
+        shift = np.concatenate(
+            [separate.mean_gain - moments.mean_gain, (separate.offset - moments.offset)[:, None]], axis=1
+        )
         moved = shift @ w @ shift.T
-        cross = np.concatenate([own.mean_gain, own.offset[:, None]], axis=1)
+        cross = np.concatenate([separate.mean_gain, separate.offset[:, None]], axis=1)
         assert np.isfinite(cross).all()
         for bound, actual in (
-            (evaluate(found.spread, w), evaluate(own.spread, w) + moved),
-            (evaluate(found.shift, w), moved),
-            (evaluate(found.power, w), evaluate(own.power, w)),
+            (evaluate(moments.spread, w), evaluate(separate.spread, w) + moved),
+            (evaluate(moments.shift, w), moved),
+            (evaluate(moments.power, w), evaluate(separate.power, w)),
         ):
             gap = np.linalg.eigvalsh(bound - actual)[0]
             assert gap >= -1e-10 * np.abs(bound).max()  # rounding
@@ -113,10 +115,10 @@ def test_interval_arithmetic_takes_over_beyond_the_corner_limit_and_stays_sound(
     low, high = moment_interval(chain, 2)
     rng = np.random.default_rng(0)
     for _ in range(50):
-        one = hg.random_affine.Series(
+        item = hg.random_affine.Series(
             [options[rng.integers(len(options))] for options in (m.extremes() for m in chain.maps)]
         )
-        inside = one.moments(2).matrix
+        inside = item.moments(2).matrix
         assert np.all(inside >= low - 1e-12) and np.all(inside <= high + 1e-12)
 
     assert low[0, 0] <= chain.moments(2).matrix[0, 0] <= high[0, 0]
@@ -134,14 +136,14 @@ def corner_cases():
     """Every kind of map that says what its corners are, some in the place of a part of another."""
     uncertain, known = hg.hop(GAMMA, 0.3), hg.hop(hg.Rayleigh(1.0), 0.2)
     lost = hg.dropout(uncertain, 0.7, 0.1)
-    many = hg.parallel([lost, hg.amplify_and_forward([uncertain, hg.hop(XI, 0.1)])])
-    series = hg.random_affine.Series([many, hg.hop(GAMMA, np.diag([0.1, 0.2]))])
+    count = hg.parallel([lost, hg.amplify_and_forward([uncertain, hg.hop(XI, 0.1)])])
+    series = hg.random_affine.Series([count, hg.hop(GAMMA, np.diag([0.1, 0.2]))])
     return [
         uncertain,
         known,
         hg.hop(hg.random_affine.GivenMoments([1.0, 2.0]), 0.1),
         lost,
-        many,
+        count,
         series,
         hg.erasure(known, 0.5),
     ]
@@ -154,8 +156,8 @@ def test_moments_at_corners_are_those_of_the_extremes(channel):
         assert channel.corner_count() == len(channel.extremes())
         return
     for order in (1, 2):
-        expected = [one.moments(order).matrix for one in channel.extremes()]
-        found = channel.corner_moments(order)
-        assert len(found) == channel.corner_count()
-        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-15)
+        expected = [extreme.moments(order).matrix for extreme in channel.extremes()]
+        result = channel.corner_moments(order)
+        assert len(result) == channel.corner_count()
+        np.testing.assert_allclose(result, expected, rtol=1e-13, atol=1e-15)
         np.testing.assert_allclose(channel.moments(2).lower(order), channel.moments(order).matrix, rtol=1e-13)

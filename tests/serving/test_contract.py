@@ -16,7 +16,7 @@ class Memory:
     def __init__(self) -> None:
         self.messages: list[bytes] = []
         self.outputs: list[bytes] = []
-        self.settled = 0
+        self.converged = 0
 
     def transport(self) -> "Reader":
         return Reader(self)
@@ -24,34 +24,34 @@ class Memory:
     async def send(self, bodies: Sequence[bytes]) -> None:
         self.messages += bodies
 
-    async def told(self) -> list[bytes]:
+    async def known(self) -> list[bytes]:
         return list(self.outputs)
 
     def batch(self, read: int) -> list[bytes]:
         return self.messages[read : read + 7]
 
     def acknowledged(self, upto: int) -> None:
-        self.settled = upto
+        self.converged = upto
 
     async def publish(self, outputs: Sequence[Output]) -> None:
-        self.outputs += [each.body for each in outputs]
+        self.outputs += [output.body for output in outputs]
 
 
 class Reader:
     """The service's side."""
 
     def __init__(self, broker: Memory) -> None:
-        self.broker, self.read = broker, broker.settled
+        self.broker, self.read = broker, broker.converged
 
     async def receive(self) -> Batch | None:
-        while not (found := self.broker.batch(self.read)):
+        while not (result := self.broker.batch(self.read)):
             await asyncio.sleep(0.01)
-        self.read = upto = self.read + len(found)
+        self.read = upto = self.read + len(result)
 
         async def acknowledge() -> None:
             self.broker.acknowledged(upto)
 
-        return Batch(found, acknowledge)
+        return Batch(result, acknowledge)
 
     async def publish(self, outputs: Sequence[Output]) -> None:
         await self.broker.publish(outputs)
@@ -63,9 +63,9 @@ class Forgets(Memory):
     """What was given is gone, whether acknowledged or not."""
 
     def batch(self, read: int) -> list[bytes]:
-        found = super().batch(read)
-        self.settled = read + len(found)
-        return found
+        result = super().batch(read)
+        self.converged = read + len(result)
+        return result
 
 
 class NeverSettles(Memory):
@@ -107,7 +107,7 @@ class TellsBackwards(Memory):
     """The last goes out first."""
 
     async def publish(self, outputs: Sequence[Output]) -> None:
-        self.outputs += [each.body for each in outputs][::-1]
+        self.outputs += [output.body for output in outputs][::-1]
 
 
 class Ends(Memory):
@@ -140,7 +140,7 @@ class Late(Memory):
     """What comes again comes after what is new."""
 
     def transport(self) -> Reader:
-        self.messages[self.settled :] = self.messages[self.settled :][::-1]
+        self.messages[self.converged :] = self.messages[self.converged :][::-1]
         return super().transport()
 
 

@@ -10,9 +10,9 @@ from time import sleep
 import pytest
 
 from heliograph.serving import loop
+from heliograph.serving.in_memory_store import InMemoryStore
 from heliograph.serving.loop import keep_running
 from heliograph.serving.message import LONGEST
-from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.output import Output
 from heliograph.serving.pipe import Pipe
 from heliograph.serving.service import Service
@@ -30,10 +30,10 @@ def fed(parts):
         os.close(end)
 
     async def read():
-        pipe, found = Pipe(source, 1), []
+        pipe, results = Pipe(source, 1), []
         while (batch := await pipe.receive()) is not None:
-            found += batch.payloads
-        return found
+            results += batch.payloads
+        return results
 
     writer = Thread(target=write)
     writer.start()
@@ -50,10 +50,10 @@ def test_lines_are_whole_however_they_are_cut():
 
 
 def test_a_line_without_an_end_is_bounded(monkeypatch):
-    found = fed([b"a\n" + b"x" * 60_000 for _ in range(LONGEST // 60_000 + 3)] + [b"\nb\n"])
-    assert found[0] == b"a" and found[-1] == b"b" and max(map(len, found)) <= LONGEST + 262_144
-    found = fed([b"x" * 60_000 for _ in range(2 * LONGEST // 60_000)] + [b"yy\nb\n"])
-    assert [len(line) > LONGEST for line in found] == [True, False] and found[-1] == b"b"
+    result = fed([b"a\n" + b"x" * 60_000 for _ in range(LONGEST // 60_000 + 3)] + [b"\nb\n"])
+    assert result[0] == b"a" and result[-1] == b"b" and max(map(len, result)) <= LONGEST + 262_144
+    result = fed([b"x" * 60_000 for _ in range(2 * LONGEST // 60_000)] + [b"yy\nb\n"])
+    assert [len(line) > LONGEST for line in result] == [True, False] and result[-1] == b"b"
 
 
 def test_a_full_disk_and_a_folder_are_named(tmp_path):
@@ -73,17 +73,17 @@ def test_a_full_disk_and_a_folder_are_named(tmp_path):
 def test_files_on_disk_are_pipes_too(tmp_path):
     (tmp_path / "in").write_bytes(b"\n".join(lines(messages(1, 10, 0, whole=True))))
     with (tmp_path / "in").open("rb") as source, (tmp_path / "out").open("wb") as target:
-        service = Service(fleet(stepping()), Nowhere())
+        service = Service(fleet(stepping()), InMemoryStore())
         asyncio.run(keep_running(service, Pipe(source.fileno(), target.fileno())))
-    told = (tmp_path / "out").read_bytes()
-    assert told.endswith(b"\n") and told.count(b'"kind":"final"') == 5
+    known = (tmp_path / "out").read_bytes()
+    assert known.endswith(b"\n") and known.count(b'"kind":"final"') == 5
 
 
 class Counting:
     """A service that tells a lot of each message, and remembers how often it was asked."""
 
     def __init__(self):
-        self.taken = self.told = self.finished = 0
+        self.taken = self.known = self.finished = 0
 
     def unpublished(self):
         return []
@@ -93,7 +93,7 @@ class Counting:
         return [Output(None, "", "provisional", b"x" * 10_000) for _ in payloads]
 
     def published(self, outputs):
-        self.told += len(outputs)
+        self.known += len(outputs)
 
     def finish(self, ended):
         self.finished += 1
@@ -127,7 +127,7 @@ def test_a_slow_reader_slows_the_sender_and_stopping_waits_for_it_no_longer_than
     sending.start()
     serve(service, source, target, after=0.4)  # nobody reads
     sending.join()
-    assert service.told == 0 and service.finished == 2
+    assert service.known == 0 and service.finished == 2
     assert written <= 2 * service.taken + 65_536 < 200_000  # the pipe is full, and nothing is held in memory beyond it
     for end in (source, sender, reader, target):
         os.close(end)
@@ -135,12 +135,12 @@ def test_a_slow_reader_slows_the_sender_and_stopping_waits_for_it_no_longer_than
 
 def test_a_service_that_is_told_to_stop_tells_what_it_took():
     (source, sender), (reader, target) = os.pipe(), os.pipe()
-    service = Service(fleet(stepping()), Nowhere())
+    service = Service(fleet(stepping()), InMemoryStore())
     os.write(sender, b"".join(line + b"\n" for line in lines(messages(1, 10, 0, whole=True))))
     serve(service, source, target, after=0.3)
     os.close(target)
-    with os.fdopen(reader, "rb") as told:
-        assert b'"kind":"provisional"' in told.read()
+    with os.fdopen(reader, "rb") as known:
+        assert b'"kind":"provisional"' in known.read()
     os.close(source)
     os.close(sender)
 

@@ -5,10 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from heliograph.serving.kept import plant_bytes, plant_from
+from heliograph.serving.identity import identity
+from heliograph.serving.plant_codec import plant_bytes, plant_from
 from heliograph.serving.service import Service
 from heliograph.serving.store import Store
-from heliograph.serving.whose import identity
 from tests.serving.worlds import fleet, lines, messages, moving, stepping
 
 
@@ -39,23 +39,23 @@ class Dying(Store):
 
 def journal(store):
     """What was told once, by plant and time or reason, without its number; a refusal may come again with a message."""
-    told = store.entries()
-    assert [one.number for one in told] == list(range(1, len(told) + 1))
-    return [{k: v for k, v in json.loads(one.body).items() if k != "id"} for one in told if one.kind == "final"]
+    known = store.entries()
+    assert [item.number for item in known] == list(range(1, len(known) + 1))
+    return [{k: v for k, v in json.loads(item.body).items() if k != "id"} for item in known if item.kind == "final"]
 
 
-def by_plant(told):
-    return {name: [one for one in told if one["plant"] == name] for name in {one["plant"] for one in told}}
+def by_plant(known):
+    return {name: [item for item in known if item["plant"] == name] for name in {item["plant"] for item in known}}
 
 
 def states(service):
     """What every plant holds, without the tallies, which duplicates change."""
-    found = {}
-    for name, kept in service.store.load([f"p{i}" for i in range(4)]).items():
-        plant = plant_from(name, kept.body, service.fleet)
+    results = {}
+    for name, item in service.store.load([f"p{i}" for i in range(4)]).items():
+        plant = plant_from(name, item.body, service.fleet)
         plant.links, plant.forced = {}, 0
-        found[name] = plant_bytes(plant, service.fleet)
-    return found
+        results[name] = plant_bytes(plant, service.fleet)
+    return results
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -94,27 +94,27 @@ def test_processes_that_share_a_store_take_turns(tmp_path):
     mine, sent = identity(fleet(network)), lines(messages(3, 20, seed=6, whole=True))
     alone = Service(fleet(network), Store(str(tmp_path / "alone.db"), mine))
     alone.take(sent)
-    many = [Service(fleet(network), Store(str(tmp_path / "many.db"), mine, name)) for name in "abc"]
+    count = [Service(fleet(network), Store(str(tmp_path / "many.db"), mine, name)) for name in "abc"]
     for i, begin in enumerate(range(0, len(sent), 5)):
-        told = many[i % 3].take(sent[begin : begin + 5])
-        assert many[i % 3].unpublished() == [one for one in told if one.number is not None]
-        many[i % 3].published(told)
-        many[i % 3].finish(ended=False)
-        assert many[i % 3].unpublished() == []
-    assert states(many[0]) == states(alone)
-    assert by_plant(journal(many[0].store)) == by_plant(journal(alone.store))
+        known = count[i % 3].take(sent[begin : begin + 5])
+        assert count[i % 3].unpublished() == [item for item in known if item.number is not None]
+        count[i % 3].published(known)
+        count[i % 3].finish(ended=False)
+        assert count[i % 3].unpublished() == []
+    assert states(count[0]) == states(alone)
+    assert by_plant(journal(count[0].store)) == by_plant(journal(alone.store))
 
 
 def test_plants_leave_memory_and_come_back(tmp_path, monkeypatch):
     network = moving()
     mine, sent = identity(fleet(network)), lines(messages(4, 40, seed=7, whole=False))
-    one, two = (Service(fleet(network), Store(str(tmp_path / name), mine)) for name in ("one.db", "two.db"))
-    one.take(sent)
+    item, two = (Service(fleet(network), Store(str(tmp_path / name), mine)) for name in ("one.db", "two.db"))
+    item.take(sent)
     monkeypatch.setattr("heliograph.serving.service.ROWS", 20)
     for line in sent:
         two.take([line])
         assert two.fleet.pool.used <= 20 + 40
-    assert len(two.plants) < 4 and states(one) == states(two)
+    assert len(two.plants) < 4 and states(item) == states(two)
 
 
 def test_the_journal_is_bounded(tmp_path):

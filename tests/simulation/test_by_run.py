@@ -29,22 +29,22 @@ def step(carry, key, row):
 
 
 def one_run(key):
-    carry, kept = init(key), []
+    carry, stored = init(key), []
     for k in range(STEPS):
-        carry, told = step(carry, key, (k, np.zeros(0)))
-        kept.append(told)
-    return {name: np.array([t[name] for t in kept]) for name in kept[0]}
+        carry, known = step(carry, key, (k, np.zeros(0)))
+        stored.append(known)
+    return {name: np.array([t[name] for t in stored]) for name in stored[0]}
 
 
 def test_every_run_is_the_one_that_a_loop_makes():
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(3), 5)
-        found = trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
-        assert found["shared"].shape == (1, STEPS)
-        assert all(found[name].shape == (5, STEPS) for name in ("walk", "later", "noise"))
+        result = trajectories(init, step, keys, tuple(map(jnp.asarray, ROWS)))
+        assert result["shared"].shape == (1, STEPS)
+        assert all(result[name].shape == (5, STEPS) for name in ("walk", "later", "noise"))
         for run, key in enumerate(keys):
             for name, expected in one_run(key).items():
-                got = found[name][0 if name == "shared" else run]
+                got = result[name][0 if name == "shared" else run]
                 np.testing.assert_allclose(got, expected, rtol=1e-13, atol=1e-14)
 
 
@@ -65,18 +65,18 @@ def test_planned_filters_tell_what_they_would_without_a_plan():
     record = hg.monte_carlo(network, 6, 40, 4)
     with jax.enable_x64(True):
         for node in "ab":
-            item, found = network.nodes[node].filters["f"], record.estimates[node]["f"]
+            item, result = network.nodes[node].filters["f"], record.estimates[node]["f"]
             for run in (0, 39):
                 state = item.init()
                 for k, z in enumerate(record.measurements[node][run]):
                     state, estimate = item.step(state, z, (), k)
-                    np.testing.assert_allclose(found.mean[run, k], estimate.mean, rtol=1e-12, atol=1e-13)
-                    np.testing.assert_allclose(found.covariance[run, k], estimate.covariance, rtol=1e-12)
+                    np.testing.assert_allclose(result.mean[run, k], estimate.mean, rtol=1e-12, atol=1e-13)
+                    np.testing.assert_allclose(result.covariance[run, k], estimate.covariance, rtol=1e-12)
     assert np.isnan(record.measurements["lost"]).any() and record.failures() == []
     sums = hg.monte_carlo(network, 6, 40, 4, hg.Statistics())["b"]["f"]
-    kept = hg.simulation.error_statistics(record, "b", "f")
+    stored = hg.simulation.error_statistics(record, "b", "f")
     for name in ("outer", "covariance", "nees", "count"):
-        np.testing.assert_allclose(getattr(sums, name), getattr(kept, name), rtol=1e-10, atol=1e-12)
+        np.testing.assert_allclose(getattr(sums, name), getattr(stored, name), rtol=1e-10, atol=1e-12)
 
 
 def test_columns_of_what_relays_heard_may_be_left_out():
@@ -125,6 +125,6 @@ def test_a_noise_of_counts_is_simulated():
     sensor = hg.LinearSensor([[1.0]], Counted(4.0))
     node = hg.Node(sensor, hg.perfect(1), {"kalman": hg.kalman_filter(plant, sensor)})
     record = hg.monte_carlo(hg.Network(plant, {"a": node}), 20, 64, 0)
-    heard = record.measurements["a"][:, :, 0] - np.asarray(record.truth)[:, :, 0]
-    np.testing.assert_allclose(heard + 4.0, np.round(heard + 4.0), atol=1e-12)  # whole numbers, to rounding
-    assert abs(heard.mean()) < 4 * 2 / np.sqrt(heard.size)  # four standard errors, the deviation being 2
+    received = record.measurements["a"][:, :, 0] - np.asarray(record.truth)[:, :, 0]
+    np.testing.assert_allclose(received + 4.0, np.round(received + 4.0), atol=1e-12)  # whole numbers, to rounding
+    assert abs(received.mean()) < 4 * 2 / np.sqrt(received.size)  # four standard errors, the deviation being 2

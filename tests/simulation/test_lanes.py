@@ -31,19 +31,19 @@ def test_chunks_do_not_change_a_bit(chunk):
     whole, parts = (hg.monte_carlo(network(), HORIZON, RUNS, 0, chunk=c) for c in (100 * BLOCK, chunk))
     np.testing.assert_array_equal(whole.truth, parts.truth)
     np.testing.assert_array_equal(whole.estimates["a"]["f"].mean, parts.estimates["a"]["f"].mean)
-    one, other = (
+    item, other = (
         hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics(), chunk=c)["a"]["f"] for c in (100 * BLOCK, chunk)
     )
-    np.testing.assert_array_equal(one.outer, other.outer)
-    np.testing.assert_array_equal(one.nees, other.nees)
+    np.testing.assert_array_equal(item.outer, other.outer)
+    np.testing.assert_array_equal(item.nees, other.nees)
 
 
 def test_one_core_gives_the_same_bits(monkeypatch):
     runs = 9 * BLOCK
-    many = hg.monte_carlo(network(), HORIZON, runs, 0, hg.Statistics())["a"]["f"]
+    count = hg.monte_carlo(network(), HORIZON, runs, 0, hg.Statistics())["a"]["f"]
     monkeypatch.setattr(os, "cpu_count", lambda: 1)
-    one = hg.monte_carlo(network(), HORIZON, runs, 0, hg.Statistics())["a"]["f"]
-    np.testing.assert_array_equal(many.outer, one.outer)
+    item = hg.monte_carlo(network(), HORIZON, runs, 0, hg.Statistics())["a"]["f"]
+    np.testing.assert_array_equal(count.outer, item.outer)
 
 
 DEVICES = """
@@ -63,12 +63,12 @@ def test_several_devices_share_the_lanes(tmp_path):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=3"
     environment = os.environ | {"XLA_FLAGS": flags}
     subprocess.run([sys.executable, "-c", DEVICES, str(tmp_path / "found.npz")], env=environment, check=True)
-    found = np.load(tmp_path / "found.npz")
+    result = np.load(tmp_path / "found.npz")
     record = hg.monte_carlo(network(), HORIZON, RUNS, 0)
-    np.testing.assert_allclose(found["truth"], record.truth, rtol=1e-12, atol=1e-13)
-    np.testing.assert_allclose(found["mean"], record.estimates["a"]["f"].mean, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(result["truth"], record.truth, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(result["mean"], record.estimates["a"]["f"].mean, rtol=1e-10, atol=1e-12)
     statistics = hg.monte_carlo(network(), HORIZON, RUNS, 0, hg.Statistics())["a"]["f"]
-    np.testing.assert_allclose(found["outer"], statistics.outer, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(result["outer"], statistics.outer, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -9,8 +9,8 @@ import heliograph as hg
 from heliograph.codegen.engine import SETTING
 from heliograph.codegen.graph import Unsupported
 from heliograph.relays.own_error import own_error_design
-from heliograph.simulation.air import air_of
 from heliograph.simulation.draws import seed_key
+from heliograph.simulation.medium import medium_of
 from heliograph.simulation.native import native
 from heliograph.simulation.reducer import AbstractReducer, Trajectories
 from heliograph.simulation.stepping import AllFilters
@@ -99,34 +99,34 @@ def by(engine: str, monkeypatch: pytest.MonkeyPatch, *args: object, **kwargs: ob
 def test_records_are_those_of_xla(networked, monkeypatch):
     """Draws to the last bits, estimates to 1e-12 of what deviates from step to step."""
     network, u = networked
-    found, expected = (by(engine, monkeypatch, network, HORIZON, RUNS, 5, inputs=u) for engine in ("native", "xla"))
-    np.testing.assert_allclose(found.truth, expected.truth, rtol=0, atol=1e-13 * np.abs(expected.truth).max())
+    result, expected = (by(engine, monkeypatch, network, HORIZON, RUNS, 5, inputs=u) for engine in ("native", "xla"))
+    np.testing.assert_allclose(result.truth, expected.truth, rtol=0, atol=1e-13 * np.abs(expected.truth).max())
     for name, z in expected.measurements.items():
-        np.testing.assert_allclose(found.measurements[name], z, rtol=0, atol=1e-13 * (1 + np.nanmax(np.abs(z))))
+        np.testing.assert_allclose(result.measurements[name], z, rtol=0, atol=1e-13 * (1 + np.nanmax(np.abs(z))))
     for node, filters in expected.estimates.items():
         for name, true in filters.items():
-            one, covariance = found.estimates[node][name], np.asarray(true.covariance)
+            item, covariance = result.estimates[node][name], np.asarray(true.covariance)
             deviation = np.sqrt(np.nanmax(np.diagonal(covariance, axis1=-2, axis2=-1), initial=0.0)) or 1.0
             digits = FLAT if name == "ci" else 1e-12
-            np.testing.assert_allclose(one.mean, true.mean, rtol=0, atol=digits * deviation, err_msg=f"{node}/{name}")
-            np.testing.assert_allclose(one.covariance, covariance, rtol=0, atol=1e-12 * deviation**2)
-            assert one.claim == true.claim
+            np.testing.assert_allclose(item.mean, true.mean, rtol=0, atol=digits * deviation, err_msg=f"{node}/{name}")
+            np.testing.assert_allclose(item.covariance, covariance, rtol=0, atol=1e-12 * deviation**2)
+            assert item.claim == true.claim
 
 
 def test_statistics_are_those_of_xla(networked, monkeypatch):
     network, u = networked
-    found, expected = (
+    result, expected = (
         by(engine, monkeypatch, network, HORIZON, RUNS, 5, hg.Statistics(), u) for engine in ("native", "xla")
     )
     for node, filters in expected.items():
         for name, true in filters.items():
-            one = found[node][name]
+            item = result[node][name]
             digits = FLAT if name == "ci" else 1e-12
             for part in ("count", "outer", "covariance", "nees"):
-                a, b = np.asarray(getattr(one, part)), np.asarray(getattr(true, part))
+                a, b = np.asarray(getattr(item, part)), np.asarray(getattr(true, part))
                 np.testing.assert_allclose(a, b, rtol=digits, atol=digits * np.nanmax(np.abs(b), initial=1e-300))
-            assert one.failed_runs == true.failed_runs
-            np.testing.assert_array_equal(one.failed, true.failed)
+            assert item.failed_runs == true.failed_runs
+            np.testing.assert_array_equal(item.failed, true.failed)
 
 
 def test_smoothed_estimates_are_those_of_xla(monkeypatch):
@@ -136,14 +136,14 @@ def test_smoothed_estimates_are_those_of_xla(monkeypatch):
     filters = {"linear": hg.linear_filter(LINEAR, POSITION, relay)}
     nodes = {"a": hg.Node(POSITION, relay, filters), "b": hg.Node(POSITION, hg.erasure(relay, 0.8), filters)}
     network = hg.Network(LINEAR, nodes)
-    found, expected = (by(e, monkeypatch, network, HORIZON, RUNS, 5, smooth=interval) for e in ("native", "xla"))
+    result, expected = (by(e, monkeypatch, network, HORIZON, RUNS, 5, smooth=interval) for e in ("native", "xla"))
     sums, true_sums = (
         by(e, monkeypatch, network, HORIZON, RUNS, 5, hg.Statistics(), smooth=interval) for e in ("native", "xla")
     )
     for node in nodes:
-        one, true = found.smoothed.estimates[node]["linear"], expected.smoothed.estimates[node]["linear"]
-        np.testing.assert_allclose(one.mean, true.mean, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(one.covariance, true.covariance, rtol=0, atol=1e-12)
+        item, true = result.smoothed.estimates[node]["linear"], expected.smoothed.estimates[node]["linear"]
+        np.testing.assert_allclose(item.mean, true.mean, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(item.covariance, true.covariance, rtol=0, atol=1e-12)
         for part in ("outer", "covariance", "nees"):
             a, b = (getattr(s.smoothed[node]["linear"], part) for s in (sums, true_sums))
             np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12 * np.abs(b).max())
@@ -168,14 +168,14 @@ def test_sums_depend_on_no_chunk(monkeypatch):
     monkeypatch.setenv(SETTING, "native")
     some = [hg.monte_carlo(linear(), HORIZON, 1000, 9, hg.Statistics(), chunk=chunk) for chunk in (32, 300, 4096)]
     for node, filters in some[0].items():
-        for name, one in filters.items():
+        for name, filter_ in filters.items():
             for other in some[1:]:
-                np.testing.assert_array_equal(one.outer, other[node][name].outer)
-                np.testing.assert_array_equal(one.nees, other[node][name].nees)
+                np.testing.assert_array_equal(filter_.outer, other[node][name].outer)
+                np.testing.assert_array_equal(filter_.nees, other[node][name].nees)
 
 
 def code(network: hg.Network, seed: int = 0):
-    world = World(network.plant, air_of(network), AllFilters(network))
+    world = World(network.plant, medium_of(network), AllFilters(network))
     with jax.enable_x64(True):
         return native(world, np.zeros((HORIZON, 0)), seed_key(seed), Trajectories())
 
@@ -202,8 +202,8 @@ def test_networks_of_one_structure_share_a_program():
 
 
 def test_covariances_that_no_data_change_are_computed_once():
-    found = code(linear()).begun
-    assert sum(part is not None for part in found.shared) == 2  # of both filters at the nodes whose links lose nothing
+    result = code(linear()).begun
+    assert sum(part is not None for part in result.shared) == 2  # of both filters at the nodes whose links lose nothing
 
 
 class Odd(AbstractReducer):
@@ -231,6 +231,6 @@ def test_keys_of_another_hash_are_simulated_by_xla():
     network = shadowed()
     record = hg.monte_carlo(network, 3, 2, jax.random.key(0, impl="rbg"))
     assert np.isfinite(record.truth).all()
-    world = World(network.plant, air_of(network), AllFilters(network))
+    world = World(network.plant, medium_of(network), AllFilters(network))
     with pytest.raises(Unsupported, match="rbg"):
         native(world, np.zeros((3, 0)), jax.random.key(0, impl="rbg"), Trajectories())

@@ -105,36 +105,38 @@ def test_runs_that_fail_are_counted_and_no_figure_hides_them():
         plant, {"node": hg.Node(sensor, hg.perfect(), {"b": Breaking(), "open": hg.filters.open_loop_filter(plant)})}
     )
     record = hg.monte_carlo(network, 6, 100, 0)
-    found = hg.monte_carlo(network, 6, 100, 0, keep=hg.Statistics())
+    outcome = hg.monte_carlo(network, 6, 100, 0, keep=hg.Statistics())
     above = (record.measurements["node"][..., 0] > 2).any(axis=1).sum()
     assert 0 < above < 100
-    assert found.failures() == record.failures() == [f"node/b: no valid covariance from step 0 in {above} of 100 runs"]
-    for one in (found["node"]["b"], hg.simulation.error_statistics(record, "node", "b")):
-        assert one.failed_runs == above
-        for figure in (one.rmse, one.nees_per_dimension, one.worst_direction, one.mean_trace, one.rmse_over_time):
+    assert (
+        outcome.failures() == record.failures() == [f"node/b: no valid covariance from step 0 in {above} of 100 runs"]
+    )
+    for item in (outcome["node"]["b"], hg.simulation.error_statistics(record, "node", "b")):
+        assert item.failed_runs == above
+        for figure in (item.rmse, item.nees_per_dimension, item.worst_direction, item.mean_trace, item.rmse_over_time):
             with pytest.warns(UserWarning, match=f"no valid covariance from step 0 in {above} of 100 runs"):
                 figure()
-    assert not found["node"]["open"].failure and np.isfinite(found["node"]["open"].rmse()[0])
+    assert not outcome["node"]["open"].failure and np.isfinite(outcome["node"]["open"].rmse()[0])
 
 
 def test_steps_summed_a_few_at_a_time_give_the_same_bits(monkeypatch):
     rng, nodes, runs = np.random.default_rng(0), 3, np.arange(64, 96)
     mean, spread = rng.normal(size=(2, 32, 6, 1, nodes, 2)), rng.normal(size=(32, 6, 1, nodes, 2, 3))
     mean[0, 5, 2, 0, 1, 0] = np.nan  # one estimate that is none
-    own = spread @ spread.swapaxes(-1, -2)
-    kinds = tuple(hg.model.Estimate(m, c, "nominal") for m, c in zip(mean, (own, own[:1]), strict=True))
+    local = spread @ spread.swapaxes(-1, -2)
+    kinds = tuple(hg.model.Estimate(m, c, "nominal") for m, c in zip(mean, (local, local[:1]), strict=True))
     batch = {"truth": rng.normal(size=(32, 6, 2)), "estimates": kinds, "fused": {}, "uplinks": {}}
-    found = []
+    results = []
     for steps in (6, 3, 1):
         monkeypatch.setattr(summing, "CACHE", steps * 2 * 2 * nodes * 32 * 8)
         with jax.enable_x64(True):
             start = hg.Statistics().initial(batch)
             add = jax.jit(lambda carry, batch: hg.Statistics().reduce(carry, batch, runs, runs < 90)[0])  # traced anew
-            found.append([np.asarray(leaf) for leaf in jax.tree.leaves(add(start, batch))])
+            results.append([np.asarray(leaf) for leaf in jax.tree.leaves(add(start, batch))])
     assert summing._steps_at_once(6, summing.CACHE) == 1
-    for others in found[1:]:
-        for one, other in zip(found[0], others, strict=True):
-            np.testing.assert_array_equal(one, other)
+    for others in results[1:]:
+        for item, other in zip(results[0], others, strict=True):
+            np.testing.assert_array_equal(item, other)
 
 
 def test_a_record_in_single_precision_is_summed_in_double():
@@ -142,10 +144,10 @@ def test_a_record_in_single_precision_is_summed_in_double():
     plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
     node = hg.Node(sensor, hg.perfect(), {"f": hg.kalman_filter(plant, sensor)})
     record = hg.monte_carlo(hg.Network(plant, {"a": node}), 6, 40, 0)
-    found = record.estimates["a"]["f"]
-    single = replace(found, mean=np.float32(found.mean), covariance=np.float32(found.covariance))
+    result = record.estimates["a"]["f"]
+    single = replace(result, mean=np.float32(result.mean), covariance=np.float32(result.covariance))
     rounded = replace(record, truth=np.float32(record.truth), estimates={"a": {"f": single}})
-    both = [hg.simulation.error_statistics(each, "a", "f") for each in (rounded, record)]
+    both = [hg.simulation.error_statistics(item, "a", "f") for item in (rounded, record)]
     assert both[0].pairs.dtype == np.float64
     assert both[0].rmse() == pytest.approx(both[1].rmse(), rel=1e-6)
     assert both[0].nees_per_dimension() == pytest.approx(both[1].nees_per_dimension(), rel=1e-6)

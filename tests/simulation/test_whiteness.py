@@ -10,7 +10,7 @@ STEPS = 20_000
 
 
 @pytest.fixture(scope="module")
-def heard():
+def received():
     channel = bursts()
     filters = {
         "memoryless": hg.linear_filter(PLANT, SENSOR, hg.model.without_memory(channel)),
@@ -21,31 +21,31 @@ def heard():
 
 
 @pytest.mark.slow
-def test_memory_is_found_where_a_filter_assumes_none(heard):
+def test_memory_is_found_where_a_filter_assumes_none(received):
     """Lag 1 is .30 and lag 2 .20; within four standard errors."""
-    z, filters = heard
-    found = hg.simulation.memory_test(z, filters["memoryless"])
-    assert found.found and found.p_value < 1e-6
-    assert np.all(np.abs(found.correlation[:2] - [0.30, 0.20]) < 4 * found.standard_error[:2])
-    assert 0.05 < found.predictable < 0.2
+    z, filters = received
+    memory = hg.simulation.memory_test(z, filters["memoryless"])
+    assert memory.result and memory.p_value < 1e-6
+    assert np.all(np.abs(memory.correlation[:2] - [0.30, 0.20]) < 4 * memory.standard_error[:2])
+    assert 0.05 < memory.predictable < 0.2
 
 
 @pytest.mark.slow
-def test_the_exact_filter_leaves_nothing_behind(heard):
-    z, filters = heard
-    found = hg.simulation.memory_test(z, filters["exact"])
-    assert not found.found and found.predictable < 0.02
-    assert abs(found.power - 1) < 4 * found.power_error
+def test_the_exact_filter_leaves_nothing_behind(received):
+    z, filters = received
+    memory = hg.simulation.memory_test(z, filters["exact"])
+    assert not memory.result and memory.predictable < 0.02
+    assert abs(memory.power - 1) < 4 * memory.power_error
 
 
 def test_innovations_alone_and_gaps():
     generator = np.random.default_rng(0)
     white = generator.normal(size=(5000, 2)) * [1.0, 30.0]
     white[generator.random(5000) < 0.2] = np.nan
-    assert not hg.simulation.memory_test(white).found and np.isnan(hg.simulation.memory_test(white).power)
+    assert not hg.simulation.memory_test(white).result and np.isnan(hg.simulation.memory_test(white).power)
     moved = white[1:] + 0.4 * white[:-1]  # a moving average: lag 1 is .4 / 1.16
     assert hg.simulation.memory_test(moved).correlation[0] == pytest.approx(0.4 / 1.16, abs=0.05)
-    assert hg.simulation.memory_test(moved[:, 0]).found
+    assert hg.simulation.memory_test(moved[:, 0]).result
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -53,8 +53,8 @@ def test_loud_bursts_alone_are_no_memory(seed):
     """Variance that comes in bursts widens the standard error, and finds nothing."""
     generator = np.random.default_rng(seed)
     loud = np.repeat(generator.choice([0.2, 3.0], 500), 20)
-    found = hg.simulation.memory_test(loud * generator.normal(size=10_000))
-    assert found.p_value > 0.001 and found.standard_error[0] > 1 / np.sqrt(10_000)
+    memory = hg.simulation.memory_test(loud * generator.normal(size=10_000))
+    assert memory.p_value > 0.001 and memory.standard_error[0] > 1 / np.sqrt(10_000)
 
 
 def test_bad_input():

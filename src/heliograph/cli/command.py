@@ -26,8 +26,8 @@ BAD_INPUT = 2
 
 # In the order of the help.
 COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
-for one in COMMANDS:
-    app.command(one)
+for single in COMMANDS:
+    app.command(single)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -48,7 +48,7 @@ def serve(
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import Wanted, run, store_of
+    from heliograph.serving.running import ServiceSettings, run, store_of
     from heliograph.serving.url import address
 
     if schema:
@@ -58,6 +58,8 @@ def serve(
         raise fail("serve", "a network, such as my_network.py", "none")
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    kept = store_of(network, store, parts)
-    wanted = Wanted(load_network(network), options, kept, process, from_snapshot, where, parts, page, tuple(anew or ()))
-    asyncio.run(run(wanted))
+    store_ = store_of(network, store, parts)
+    settings = ServiceSettings(
+        load_network(network), options, store_, process, from_snapshot, where, parts, page, tuple(anew or ())
+    )
+    asyncio.run(run(settings))

@@ -42,17 +42,17 @@ def _over(
 ) -> list[Value]:
     """The last axis of runs first: few written out, many in a loop."""
     if not runs:
-        results = zip(_one(lowering, equation, inputs), shapes, strict=True)
+        results = zip(_single(lowering, equation, inputs), shapes, strict=True)
         return [x if x.shape == s else np.broadcast_to(lowering.nodes(x), s) for x, s in results]
     count, rest = runs[-1], runs[:-1]
     if count <= FEW:
-        each = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
-        return [_together(lowering, list(results)) for results in zip(*each, strict=True)]
+        items = [_over(lowering, equation, [_run(x, k) for x in inputs], rest, shapes) for k in range(count)]
+        return [_together(lowering, list(results)) for results in zip(*items, strict=True)]
     rows = [in_memory(lowering, x) if x.shape[-1] > 1 else _run(x, 0) for x in inputs]
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        one = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
-        return [], [lowering.nodes(x) for x in _over(lowering, equation, one, rest, shapes)]
+        item = [_run(x, place) if isinstance(x, InMemory) else x for x in rows]
+        return [], [lowering.nodes(x) for x in _over(lowering, equation, item, rest, shapes)]
 
     stacked = repeated(lowering, count, [], turn)[1]
     return [x.view([*x.shape[1:], x.shape[0]], [*x.strides[1:], x.strides[0]]) for x in stacked]
@@ -69,7 +69,7 @@ def _together(lowering: Lowering, results: list[Value]) -> Value:
     return whole.view([*whole.shape[1:], len(results)], [*whole.strides[1:], whole.strides[0]])
 
 
-def _one(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+def _single(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     params = equation.params
     numbers = [v.aval.dtype for v in equation.invars]  # type: ignore[attr-defined]
     kinds = tuple((x.shape, dtype) for x, dtype in zip(inputs, numbers, strict=True))

@@ -27,7 +27,7 @@ def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list
 def _elementwise(op: str) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
-        return [array_of([node(op, type, *each) for each in zip(*broadcast(inputs, shape), strict=True)], shape)]
+        return [array_of([node(op, type, *item) for item in zip(*broadcast(inputs, shape), strict=True)], shape)]
 
     return rule
 
@@ -38,7 +38,7 @@ def _composed(function: Any) -> Rule:
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
         entries = zip(*broadcast(inputs, shape), strict=True)
-        return [array_of([function(graph, type, equation.params, *each) for each in entries], shape)]
+        return [array_of([function(graph, type, equation.params, *entry) for entry in entries], shape)]
 
     return rule
 
@@ -62,7 +62,7 @@ def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -
 def _key_select(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     shape = result_shape(equation)
     entries = zip(*broadcast(inputs, shape), strict=True)
-    return [array_of([_select_n(lowering.graph, "u32", None, *each) for each in entries], shape)]
+    return [array_of([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
 
 
 def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
@@ -75,9 +75,9 @@ def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
         exponent //= 2
         if exponent:
             square = graph.node("mul", type, square, square)
-    one = graph.constant(1.0 if type == "f64" else 1, type)
-    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, one)
-    return product if params["y"] >= 0 else graph.node("div", type, one, product)
+    item = graph.constant(1.0 if type == "f64" else 1, type)
+    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, item)
+    return product if params["y"] >= 0 else graph.node("div", type, item, product)
 
 
 def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
@@ -95,9 +95,9 @@ def _bitcast(graph: Graph, type: Type, params: Any, x: Node) -> Node:
 
 
 def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
-    one = graph.constant(1.0, type)
+    item = graph.constant(1.0, type)
     power = graph.node("exp", type, graph.node("neg", type, x))
-    return graph.node("div", type, one, graph.node("add", type, one, power))
+    return graph.node("div", type, item, graph.node("add", type, item, power))
 
 
 def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:

@@ -53,12 +53,12 @@ def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]
     """
     lowering = Lowering()
     lowering.graph = program.graph
-    found: list[Buffer] = []
+    results: list[Buffer] = []
     for number, value in enumerate(program.outputs):
         nodes_only = number in last or not isinstance(value, InMemory)
-        stored = _filled(lowering, lowering.nodes(value)) if nodes_only else _stored(lowering, value, found)
-        found.append(stored.buffer)
-    return found
+        stored = _filled(lowering, lowering.nodes(value)) if nodes_only else _stored(lowering, value, results)
+        results.append(stored.buffer)
+    return results
 
 
 def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:

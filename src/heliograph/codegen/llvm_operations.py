@@ -43,24 +43,24 @@ def splat(value: float | int | bool, type: Type) -> str:
 def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
     """Emit what computes a node of its arguments' names; the name of the result."""
     source: Type = node.args[0].type if node.args else node.type
-    own, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
+    local, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
     op, result = node.op, vector(node.type, width)
     if op == "select":
-        return emit(f"select {own} {names[0]}, {result} {names[1]}, {result} {names[2]}")
+        return emit(f"select {local} {names[0]}, {result} {names[1]}, {result} {names[2]}")
     if op in ORDER:
-        return emit(f"{_comparison(op, source)} {own} {names[0]}, {names[1]}")
+        return emit(f"{_comparison(op, source)} {local} {names[0]}, {names[1]}")
     if op == "convert":
         return _converted(source, node.type, names[0], width, emit)
     if op == "bitcast":
-        return emit(f"bitcast {own} {names[0]} to {result}")
+        return emit(f"bitcast {local} {names[0]} to {result}")
     if op == "not":
-        return emit(f"xor {own} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+        return emit(f"xor {local} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
     if op in CALLED:
         typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
         return emit(f"call {result} @hg_{op}({typed})")
     if source == "f64":
-        return _of_doubles(op, names, own, kind, width, emit)
-    return _of_integers(node, names, own, kind, emit)
+        return _of_doubles(op, names, local, kind, width, emit)
+    return _of_integers(node, names, local, kind, emit)
 
 
 def _comparison(op: str, type: Type) -> str:
@@ -71,39 +71,39 @@ def _comparison(op: str, type: Type) -> str:
     return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
 
 
-def _of_doubles(op: str, names: list[str], own: str, kind: str, width: int, emit: Emit) -> str:
-    first = f"{own} {names[0]}"
+def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emit: Emit) -> str:
+    first = f"{text} {names[0]}"
     if op in FLOAT:
         return emit(f"{FLOAT[op]} {first}, {names[1]}")
     if op == "neg":
         return emit(f"fneg {first}")
     if op in UNARY:
-        return emit(f"call {own} @llvm.{UNARY[op]}.{kind}({first})")
+        return emit(f"call {text} @llvm.{UNARY[op]}.{kind}({first})")
     if op in ("max", "min"):
-        return emit(f"call {own} @llvm.{op}imum.{kind}({first}, {own} {names[1]})")
+        return emit(f"call {text} @llvm.{op}imum.{kind}({first}, {text} {names[1]})")
     if op == "is_finite":
-        size = emit(f"call {own} @llvm.fabs.{kind}({first})")
-        return emit(f"fcmp olt {own} {size}, {splat(float('inf'), 'f64')}")
+        size = emit(f"call {text} @llvm.fabs.{kind}({first})")
+        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
     if op == "sign":
-        one = emit(f"call {own} @llvm.copysign.{kind}({own} {splat(1.0, 'f64')}, {first})")
+        item = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
         other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
-        return emit(f"select <{width} x i1> {other}, {own} {one}, {first}")
+        return emit(f"select <{width} x i1> {other}, {text} {item}, {first}")
     if op == "rem":
         return emit(f"frem {first}, {names[1]}")
     raise Unsupported(op)
 
 
-def _of_integers(node: Node, names: list[str], own: str, kind: str, emit: Emit) -> str:
-    op, type, first = node.op, node.args[0].type, f"{own} {names[0]}"
+def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit) -> str:
+    op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
     if op in INTEGER:
         return emit(f"{INTEGER[op]} {first}, {names[1]}")
     if op == "neg":
-        return emit(f"sub {own} zeroinitializer, {names[0]}")
+        return emit(f"sub {text} zeroinitializer, {names[0]}")
     signed = type[0] == "i"
     if op in ("max", "min"):
-        return emit(f"call {own} @llvm.{'s' if signed else 'u'}{op}.{kind}({first}, {own} {names[1]})")
+        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}.{kind}({first}, {text} {names[1]})")
     if op == "abs" and signed:
-        return emit(f"call {own} @llvm.abs.{kind}({first}, i1 false)")
+        return emit(f"call {text} @llvm.abs.{kind}({first}, i1 false)")
     if op in ("div", "rem") and node.args[1].op == "constant" and node.args[1].value > 0:
         return emit(f"{'s' if signed else 'u'}{op} {first}, {names[1]}")
     if op in ("shift_left", "shift_right", "shift_right_signed") and node.args[1].op == "constant":
@@ -114,27 +114,27 @@ def _of_integers(node: Node, names: list[str], own: str, kind: str, emit: Emit) 
 
 
 def _converted(source: Type, target: Type, name: str, width: int, emit: Emit) -> str:
-    own, result = vector(source, width), vector(target, width)
+    local, result = vector(source, width), vector(target, width)
     if source == target or LLVM[source] == LLVM[target]:
         return name
     if target == "f64":
-        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {own} {name} to {result}")
+        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {local} {name} to {result}")
     if source == "f64":
         how = "fptosi" if target[0] == "i" else "fptoui"
         suffix = f"v{width}{LLVM[target]}.v{width}f64"
-        return emit(f"call {result} @llvm.{how}.sat.{suffix}({own} {name})")
+        return emit(f"call {result} @llvm.{how}.sat.{suffix}({local} {name})")
     if BITS[target] < BITS[source]:
-        return emit(f"trunc {own} {name} to {result}")
-    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {own} {name} to {result}")
+        return emit(f"trunc {local} {name} to {result}")
+    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {local} {name} to {result}")
 
 
 def fused(node: Node, product: Node, names: list[str], width: int, emit: Emit) -> str:
     """a b + c, c - a b or a b - c, rounded once; names of a, b, c."""
-    own = vector("f64", width)
+    local = vector("f64", width)
     a, b, c = names
     if node.op == "sub":
         if node.args[1] is product:
-            a = emit(f"fneg {own} {a}")
+            a = emit(f"fneg {local} {a}")
         else:
-            c = emit(f"fneg {own} {c}")
-    return emit(f"call {own} @llvm.fma.v{width}f64({own} {a}, {own} {b}, {own} {c})")
+            c = emit(f"fneg {local} {c}")
+    return emit(f"call {local} @llvm.fma.v{width}f64({local} {a}, {local} {b}, {local} {c})")

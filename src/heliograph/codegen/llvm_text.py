@@ -109,9 +109,9 @@ class Writer:
         return node.op in ("constant", "counter") or node not in self.mine or self.width == 1
 
     def _everywhere(self, name: str, type: Type) -> str:
-        own = vector(type, self.width)
-        first = self.add(f"insertelement {own} poison, {LLVM[type]} {name}, i64 0")
-        return self.add(f"shufflevector {own} {first}, {own} poison, <{self.width} x i32> zeroinitializer")
+        local = vector(type, self.width)
+        first = self.add(f"insertelement {local} poison, {LLVM[type]} {name}, i64 0")
+        return self.add(f"shufflevector {local} {first}, {local} poison, <{self.width} x i32> zeroinitializer")
 
     def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
         """Of the entry offset + sum strides * indices, each of so many lanes."""
@@ -120,14 +120,14 @@ class Writer:
         base = self.bases[owner]
         if indices:
             key = ("row", owner, tuple(strides), tuple(indices))
-            found = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
-            if found is None:
+            result = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+            if result is None:
                 place = ""
                 for stride, index in zip(strides, indices, strict=True):
                     part = self.add(f"mul i64 {self.scalar(index)}, {stride}")
                     place = self.add(f"add i64 {place}, {part}") if place else part
-                found = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {place}")
-            base = found
+                result = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {place}")
+            base = result
         return self.add(f"getelementptr {element}, ptr {base}, i64 {offset + start}")
 
     def _load(self, node: Node) -> str:
@@ -158,7 +158,7 @@ class Writer:
         lanes = self.width if owner in self.spread else 1
         if lanes == 1:
             self.read.add(owner)
-        wide, own = f"<{self.width} x i64>", vector(node.type, self.width)
+        wide, local = f"<{self.width} x i64>", vector(node.type, self.width)
         place = f"splat (i64 {(offset + start) * lanes})"
         for stride, index in zip(strides, node.args, strict=True):
             part = self.add(f"mul {wide} {self.operand(index)}, splat (i64 {stride * lanes})")
@@ -171,23 +171,23 @@ class Writer:
         for lane in range(self.width):
             at = self.add(f"extractelement {wide} {place}, i64 {lane}")
             address = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, i64 {at}")
-            one = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
-            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {one}, i64 {lane}")
+            item = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {item}, i64 {lane}")
         if node.type == "bool":
             return self.add(f"icmp ne {values} {loaded}, zeroinitializer")
-        return self.add(f"bitcast {values} {loaded} to {own}") if node.type == "f64" else loaded
+        return self.add(f"bitcast {values} {loaded} to {local}") if node.type == "f64" else loaded
 
     def _store(self, store: Store) -> None:
-        name, own = self.operand(store.node), vector(store.node.type, self.width)
+        name, local = self.operand(store.node), vector(store.node.type, self.width)
         lanes = self.sums.get(store.buffer, self.width)
         address = self._address(store.buffer, store.offset, store.strides, store.indices, lanes)
         if store.buffer in self.sums:
-            before = self.add(f"load {own}, ptr {address}, align 8")
-            counted = self.add(f"select <{self.width} x i1> {self.counted}, {own} {name}, {own} zeroinitializer")
-            name = self.add(f"fadd {own} {before}, {counted}")
+            before = self.add(f"load {local}, ptr {address}, align 8")
+            counted = self.add(f"select <{self.width} x i1> {self.counted}, {local} {name}, {local} zeroinitializer")
+            name = self.add(f"fadd {local} {before}, {counted}")
         if store.node.type == "bool":
-            name, own = self.add(f"zext {own} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
-        self.line(f"store {own} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
+            name, local = self.add(f"zext {local} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
+        self.line(f"store {local} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
 
     def _loop(self, loop: Loop) -> None:
         """Parameters are what the turn before made of them; a counted loop takes one turn at least."""
@@ -220,8 +220,8 @@ class Writer:
             following, results = self._turns(loop, name, moving)
         phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
         for k, start, after in zip(moving, starts, following, strict=True):
-            own = vector(loop.parameters[k].type, self.width)
-            phis.append(f"  %{name}.p{k} = phi {own} [{start}, %{before}], [{after}, %{self.label}]")
+            local = vector(loop.parameters[k].type, self.width)
+            phis.append(f"  %{name}.p{k} = phi {local} [{start}, %{before}], [{after}, %{self.label}]")
         self.lines[place:place] = phis
         self.start(f"{name}.end")
         self.scopes.pop()
@@ -247,8 +247,8 @@ class Writer:
 
     def _any(self, condition: Node) -> str:
         """Whether a condition holds in some lane."""
-        own = f"<{self.width} x i1>"
-        bits = self.add(f"bitcast {own} {self.operand(condition)} to i{self.width}")
+        local = f"<{self.width} x i1>"
+        bits = self.add(f"bitcast {local} {self.operand(condition)} to i{self.width}")
         return self.add(f"icmp ne i{self.width} {bits}, 0")
 
     def _guard(self, guard: Guard) -> None:
@@ -267,5 +267,5 @@ class Writer:
         self.start(f"{name}.end")
         self.scopes.pop()
         for k, value in zip(used, values, strict=True):
-            own = vector(guard.results[k].type, self.width)
-            self._keep(guard.results[k], self.add(f"phi {own} [{value}, %{after}], [zeroinitializer, %{before}]"))
+            local = vector(guard.results[k].type, self.width)
+            self._keep(guard.results[k], self.add(f"phi {local} [{value}, %{after}], [zeroinitializer, %{before}]"))

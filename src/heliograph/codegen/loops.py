@@ -91,8 +91,8 @@ def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[V
     rows = [in_memory(lowering, x) for x in rows]
 
     def turn(place: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-        each = iter(moving)
-        now = [x if s else next(each) for x, s in zip(carry, same, strict=True)]
+        items = iter(moving)
+        now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
         results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(place) for x in rows)])
         nodes = [lowering.nodes(x) for x in results]
         return [x for x, s in zip(nodes[:carried], same, strict=True) if not s], nodes[carried:]
@@ -111,8 +111,8 @@ def _written_out(
     stacked: list[list[Value]] = []
     turns = range(params["length"])
     for turn in reversed(turns) if params["reverse"] else turns:
-        each = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
-        results = lowering.inline(params["jaxpr"], [*fixed, *carry, *each])
+        items = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
+        results = lowering.inline(params["jaxpr"], [*fixed, *carry, *items])
         carry = results[: len(carry)]
         stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
     if not stacked:
@@ -120,7 +120,7 @@ def _written_out(
         return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
     if params["reverse"]:
         stacked.reverse()
-    return [*carry, *(np.stack(each) for each in zip(*stacked, strict=True))]
+    return [*carry, *(np.stack(item) for item in zip(*stacked, strict=True))]
 
 
 def _entry(x: np.ndarray, turn: int) -> np.ndarray:

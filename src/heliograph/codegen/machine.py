@@ -22,9 +22,9 @@ def target() -> llvm.Target:
 @cache
 def features() -> tuple[str, str, bool]:
     """This processor's name and features for LLVM, and whether it fuses products and sums."""
-    found = llvm.get_host_cpu_features()
+    result = llvm.get_host_cpu_features()
     arm = "aarch64" in target().triple or "arm64" in target().triple
-    return llvm.get_host_cpu_name(), found.flatten(), bool(found.get("fma")) or arm
+    return llvm.get_host_cpu_name(), result.flatten(), bool(result.get("fma")) or arm
 
 
 class Machine:

@@ -49,7 +49,7 @@ def _arg(op: str) -> Rule:
         x = np.moveaxis(inputs[0], equation.params["axes"][0], -1).reshape(
             -1, inputs[0].shape[equation.params["axes"][0]]
         )
-        found = []
+        results = []
         for row in x.tolist():
             best, place = row[0], graph.constant(0, type)
             for number, entry in enumerate(row[1:], 1):
@@ -59,8 +59,8 @@ def _arg(op: str) -> Rule:
                 better = graph.node("and", "bool", known, graph.node("or", "bool", beyond, is_nan))
                 best = graph.node("select", entry.type, better, entry, best)
                 place = graph.node("select", type, better, graph.constant(number, type), place)
-            found.append(place)
-        return [array_of(found, result_shape(equation))]
+            results.append(place)
+        return [array_of(results, result_shape(equation))]
 
     return rule
 
@@ -91,8 +91,8 @@ def _each_matrix(function: Any) -> Rule:
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
         flat = [x.reshape(-1, *x.shape[-2:]) for x in inputs]
-        each = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
-        return [np.stack(each).reshape(result_shape(equation))]
+        items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
+        return [np.stack(items).reshape(result_shape(equation))]
 
     return rule
 
@@ -128,8 +128,8 @@ def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -
         transposed, b = not transposed, b.T
     if transposed:
         a, lower = a.T, not lower
-    n, one = len(a), graph.constant(1.0, "f64")
-    scales = [one if params["unit_diagonal"] else graph.node("div", "f64", one, a[i, i]) for i in range(n)]
+    n, item = len(a), graph.constant(1.0, "f64")
+    scales = [item if params["unit_diagonal"] else graph.node("div", "f64", item, a[i, i]) for i in range(n)]
     x = np.empty(b.shape, dtype=object)
     order = list(range(n)) if lower else list(range(n))[::-1]
     for place, i in enumerate(order):

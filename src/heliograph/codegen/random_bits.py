@@ -96,8 +96,8 @@ def _seed(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> l
 def _hash(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
     """The hash itself, of words (...)."""
     shape = result_shape(equation)
-    each = zip(*broadcast(inputs, shape), strict=True)
-    keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in each]
+    items = zip(*broadcast(inputs, shape), strict=True)
+    keys = [_new_key(lowering.graph, Key(first, second), high, low) for first, second, high, low in items]
     return [array_of([key.first for key in keys], shape), array_of([key.second for key in keys], shape)]
 
 

@@ -13,7 +13,7 @@ from heliograph.codegen.elementwise import ELEMENTWISE
 from heliograph.codegen.graph import Node, Unsupported
 from heliograph.codegen.loops import in_memory, repeated
 from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
-from heliograph.codegen.memory import LONG, MANY, InMemory
+from heliograph.codegen.memory import LARGE, LONG, InMemory
 
 OF_ENTRIES = (
     *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
@@ -25,7 +25,7 @@ def is_long(inputs: list[Value]) -> bool:
     """Whether nodes for all entries of some argument would be too many; of tables alone they are numbers."""
     longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
     known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
-    return longest > MANY or (longest > LONG and not (known and _are_known(inputs)))
+    return longest > LARGE or (longest > LONG and not (known and _are_known(inputs)))
 
 
 def _are_known(inputs: list[Value]) -> bool:
@@ -38,12 +38,12 @@ def _of_entries(name: str) -> Rule:
         shape = result_shape(equation)
         if not is_long(inputs):
             return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
-        each = [x if len(x.shape) < len(shape) or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
-        one = like_row(equation)
+        items = [x if len(x.shape) < len(shape) or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
+        item = like_row(equation)
 
         def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
-            rows = [row_of(lowering, x, place, len(shape)) for x in each]
-            return [], list(lowering.equation(one, rows))
+            rows = [row_of(lowering, x, place, len(shape)) for x in items]
+            return [], list(lowering.equation(item, rows))
 
         return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
 
@@ -90,11 +90,11 @@ def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) ->
         if free is None:
             raise Unsupported("a sum of products over a long array")
         a, numbers = _first(a, free), ((_without(left, free), right), ((), ()))
-    one = like_row(equation, dimension_numbers=numbers)
+    item = like_row(equation, dimension_numbers=numbers)
 
     def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
         rows = [a.row(place), b.row(place) if left_batch else b]
-        return as_nodes(lowering, ([], list(lowering.equation(one, rows))))
+        return as_nodes(lowering, ([], list(lowering.equation(item, rows))))
 
     return list(repeated(lowering, a.shape[0], [], turn)[1])
 
@@ -121,11 +121,11 @@ def _reduction(name: str) -> Rule:
         dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
         row = SimpleNamespace(aval=like(shape, dtype))
         params = equation.params | {"axes": inner}
-        one: Any = SimpleNamespace(params=params, outvars=[row])
+        item: Any = SimpleNamespace(params=params, outvars=[row])
         pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
 
         def reduced(place: Node) -> np.ndarray:
-            return np.asarray(RULES[name](lowering, one, [lowering.nodes(x.row(place))])[0])
+            return np.asarray(RULES[name](lowering, item, [lowering.nodes(x.row(place))])[0])
 
         if 0 not in axes:
             return list(repeated(lowering, x.shape[0], [], lambda place, _: ([], [reduced(place)]))[1])

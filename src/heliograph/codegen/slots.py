@@ -44,11 +44,11 @@ class Slots:
         """Write it where it is computed, if the other function uses it."""
         if node not in self.places or writer.width != 1:
             return
-        own = vector(node.type, 1)
+        local = vector(node.type, 1)
         address = self._address(writer, node)
         if node.type == "bool":
-            name, own = writer.add(f"zext {own} {name} to <1 x i8>"), "<1 x i8>"
-        writer.line(f"store {own} {name}, ptr {address}, align 1")
+            name, local = writer.add(f"zext {local} {name} to <1 x i8>"), "<1 x i8>"
+        writer.line(f"store {local} {name}, ptr {address}, align 1")
 
     def _address(self, writer: Writer, node: Node) -> str:
         place, stride, index = self.place(node), 8, ""

@@ -38,9 +38,9 @@ def exp_of_sum(x: Vector, low: Vector) -> Vector:
     first, rest = _reduced(x, n)
     r = first + (rest + low)
     rest = (first - r) + (rest + low)
-    one = 1 + r
+    item = 1 + r
     small = fma(r * r, polynomial(r, EXP), fma(r, rest, rest))
-    return _limited(x, _scaled(one + ((1 - one + r) + small), count), 709.782712893384, -745.1332191019412)
+    return _limited(x, _scaled(item + ((1 - item + r) + small), count), 709.782712893384, -745.1332191019412)
 
 
 def exp2(x: Vector) -> Vector:

@@ -20,8 +20,8 @@ def _viewed(name: str, view: View) -> Rule:
     """A rule of one array: its view, or where there is none the rearranged nodes."""
 
     def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-        found = view(inputs[0], equation.params, result_shape(equation))
-        return [found] if found is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+        result = view(inputs[0], equation.params, result_shape(equation))
+        return [result] if result is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
 
     return rule
 
@@ -121,8 +121,8 @@ def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list
 def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
     """Strides of the same entries where axes of length 1 were added."""
     rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
-    each = iter(rest)
-    return [next(each) if n != 1 else 0 for n in shape]
+    items = iter(rest)
+    return [next(items) if n != 1 else 0 for n in shape]
 
 
 def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:

@@ -54,7 +54,7 @@ from .polynomial import (
 from .prediction import (
     prediction_of as prediction_of,
 )
-from .revealed import (
+from .mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
@@ -65,8 +65,8 @@ from .scheduled import (
 from .sequential import (
     sequential_filter as sequential_filter,
 )
-from .told import (
-    told_filter as told_filter,
+from .side_information import (
+    side_information_filter as side_information_filter,
 )
 from .transform import (
     AbstractTransform as AbstractTransform,

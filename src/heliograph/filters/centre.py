@@ -33,12 +33,12 @@ class Centre(Module):
     start: Float[Array, " n"]
     transition: Array | OverTime
     drift: Array | OverTime
-    heard: Array | OverTime
+    received: Array | OverTime
 
 
 def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | None:
     """The mean of a linear model's state; None where it is zero throughout or a gain is random."""
-    plants, sensors, channels = _each(plant), _each(sensor), _each(channel)
+    plants, sensors, channels = _over_steps(plant), _over_steps(sensor), _over_steps(channel)
     if not all(has_known_gain(c) for c in channels):
         return None
     drifts = [np.asarray(p.noise_mean()) for p in plants]
@@ -47,21 +47,21 @@ def centre_of(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Centre | 
         return None
     count = max(len(sensors), len(channels))
     pairs = zip(_repeated(sensors, count), _repeated(channels, count), strict=False)
-    heard = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
-    return Centre(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(heard))
+    received = [np.asarray(c.moments(1).mean[:-1, :-1]) @ _matrix(s) for s, c in pairs]
+    return Centre(start, _series([_matrix(p) for p in plants]), _series(drifts), _series(received))
 
 
 def without_mean(plant: AnyPlant) -> AnyPlant:
     """The plant of x_k - E[x_k]."""
     if isinstance(plant, OverTime):
-        return over_time([without_mean(one) for one in unstack(plant)])
+        return over_time([without_mean(item) for item in unstack(plant)])
     assert isinstance(plant, LinearPlant) and isinstance(plant.noise, AbstractNoise)
     law = about_mean(plant.deviation) if plant.deviation is not None else Gaussian(plant.initial_covariance)
     n = len(plant.states)
     return LinearPlant(plant.matrix, about_mean(plant.noise), np.zeros(n), law, plant.input_matrix, plant.states)
 
 
-def _each(item: Part | OverTime) -> list[Part]:
+def _over_steps(item: Part | OverTime) -> list[Part]:
     return unstack(item) if isinstance(item, OverTime) else [item]
 
 

@@ -26,7 +26,7 @@ from heliograph.numerics.linalg import eigh, symmetrize
 from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.second_moments import SecondOrder
 
-Hears = Callable[[jax.Array], jax.Array]
+Observe = Callable[[jax.Array], jax.Array]
 SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of none tells nothing of when it was
 SHARE = 1e-3  # of what the outputs say of an offset: with less left when all other states may be anything, it is none
 RANK = 1e-12  # of the largest eigenvalue: directions below are not seen at all
@@ -93,11 +93,11 @@ class ClockFilter(AbstractFilter):
         sensor, prior = at(base.sensor, k), Belief(state.mean, state.covariance)
         signal = signal_of(at(base.plant, k), sensor, base.transform, prior)
         expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
-        z = nearest(jnp.asarray(z), expected, base.heard_angles)
+        z = nearest(jnp.asarray(z), expected, base.observed_angles)
         present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
         silence = jnp.where(present, 0, state.silence)
-        heard = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
-        observed = self._observed(state, lambda x: heard @ sensor.measure(x), k) & jnp.any(present)
+        arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
+        observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
         gain, _ = base.update.correct(prior.covariance, signal, channel, present)
         gain = gain * self._estimated(observed)[:, None]
         mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
@@ -107,16 +107,16 @@ class ClockFilter(AbstractFilter):
 
     def _estimated(self, observed: jax.Array) -> jax.Array:
         """1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
-        each = jnp.ones(len(self.states))
+        values = jnp.ones(len(self.states))
         for i, place in enumerate(self.offsets):
-            each = each.at[place : place + 2].set(jnp.where(observed[i], 1.0, 0.0))
-        return each
+            values = values.at[place : place + 2].set(jnp.where(observed[i], 1.0, 0.0))
+        return values
 
-    def _observed(self, state: ClockBelief, hears: Hears, k: Step) -> jax.Array:
+    def _observed(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Whether each clock can be observed."""
-        slope = jax.jacfwd(hears)
+        slope = jax.jacfwd(observe)
         rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
-        seen = self._alone(state, hears, k)
+        seen = self._alone(state, observe, k)
         result = []
         for i, place in enumerate(self.offsets):
             variance = jnp.einsum("ri,ij,rj->r", curve[:, place], state.covariance, curve[:, place])
@@ -124,15 +124,15 @@ class ClockFilter(AbstractFilter):
             result.append(moves & (seen[i] > SHARE))
         return jnp.stack(result)
 
-    def _alone(self, state: ClockBelief, hears: Hears, k: Step) -> jax.Array:
+    def _alone(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
         """Share of the outputs' derivatives by each offset that is no combination of those by the other states."""
         plant, n = at(self.base.plant, k), len(self.states)
 
         def follow(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
             x, reach = carry
-            heard = jax.jacfwd(hears)(x) @ reach
+            observed = jax.jacfwd(observe)(x) @ reach
             step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
-            return (plant.transition(x, state.inputs), step @ reach), heard.T @ heard
+            return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
 
         _, parts = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
         return jnp.stack([_share(jnp.sum(parts, axis=0), place) for place in self.offsets])
@@ -149,10 +149,10 @@ def _share(square: jax.Array, place: int) -> jax.Array:
     scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
     correlations = scale[:, None] * square * scale
     others = [i for i in range(square.shape[0]) if i != place]
-    among, own = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), place]
+    among, local = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), place]
     values, vectors = eigh(among)
     used = values > RANK * values[-1]
-    known = jnp.sum(jnp.where(used, (vectors.T @ own) ** 2 / jnp.where(used, values, 1.0), 0.0))
+    known = jnp.sum(jnp.where(used, (vectors.T @ local) ** 2 / jnp.where(used, values, 1.0), 0.0))
     return jnp.where(size[place] > 0, 1 - known, 0.0)
 
 

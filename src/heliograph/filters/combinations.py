@@ -43,7 +43,7 @@ def atoms_of(item: AbstractRandomAffine) -> list[Component]:
         case Stack():
             result = atoms_of(item.maps[0])
             for part in item.maps[1:]:
-                result = _combine(result, atoms_of(part), _beside)
+                result = _combine(result, atoms_of(part), _others)
         case Mixture():
             weighted = zip(item.choice.probabilities, item.maps, strict=True)
             result = [c._replace(weight=p * c.weight) for p, part in weighted for c in atoms_of(part)]
@@ -66,7 +66,7 @@ def _after(x: Component, y: Component) -> Component:
     return Component(x.weight * y.weight, y.gain @ x.gain, y.gain @ x.offset + y.offset, noise)
 
 
-def _beside(x: Component, y: Component) -> Component:
+def _others(x: Component, y: Component) -> Component:
     """Both heard, one above the other."""
     gain, offset = np.concatenate([x.gain, y.gain]), np.concatenate([x.offset, y.offset])
     return Component(x.weight * y.weight, gain, offset, np.asarray(block_diag(x.noise, y.noise)))

@@ -20,7 +20,7 @@ from heliograph.numerics.small_matrix import (
     PRECISE,
     congruence,
     diagonal,
-    own,
+    diagonal_of,
     pivots,
     root,
     rounding,
@@ -116,9 +116,9 @@ def _known_gain_correction(
     cross = _cross(signal, channel, present)
     if signal.matrix is None or signal.noise is None:
         return gain_and_bound(prior, cross, spread + mean_part)
-    heard = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
+    received = jnp.where(present[:, None], times(channel.mean_gain, signal.matrix), 0.0)
     noise = spread + jnp.where(both, congruence(channel.mean_gain, signal.noise), 0.0)
-    return gain_and_covariance(prior, cross, spread + mean_part, heard, noise)
+    return gain_and_covariance(prior, cross, spread + mean_part, received, noise)
 
 
 def _cross(signal: Signal, channel: SecondOrder, present: jax.Array) -> jax.Array:
@@ -150,7 +150,7 @@ def zero_mean_correction(
     cross = _cross(signal, channel, present)
     base = channel.power(unknown_part, present) + channel.spread(known_part, present) + absent(present)
     shift, power = channel.shift(unknown_part, present), times(cross, transpose(cross))
-    used = heard(channel, present)
+    used = received(channel, present)
     among = jnp.where(used[:, None] & used[None], signal.covariance, 0.0)
     of_used = jnp.where(used, signal.cross, 0.0)
     explained = symmetric(times(of_used, solve(among, transpose(of_used))))
@@ -160,7 +160,7 @@ def zero_mean_correction(
     return gain, bound + beta * explained
 
 
-def heard(channel: SecondOrder, present: jax.Array) -> jax.Array:
+def received(channel: SecondOrder, present: jax.Array) -> jax.Array:
     """Which components of the signal have a part in what arrived: the others say nothing, as if never measured."""
     m, p = channel.mean_gain.shape[:2]
     reached = (channel.power.center != 0) | (channel.power.radius != 0)
@@ -168,12 +168,12 @@ def heard(channel: SecondOrder, present: jax.Array) -> jax.Array:
     return jnp.stack([jnp.any(jnp.stack(rows), axis=0) for rows in parts])
 
 
-def homogeneous(second: jax.Array, mean: jax.Array, one: float) -> jax.Array:
-    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `one` in the last corner."""
+def homogeneous(second: jax.Array, mean: jax.Array, item: float) -> jax.Array:
+    """E[(y, 1)(y, 1)'] from E[y y'] and E[y], with `item` in the last corner."""
     column = mean[:, None]
     second = jnp.broadcast_to(second, (*second.shape[:2], *jnp.broadcast_shapes(second.shape[2:], mean.shape[1:])))
     column = jnp.broadcast_to(column, (*column.shape[:2], *second.shape[2:]))
-    corner = jnp.full_like(column[:1], one)
+    corner = jnp.full_like(column[:1], item)
     top = jnp.concatenate([second, column], axis=1)
     return jnp.concatenate([top, jnp.concatenate([transpose(column), corner], axis=1)])
 
@@ -270,4 +270,4 @@ def _is_precise(omega: jax.Array, noise: jax.Array) -> jax.Array:
 
     So a combination of components that is free of noise counts, though none of them is.
     """
-    return jnp.any(pivots(noise) < rounding(PRECISE, omega, 1000) * own(omega), axis=0)
+    return jnp.any(pivots(noise) < rounding(PRECISE, omega, 1000) * diagonal_of(omega), axis=0)

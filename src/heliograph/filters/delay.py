@@ -12,7 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.held import HeldFilter, relayed_filter, with_relays
 from heliograph.filters.plan import PlannedFilter
-from heliograph.filters.told import with_flag
+from heliograph.filters.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
@@ -67,17 +67,17 @@ class PartFilter(AbstractFilter):
         """The first states."""
         return self._part(self.base.after_step(state, k))
 
-    def _part(self, told: Estimate) -> Estimate:
+    def _part(self, estimate_: Estimate) -> Estimate:
         n = len(self.states)
-        return Estimate(told.mean[..., :n], told.covariance[..., :n, :n], self.claim)
+        return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all that does not depend on data computed before."""
         plan, n = self.base.planned(inputs), len(self.states)
         if not isinstance(plan, PlannedFilter):
             return PartFilter(plan, n)
-        want = jnp.eye(len(self.base.states)) if plan.want is None else jnp.asarray(plan.want)
-        return replace(plan, covariances=plan.covariances[:, :n, :n], want=want[:n], states=self.states)
+        projection = jnp.eye(len(self.base.states)) if plan.projection is None else jnp.asarray(plan.projection)
+        return replace(plan, covariances=plan.covariances[:, :n, :n], projection=projection[:n], states=self.states)
 
 
 def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
@@ -143,12 +143,12 @@ class LateFilter(AbstractFilter):
     def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
         """Use what was sent at step k - delay; what is heard before anything was sent says nothing."""
         then = jnp.asarray(k) - self.delay
-        heard = jnp.where(then >= 0, jnp.asarray(z), jnp.nan)
+        observed = jnp.where(then >= 0, jnp.asarray(z), jnp.nan)
         step = jnp.maximum(then, 0)
-        base, innovation = self.base.correct(state.base, heard, step)
+        base, innovation = self.base.correct(state.base, observed, step)
         _, early = self.base.correct(state.base, z, step)
-        told = jax.tree.map(lambda now, before: jnp.where(then >= 0, now, before), innovation, early)
-        return state._replace(base=base), Innovation(told.value, told.covariance, innovation.log_likelihood)
+        published = jax.tree.map(lambda now, before: jnp.where(then >= 0, now, before), innovation, early)
+        return state._replace(base=base), Innovation(published.value, published.covariance, innovation.log_likelihood)
 
     @in_float64
     def estimate(self, state: LateState) -> Estimate:
@@ -172,7 +172,7 @@ def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
     return LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
 
 
-class ToldDelayFilter(AbstractFilter):
+class KnownDelayFilter(AbstractFilter):
     """The best linear filter behind a link that tells how late each value is, as the last number that is received.
 
     It estimates what was sent as well, so that one y heard twice is one, with two channel noises: joint noise
@@ -206,17 +206,17 @@ class ToldDelayFilter(AbstractFilter):
         d = jnp.clip(jnp.where(known, delay, 0.0).astype(int), 0, longest)
         here = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
         base = eqx.tree_at(lambda item: item.channel, self.base, here)
-        after, heard = base.correct(state, z, k)
+        after, innovation = base.correct(state, z, k)
         used = jax.tree.map(lambda new, old: jnp.where(known, new, old), after, state)
-        surprise, covariance = with_flag(heard.covariance, delay)
-        likelihood = jnp.where(known, heard.log_likelihood, 0.0)
-        return used, Innovation(jnp.append(heard.value, surprise), covariance, likelihood)
+        flag_innovation, covariance = with_flag(innovation.covariance, delay)
+        likelihood = jnp.where(known, innovation.log_likelihood, 0.0)
+        return used, Innovation(jnp.append(innovation.value, flag_innovation), covariance, likelihood)
 
     @in_float64
     def estimate(self, state: PyTree) -> Estimate:
         """The plant's states."""
-        n, told = len(self.states), self.base.estimate(state)
-        return Estimate(told.mean[:n], told.covariance[:n, :n], self.claim)
+        n, published = len(self.states), self.base.estimate(state)
+        return Estimate(published.mean[:n], published.covariance[:n, :n], self.claim)
 
 
 Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
@@ -226,8 +226,8 @@ def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Ma
     """The filter that `make` makes of links that are not late, behind those that are."""
     start, n = first(channel), len(first(plant).states)
     check_link(first(sensor), start, n, late=True)
-    if isinstance(start, Delayed) and start.told:
-        return _told(plant, sensor, channel, make)
+    if isinstance(start, Delayed) and start.timestamped:
+        return _known_delays(plant, sensor, channel, make)
     if isinstance(channel, Delayed) and channel.constant:
         return LateFilter(make(plant, sensor, channel.link), channel.past)
     if isinstance(start, Relayed):
@@ -242,16 +242,16 @@ def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: M
     return relayed_filter(plant, channel, make(larger, last, link), lines)
 
 
-def _told(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> ToldDelayFilter:
+def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
     if not isinstance(channel, Delayed):
         raise fail("channel with told delays", "one that does not vary", "one in over_time")
     check_forgets("link with told delays", channel.link)
     larger, everything, _ = with_past(plant, sensor, channel)
-    each = [channel.given(d) for d in range(channel.past + 1)]
-    base, start = make(larger, everything, each[0]), first(plant)
-    return ToldDelayFilter(
+    items = [channel.given(d) for d in range(channel.past + 1)]
+    base, start = make(larger, everything, items[0]), first(plant)
+    return KnownDelayFilter(
         base=base,
-        channels=stack([second_order(one) for one in each]),
+        channels=stack([second_order(item) for item in items]),
         claim=base.claim,
         states=start.states,
         inputs=start.inputs,
@@ -262,7 +262,7 @@ def _told(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> T
 def as_current(channel: Channel) -> Channel:
     """The channel for those who take what is late as current: all that its line holds is y_k."""
     if isinstance(channel, OverTime):
-        return over_time([as_current(one) for one in unstack(channel)])
+        return over_time([as_current(item) for item in unstack(channel)])
     return _at_once(as_maps("channel", [channel])[0])
 
 

@@ -238,7 +238,7 @@ def factored(base: AbstractFilter) -> AbstractFilter:
         cubature=isinstance(transform, Cubature),
         from_prior=by_prior and random_gain,
         random_gain=random_gain,
-        angles=() if isinstance(base, LinearFilter) else base.heard_angles,
+        angles=() if isinstance(base, LinearFilter) else base.observed_angles,
         claim=base.claim,
         states=base.states,
         inputs=base.inputs,

@@ -42,10 +42,10 @@ class FedBackFilter(AbstractFilter):
     inputs: tuple[str, ...] = eqx.field(static=True)
     received: int = eqx.field(static=True)
 
-    def reference(self, told: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
+    def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
         """What is taken off y at step k, from the estimate after the step before and the input over step k."""
         plant, sensor = at(self.base.plant, k), at(self.base.sensor, k)
-        expected = plant.transition(jnp.asarray(told), jnp.asarray(u)) + plant.noise_mean()
+        expected = plant.transition(jnp.asarray(known), jnp.asarray(u)) + plant.noise_mean()
         result: jax.Array = sensor.measure(expected) + sensor.noise.mean
         return result
 
@@ -68,8 +68,8 @@ class FedBackFilter(AbstractFilter):
         y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
-        after, heard = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z))
-        return FedBackBelief(*after, state.reference), heard
+        after, innovation = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z))
+        return FedBackBelief(*after, state.reference), innovation
 
     @in_float64
     def estimate(self, state: FedBackBelief) -> Estimate:

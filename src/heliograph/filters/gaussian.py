@@ -12,8 +12,8 @@ from heliograph.filters.belief import AbstractBeliefFilter, Belief, predicted, p
 from heliograph.filters.correction import Signal
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.update import AbstractUpdate, Polytope
 from heliograph.model.angle import received_angles
@@ -31,7 +31,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.second_moments import SecondOrder, has_random_gain
 
-Each = TypeVar("Each", AbstractRandomAffine, SecondOrder)
+Element = TypeVar("Element", AbstractRandomAffine, SecondOrder)
 
 
 class GaussianFilter(AbstractBeliefFilter):
@@ -43,36 +43,36 @@ class GaussianFilter(AbstractBeliefFilter):
     spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
 
     `linear`: plant and sensor are, no gain is random and nothing is an angle, so that nothing but the mean depends on
-    data. `heard_angles`: which components of z are angles; z is then read within half a turn of what is expected.
+    data. `observed_angles`: which components of z are angles; z is then read within half a turn of what is expected.
     """
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
     update: AbstractUpdate
     linear: bool = eqx.field(static=True)
-    heard_angles: Angles = eqx.field(static=True)
+    observed_angles: Angles = eqx.field(static=True)
 
     @corrects
     def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         unknown = signal.about_mean() if self.linear else signal
-        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.heard_angles, unknown)
+        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.observed_angles, unknown)
 
-    def retain(
-        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
         """The update itself where it is linear, else the moments around it."""
         plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
         if not self.linear:
             cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
-            return moments_retained(after, prior, cross, "nominal", plant.angles)
-        heard_of = heard_through(channel.mean_gain, sensor.matrix)
+            return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
+        observed_of = observed_through(channel.mean_gain, sensor.matrix)
         process = plant.noise_covariance(jnp.asarray(u))
-        found = linear_retained(
-            after, prior, plant.matrix, process, heard_of, heard.value, heard.covariance, self.claim
+        result = linear_smoother_step(
+            after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
         )
-        return replace(found, angles=plant.angles)
+        return replace(result, angles=plant.angles)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before, where they do not depend on data."""
@@ -147,7 +147,7 @@ def _build(
     trusted = trusted and not memory_matters(channel)
     channel = without_memory(channel)
     described = describe(channel, update)
-    pairs = zip(_each(channel), _each(described), strict=True)
+    pairs = zip(_over_steps(channel), _over_steps(described), strict=True)
     on_line = not start.circular and not first(sensor).circular
     linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
     claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
@@ -160,7 +160,7 @@ def _build(
         initial_mean=mean,
         initial_covariance=spread,
         linear=linear,
-        heard_angles=angles,
+        observed_angles=angles,
         claim=claim,
         states=start.states,
         inputs=start.inputs,
@@ -168,7 +168,7 @@ def _build(
     )
 
 
-def _each(item: Each | OverTime) -> list[Each]:
+def _over_steps(item: Element | OverTime) -> list[Element]:
     return unstack(item) if isinstance(item, OverTime) else [item]
 
 

@@ -36,7 +36,7 @@ class HeldFilter(AbstractFilter):
     """
 
     base: AbstractFilter
-    hears: tuple[SecondOrder, ...]
+    links: tuple[SecondOrder, ...]
     lines: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
@@ -52,8 +52,8 @@ class HeldFilter(AbstractFilter):
     def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
         """The plant moves, the sensor sends, and one relay after another hears."""
         state = self.base.predict(state, u, k)
-        for link, line in zip(self.hears, self.lines, strict=True):
-            state = _heard(state, link, *line)
+        for link, line in zip(self.links, self.lines, strict=True):
+            state = _received_by(state, link, *line)
         return state
 
     @corrects
@@ -64,15 +64,15 @@ class HeldFilter(AbstractFilter):
     @in_float64
     def estimate(self, state: PyTree) -> Estimate:
         """The plant's states."""
-        n, told = len(self.states), self.base.estimate(state)
-        return Estimate(told.mean[:n], told.covariance[:n, :n], self.claim)
+        n, known = len(self.states), self.base.estimate(state)
+        return Estimate(known.mean[:n], known.covariance[:n, :n], self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
         return plan(self, inputs, np.eye(len(self.states), len(self.base.states)))
 
 
-def _heard(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
+def _received_by(state: PyTree, link: SecondOrder, start: int, length: int, place: int) -> PyTree:
     """The moments after r at `place` is what the link makes of the line from `start` on."""
     gain, offset = jnp.asarray(link.mean_gain), jnp.asarray(link.offset)
     total, m = len(state.mean), len(offset)
@@ -107,7 +107,7 @@ def with_relays(
         start = total
         total += later.inputs
         if isinstance(moved, OverTime):
-            moved = over_time([_holding(one, i, stage.outputs, later.past) for one in unstack(moved)])
+            moved = over_time([_holding(item, i, stage.outputs, later.past) for item in unstack(moved)])
         else:
             moved = _holding(moved, i, stage.outputs, later.past)
     last = LinearSensor(np.eye(total)[start:], np.zeros((total - start, total - start)), first(moved).states[start:])
@@ -136,13 +136,13 @@ def relayed_filter(plant: AnyPlant, channel: Relayed, base: AbstractFilter, line
     Raises:
         ValueError: relays' links with uncertain probabilities.
     """
-    hears = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
-    if any(link.uncertain for link in hears):
+    links = tuple(second_order(of_line(stage)) for stage in channel.stages[:-1])
+    if any(link.uncertain for link in links):
         raise fail("link to a relay that is late by chance", "known probabilities", "uncertain ones")
     start = first(plant)
     return HeldFilter(
         base=base,
-        hears=hears,
+        links=links,
         lines=lines,
         claim=base.claim,
         states=start.states,

@@ -16,9 +16,9 @@ from heliograph.filters.gaussian import describe
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.modal import modal_filter
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import heard_through, linear_retained, moments_retained
-from heliograph.filters.told import told_filter
+from heliograph.filters.side_information import side_information_filter
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import linear_smoother_step, moments_smoother_step, observed_through
 from heliograph.filters.uncertain import uncertain_modal_filter
 from heliograph.filters.update import Polytope
 from heliograph.model.channel import Channel, check_link
@@ -30,7 +30,7 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, diagonal, own, times, times_vector, transpose
+from heliograph.numerics.small_matrix import congruence, diagonal, diagonal_of, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.second_moments import SecondOrder, has_known_mean
@@ -80,8 +80,8 @@ class LinearFilter(AbstractFilter):
         """Both moments over step k."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
-        error, own = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
-        return LinearBelief(*error, *own)
+        error, local = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
+        return LinearBelief(*error, *local)
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
@@ -103,37 +103,37 @@ class LinearFilter(AbstractFilter):
             channel.offset,
             z,
         )
-        heard = gaussian_innovation(z, expected, innovation_covariance(y, channel))
-        return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), heard
+        innovation = gaussian_innovation(z, expected, innovation_covariance(y, channel))
+        return LinearBelief(mean, covariance, state.state_mean, state.state_covariance), innovation
 
     @in_float64
     def estimate(self, state: LinearBelief) -> Estimate:
         """The estimate's mean and covariance."""
         return Estimate(state.mean, state.covariance, self.claim)
 
-    def retain(
+    def smoother_step(
         self,
         before: LinearBelief,
         prior: LinearBelief,
         after: LinearBelief,
-        heard: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """The update itself, or the moments around it where E[G] is uncertain."""
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         transition = jnp.asarray(at(self.plant, k).matrix)
         if not self.mean_known:
             cross = before.covariance @ transition.T
-            return moments_retained(after, prior, cross, "nominal")
-        total = heard.covariance
+            return moments_smoother_step(after, prior, cross, "nominal")
+        total = innovation.covariance
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
             y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
             total = known_gain_covariance(y, channel, ~jnp.isnan(z))
-        output = heard_through(channel.mean_gain, sensor.matrix)
+        output = observed_through(channel.mean_gain, sensor.matrix)
         process = at(self.plant, k).noise_covariance(jnp.asarray(u))
-        return linear_retained(after, prior, transition, process, output, heard.value, total, self.claim)
+        return linear_smoother_step(after, prior, transition, process, output, innovation.value, total, self.claim)
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
@@ -156,8 +156,8 @@ def above_rounding(covariance: jax.Array, state_mean: jax.Array, state_covarianc
     innovation by it.
     """
     unit = (len(covariance) + 2) * float(np.finfo(covariance.dtype).eps)
-    second = own(state_covariance) + state_mean**2
-    return covariance + diagonal(jnp.where(own(covariance) > 0, unit**2 * second, 0.0))
+    second = diagonal_of(state_covariance) + state_mean**2
+    return covariance + diagonal(jnp.where(diagonal_of(covariance) > 0, unit**2 * second, 0.0))
 
 
 @runs_last
@@ -201,8 +201,9 @@ def linear_filter(
     """The best linear filter for a linear plant and sensor behind any channel.
 
     Claim: "exact"; "upper" where probabilities are uncertain. Behind a channel that remembers its modes are estimated
-    too; if it also loses data, what arrives tells of the modes (`told_filter`). Behind a link that is late what was
-    sent is estimated too, unless the delay is constant. A sensor noise correlated with its own past is outside.
+    too; if it also loses data, what arrives tells of the modes (`side_information_filter`). Behind a link that is
+    late what was sent is estimated too, unless the delay is constant. A sensor noise correlated with its own past is
+    outside.
 
     Raises:
         ValueError: a plant or sensor that is not linear, or parts that do not fit.
@@ -216,7 +217,7 @@ def linear_filter(
         if update is not None:
             raise fail("update", "none behind a channel that remembers", type(update).__name__)
         if first(channel).erases:
-            return told_filter(plant, sensor, channel)
+            return side_information_filter(plant, sensor, channel)
         if uncertain_chain(channel):
             return uncertain_modal_filter(plant, sensor, channel)
         return modal_filter(plant, sensor, channel)

@@ -34,8 +34,8 @@ class AbstractMerging(Module):
 
     def pairs(self, modes: int) -> tuple[np.ndarray, np.ndarray]:
         """Components and modes to hear with: all that may have a weight."""
-        each = np.arange(modes)
-        return each, each
+        items = np.arange(modes)
+        return items, items
 
 
 class MergeAll(AbstractMerging):

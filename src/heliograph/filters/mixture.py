@@ -10,8 +10,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.combinations import COMPONENT_LIMIT, atoms_of
 from heliograph.filters.innovation import log_density, mixed_innovation
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import moments_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import moments_smoother_step
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.estimate import Claim, Estimate, Innovation
@@ -77,7 +77,7 @@ class MixtureFilter(AbstractFilter):
     plant: AnyPlant
     components: Components | OverTime
     initial: Float[Array, " M"]
-    heard_angles: Angles = eqx.field(static=True)
+    observed_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -114,9 +114,9 @@ class MixtureFilter(AbstractFilter):
         def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
             cross = jnp.where(present[:, None], gain @ spread, 0.0)
             total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
-            value = wrapped(z - gain @ mean - offset, self.heard_angles)
-            heard = jnp.where(present, value, 0.0)
-            solved = psd_solve(total, jnp.concatenate([cross, heard[:, None]], axis=1))
+            value = wrapped(z - gain @ mean - offset, self.observed_angles)
+            observed = jnp.where(present, value, 0.0)
+            solved = psd_solve(total, jnp.concatenate([cross, observed[:, None]], axis=1))
             free = jnp.diagonal(cholesky(total)) > 0
             likelihood = log_density(value, total, jnp.abs(z) + jnp.abs(z - value))
             return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
@@ -132,30 +132,30 @@ class MixtureFilter(AbstractFilter):
             - jnp.einsum("a,aij->ij", weight, known)
             + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
         )
-        value = nearest(value, value[jnp.argmax(prior)], self.heard_angles)
-        heard = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
+        value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
+        innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
         modes = jnp.zeros(len(law)).at[c.mode].add(weight)
-        found = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
-        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, found), heard
+        result = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
 
     @in_float64
     def estimate(self, state: MixtureBelief) -> Estimate:
         """The belief, angles between -pi and pi."""
         return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
 
-    def retain(
+    def smoother_step(
         self,
         before: MixtureBelief,
         prior: MixtureBelief,
         after: MixtureBelief,
-        heard: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """The moments around the update."""
         cross = before.covariance @ at(self.plant, k).matrix.T
-        return moments_retained(after, prior, cross, "nominal", first(self.plant).angles)
+        return moments_smoother_step(after, prior, cross, "nominal", first(self.plant).angles)
 
 
 def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
@@ -198,13 +198,13 @@ def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolut
         steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
         sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
         modes = [_modes(c) for c in channels if isinstance(c, AbstractRandomAffine)]
-        each = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
-        components = over_time([_components(s, now, before, floor) for s, now, before in each])
+        items = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
+        components = over_time([_components(s, now, before, floor) for s, now, before in items])
     return MixtureFilter(
         plant=plant,
         components=components,
         initial=modes[0].initial,
-        heard_angles=angles,
+        observed_angles=angles,
         claim="nominal",
         states=start.states,
         inputs=start.inputs,
@@ -220,8 +220,8 @@ def _modes(channel: AbstractRandomAffine) -> JointModes:
 
 def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> Components:
     assert isinstance(sensor, LinearSensor)  # checked before
-    heard = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
-    parts = [(c, i) for i, m in enumerate(now.maps) for c in atoms_of(Series([heard, m])) if c.weight > 0]
+    received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
+    parts = [(c, i) for i, m in enumerate(now.maps) for c in atoms_of(Series([received, m])) if c.weight > 0]
     if len(parts) > COMPONENT_LIMIT:
         raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")
     mode = np.array([i for _, i in parts])

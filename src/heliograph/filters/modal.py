@@ -17,8 +17,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.correction import absent, gain_and_covariance
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import linear_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import linear_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first, over_time, unstack
@@ -33,7 +33,7 @@ from heliograph.random_affine.modes import JointModes, joint_modes
 from heliograph.random_affine.second_moments import nominal_spread
 
 
-class Heard(Module):
+class ObservationModel(Module):
     """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
 
     transition: of the modes from the step before to this one; radius: how far each may be off.
@@ -74,7 +74,7 @@ class ModalFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: Heard | OverTime
+    channel: ObservationModel | OverTime
     initial: Float[Array, " M"]
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
@@ -112,9 +112,9 @@ class ModalFilter(AbstractFilter):
 
         Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
         """
-        heard, added, common = self._hears(state, k)
-        expected = common + heard @ (state.mean - known_part(state.moments[:, -1, -1], state.centre))
-        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, expected, z)
+        observed, added, common = self._observe(state, k)
+        expected = common + observed @ (state.mean - known_part(state.moments[:, -1, -1], state.centre))
+        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
@@ -123,7 +123,7 @@ class ModalFilter(AbstractFilter):
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
         return jnp.kron(rows.T, move), move, noise, centre, rows
 
-    def _hears(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
+    def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
         """What is heard of zeta beyond what all modes send, Cov(z - E[z | zeta]), and what all modes send."""
         channel = at(self.channel, k)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
@@ -131,35 +131,35 @@ class ModalFilter(AbstractFilter):
         second = measure @ state.moments @ measure.T + law[:, None, None] * noise
         added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
         added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
-        heard, common = beside_common(gains @ measure, law)
-        return joined(heard), added, common
+        observed, common = without_common(gains @ measure, law)
+        return joined(observed), added, common
 
     @in_float64
     def estimate(self, state: ModalBelief) -> Estimate:
         """x = sum_j zeta^j."""
-        want = sum_of_modes(len(self.states), len(self.initial))
-        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+        projection = sum_of_modes(len(self.states), len(self.initial))
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
-    def retain(
+    def smoother_step(
         self,
         before: ModalBelief,
         prior: ModalBelief,
         after: ModalBelief,
-        heard: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """The update of zeta itself."""
-        output, _, _ = self._hears(prior, k)
-        return linear_retained(
+        output, _, _ = self._observe(prior, k)
+        return linear_smoother_step(
             after,
             prior,
             self._moves(before, u, k)[0],
             None,
             output,
-            heard.value,
-            heard.covariance,
+            innovation.value,
+            innovation.covariance,
             self.claim,
             sum_of_modes(len(self.states), len(self.initial)),
         )
@@ -174,10 +174,10 @@ def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
     return np.tile(np.eye(n, n + 1), (1, modes))
 
 
-def heard_linearly(
+def linear_observation(
     mean: Float[jax.Array, " N"],
     covariance: Float[jax.Array, "N N"],
-    heard: Float[jax.Array, "m N"],
+    received: Float[jax.Array, "m N"],
     added: Float[jax.Array, "m m"],
     expected: Float[jax.Array, " m"],
     z: ArrayLike,
@@ -186,13 +186,13 @@ def heard_linearly(
     z = jnp.asarray(z)
     present = ~jnp.isnan(z)
     both = present[:, None] & present
-    cross = heard @ covariance
-    total = cross @ heard.T + added
+    cross = received @ covariance
+    total = cross @ received.T + added
     gain, after = gain_and_covariance(
         covariance,
         jnp.where(present[:, None], cross, 0.0),
         jnp.where(both, total, 0.0) + absent(present),
-        jnp.where(present[:, None], heard, 0.0),
+        jnp.where(present[:, None], received, 0.0),
         jnp.where(both, added, 0.0) + absent(present),
     )
     return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
@@ -236,7 +236,7 @@ def measured_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, 
     return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
 
 
-def beside_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What the modes send beside what is sent on average (the indicators sum to 1: it tells nothing of them), and that.
 
     Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
@@ -264,7 +264,7 @@ def blocks(parts: jax.Array) -> jax.Array:
 
 def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
     """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
-    start, (initial, described) = first(plant), heard_over(channel)
+    start, (initial, described) = first(plant), observation_models(channel)
     return ModalFilter(
         plant=plant,
         sensor=sensor,
@@ -277,21 +277,21 @@ def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalF
     )
 
 
-def heard_over(channel: Channel) -> tuple[Float[Array, " M"], Heard | OverTime]:
+def observation_models(channel: Channel) -> tuple[Float[Array, " M"], ObservationModel | OverTime]:
     """Law of the modes at the first step, and what is heard at each; a channel that forgets has one mode."""
     if not isinstance(channel, OverTime):
         modes = joint_modes(channel)
-        return modes.initial, heard(modes, modes)
+        return modes.initial, observation_model(modes, modes)
     steps = [joint_modes(c) for c in unstack(channel)]
-    each = [heard(one, before) for one, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
-    return steps[0].initial, over_time(each)
+    items = [observation_model(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(items)
 
 
-def heard(now: JointModes, before: JointModes) -> Heard:
+def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
     """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
     mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
     spread = stacked([nominal_spread(m).center for m in now.maps])
-    return Heard(before.transition, before.radius, mean, spread)
+    return ObservationModel(before.transition, before.radius, mean, spread)
 
 
 def claim_of_modes(channel: Channel) -> Claim:

@@ -13,10 +13,10 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.belief import Belief, predicted
 from heliograph.filters.gaussian import signal_of
 from heliograph.filters.merging import AbstractMerging, MergeAll, MergeByMode, MergeByNextMode, ModalBeliefs, merged
-from heliograph.filters.modes_heard import describe_modes, hear
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import moments_retained
-from heliograph.filters.told import Told
+from heliograph.filters.mode_observations import describe_modes, receive
+from heliograph.filters.side_information import SideInformation
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import moments_smoother_step
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
@@ -40,11 +40,11 @@ class MultipleModelFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: Told | OverTime
+    channel: SideInformation | OverTime
     initial: Float[Array, " M"]
     merging: AbstractMerging
     transform: AbstractTransform
-    heard_angles: Angles = eqx.field(static=True)
+    observed_angles: Angles = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -64,7 +64,7 @@ class MultipleModelFilter(AbstractFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)
-        mean, spread, _ = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
         mean = together(plant, mean, jnp.sum(state.weight, axis=1))
         return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
 
@@ -73,10 +73,12 @@ class MultipleModelFilter(AbstractFilter):
         """Hear z with each component in each mode, and weigh them by it."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         i, j = self.merging.pairs(len(self.initial))
-        signals = jax.vmap(lambda *own: signal_of(plant, sensor, self.transform, Belief(*own)))(*state[:2])
+        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        after, weight, mixed = hear(belief, signal, channel, jnp.asarray(j), state.weight[i, j], z, self.heard_angles)
+        after, weight, mixed = receive(
+            belief, signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
+        )
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
         (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
         return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
@@ -87,26 +89,26 @@ class MultipleModelFilter(AbstractFilter):
         whole = _whole(state)
         return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
 
-    def retain(
+    def smoother_step(
         self,
         before: ModalBeliefs,
         prior: ModalBeliefs,
         after: ModalBeliefs,
-        heard: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """Moments of the whole mixture around the update; nothing later is said of the modes."""
-        own = _whole(before)
-        cross = predicted(at(self.plant, k), self.transform, own, jnp.asarray(u)).cross
-        return moments_retained(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
+        local = _whole(before)
+        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
+        return moments_smoother_step(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
 
 
 def _whole(state: ModalBeliefs) -> Belief:
     """Mean and covariance of the whole mixture."""
-    found, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
-    return Belief(found.mean[0], found.covariance[0])
+    result, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+    return Belief(result.mean[0], result.covariance[0])
 
 
 def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
@@ -133,7 +135,7 @@ def _build(
         initial=initial,
         merging=merging,
         transform=Cubature() if transform is None else transform,
-        heard_angles=angles,
+        observed_angles=angles,
         claim="nominal",
         states=start.states,
         inputs=start.inputs,

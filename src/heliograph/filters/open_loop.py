@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from heliograph.filters.base import Step, corrects
 from heliograph.filters.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.innovation import no_innovation
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import moments_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import moments_smoother_step
 from heliograph.filters.transform import Cubature
 from heliograph.model.estimate import Claim, Innovation
 from heliograph.model.over_time import at, first
@@ -22,12 +22,12 @@ class OpenLoop(AbstractBeliefFilter):
         """z, of whatever length, is not used."""
         return state, no_innovation()
 
-    def retain(
-        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
         """The prediction, of which nothing more is ever heard."""
         cross = predicted(at(self.plant, k), self.transform, before, jnp.asarray(u)).cross
-        return moments_retained(after, prior, cross, self.claim, first(self.plant).angles)
+        return moments_smoother_step(after, prior, cross, self.claim, first(self.plant).angles)
 
 
 def open_loop_filter(

@@ -10,9 +10,9 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.belief import Belief, predicted
 from heliograph.filters.gaussian import signal_of
 from heliograph.filters.merging import merged
-from heliograph.filters.modes_heard import describe_modes, hear
+from heliograph.filters.mode_observations import describe_modes, receive
 from heliograph.filters.multiple_model import together
-from heliograph.filters.told import Told
+from heliograph.filters.side_information import SideInformation
 from heliograph.filters.transform import AbstractTransform, Cubature
 from heliograph.model.angle import received_angles
 from heliograph.model.channel import Channel, check_link
@@ -51,10 +51,10 @@ class ParticleFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: Told | OverTime
+    channel: SideInformation | OverTime
     initial: Float[Array, " M"]
     transform: AbstractTransform
-    heard_angles: Angles = eqx.field(static=True)
+    observed_angles: Angles = eqx.field(static=True)
     particles: int = eqx.field(static=True)
     seed: int = eqx.field(static=True)
     claim: Claim = eqx.field(static=True)
@@ -78,7 +78,7 @@ class ParticleFilter(AbstractFilter):
         key = jax.random.fold_in(state.key, 0)
         rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
         drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
-        mean, spread, _ = jax.vmap(lambda *own: predicted(plant, self.transform, Belief(*own), u))(*state[:2])
+        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
         mode = jnp.where(state.moved, drawn, state.mode)
         mean = together(plant, mean, state.weight)
         return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
@@ -88,9 +88,9 @@ class ParticleFilter(AbstractFilter):
         """Hear z with each particle, weigh them by it, and draw them anew where half of them weigh next to nothing."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
-        signals = jax.vmap(lambda *own: signal_of(plant, sensor, self.transform, Belief(*own)))(*belief)
+        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
 
-        after, weight, mixed = hear(belief, signals, channel, state.mode, state.weight, z, self.heard_angles)
+        after, weight, mixed = receive(belief, signals, channel, state.mode, state.weight, z, self.observed_angles)
         after = after._replace(mean=together(plant, after.mean, weight))
         key = _folded(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
@@ -156,7 +156,7 @@ def particle_filter(
         channel=described,
         initial=initial,
         transform=Cubature() if transform is None else transform,
-        heard_angles=angles,
+        observed_angles=angles,
         particles=check_count("particles", particles),
         seed=check_count("seed", seed, 0),
         claim="nominal",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.innovation import gaussian_innovation
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step import AbstractSmootherStep
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at
 from heliograph.numerics.check import array
@@ -55,7 +55,7 @@ class PlannedFilter(AbstractFilter):
     steps: OverTime
     covariances: Array
     start: Array
-    want: Array | None
+    projection: Array | None
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -90,30 +90,30 @@ class PlannedFilter(AbstractFilter):
         """The same, its place taken from the step: it is then common to all runs."""
         return self._estimate(state.mean, 2 * k + 2)
 
-    def retain(
+    def smoother_step(
         self,
         before: PlannedMean,
         prior: PlannedMean,
         after: PlannedMean,
-        heard: Innovation,
+        innovation_: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """What was planned, with the mean and the innovation of these data."""
         if self.past is None:
-            return super().retain(before, prior, after, heard, z, u, k)
-        p, planned = at(self.steps, k), cast(AbstractRetained, at(self.past, k))
+            return super().smoother_step(before, prior, after, innovation_, z, u, k)
+        p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
         innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
         return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
 
-    def with_past(self, steps: AbstractRetained) -> AbstractFilter:
+    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """With what the steps retained, whatever the data were."""
         return replace(self, past=OverTime(steps))
 
     def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
-        told = mean if self.want is None else _affine(self.want, mean, jnp.zeros(len(self.want)))
-        return Estimate(told, jnp.asarray(self.covariances)[stage], self.claim)
+        known = mean if self.projection is None else _affine(self.projection, mean, jnp.zeros(len(self.projection)))
+        return Estimate(known, jnp.asarray(self.covariances)[stage], self.claim)
 
 
 @runs_last
@@ -125,7 +125,9 @@ def _stage(state: PlannedMean, stage: Step) -> jax.Array:
     return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
 
 
-def plan(item: AbstractFilter, inputs: Float[Array, "horizon inputs"], want: Array | None = None) -> PlannedFilter:
+def plan(
+    item: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
+) -> PlannedFilter:
     """Follow a filter over complete data and read its matrices off it; its state has a `mean` and a `covariance`.
 
     Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
@@ -133,27 +135,27 @@ def plan(item: AbstractFilter, inputs: Float[Array, "horizon inputs"], want: Arr
     Raises:
         ValueError: inputs of another number than the filter's.
     """
-    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), want)
+    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), projection)
 
 
 @compiled
-def _plan(item: AbstractFilter, inputs: Array, want: Array | None) -> PlannedFilter:
+def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
     quiet = jnp.zeros(item.received)
 
     def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
-        one, prior, after = followed(item, state, quiet, row[1], row[0])
-        return after, (one, jnp.stack([_seen(prior.covariance, want), _seen(after.covariance, want)]))
+        single, prior, after = followed(item, state, quiet, row[1], row[0])
+        return after, (single, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
 
     start = item.init()
     start = jax.tree.map(jnp.asarray, start)
     _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
-    each = covariances.reshape(-1, *covariances.shape[2:])
-    known = jnp.concatenate([_seen(start.covariance, want)[None], each])
+    items = covariances.reshape(-1, *covariances.shape[2:])
+    known = jnp.concatenate([_seen(start.covariance, projection)[None], items])
     return PlannedFilter(
         steps=OverTime(steps),
         covariances=known,
         start=start.mean,
-        want=want,
+        projection=projection,
         claim=item.claim,
         states=item.states,
         inputs=item.inputs,
@@ -170,16 +172,16 @@ def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k:
         return jnp.asarray(prior.mean), prior
 
     transition, prior = jax.jacfwd(predict, has_aux=True)(none)
-    (_, gain), (output, _), after, heard = _corrected(item, prior, none, z, k)
-    one = Plan(
+    (_, gain), (output, _), after, innovation = _corrected(item, prior, none, z, k)
+    single = Plan(
         transition=transition,
         drift=jnp.asarray(prior.mean),
         gain=gain,
         output=-output,
-        offset=-jnp.asarray(heard.value),
-        innovation=jnp.asarray(heard.covariance),
+        offset=-jnp.asarray(innovation.value),
+        innovation=jnp.asarray(innovation.covariance),
     )
-    return one, prior, after
+    return single, prior, after
 
 
 def _corrected(
@@ -188,11 +190,11 @@ def _corrected(
     """Derivatives of the corrected mean and of the innovation, each by prior mean and by z, and both themselves."""
 
     def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
-        after, heard = item.correct(prior._replace(mean=mean), z, k)
-        return (jnp.asarray(after.mean), jnp.asarray(heard.value)), (after, heard)
+        after, innovation = item.correct(prior._replace(mean=mean), z, k)
+        return (jnp.asarray(after.mean), jnp.asarray(innovation.value)), (after, innovation)
 
-    (of_mean, of_innovation), (after, heard) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
-    return of_mean, of_innovation, after, heard
+    (of_mean, of_innovation), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    return of_mean, of_innovation, after, received
 
 
 def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
@@ -201,14 +203,14 @@ def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array,
     Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
     """
     if isinstance(item, PlannedFilter):
-        found: Plan = at(item.steps, k)
-        return found
-    one, _, _ = followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+        outcome: Plan = at(item.steps, k)
+        return outcome
+    single, _, _ = followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
     present = ~jnp.isnan(z)
-    return one._replace(
-        gain=jnp.where(present, one.gain, 0.0),
-        output=jnp.where(present[:, None], one.output, 0.0),
-        offset=jnp.where(present, one.offset, 0.0),
+    return single._replace(
+        gain=jnp.where(present, single.gain, 0.0),
+        output=jnp.where(present[:, None], single.output, 0.0),
+        offset=jnp.where(present, single.offset, 0.0),
     )
 
 
@@ -230,10 +232,10 @@ def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Ar
     The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
     """
     prior = item.predict(state, u, k)
-    (_, gain), (output, _), _, heard = _corrected(item, prior, jnp.asarray(prior.mean), z, k)
+    (_, gain), (output, _), _, innovation = _corrected(item, prior, jnp.asarray(prior.mean), z, k)
     present = ~jnp.isnan(z)
     output = jnp.where(present[:, None], -output, 0.0)
-    total = jnp.where(present[:, None] & present, heard.covariance, 0.0)
+    total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
     return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
 
 
@@ -254,9 +256,9 @@ def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> boo
     """What numbers have no part in, so that filters of one structure are traced once."""
     with jax.enable_x64(True):
         item = jax.tree.unflatten(tree, leaves)
-        planned = eqx.filter_eval_shape(lambda one: one.planned(jnp.zeros((1, len(one.inputs)))), item)
-    return isinstance(planned, PlannedFilter) and planned.want is None
+        planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), item)
+    return isinstance(planned, PlannedFilter) and planned.projection is None
 
 
-def _seen(covariance: jax.Array, want: Array | None) -> jax.Array:
-    return covariance if want is None else jnp.asarray(want) @ covariance @ jnp.asarray(want).T
+def _seen(covariance: jax.Array, projection: Array | None) -> jax.Array:
+    return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

@@ -11,8 +11,8 @@ from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.centre import Centre, centre_of, without_mean
 from heliograph.filters.innovation import log_density
 from heliograph.filters.modal import claim_of_modes
-from heliograph.filters.retained import AbstractRetained
 from heliograph.filters.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
+from heliograph.filters.smoother_step import AbstractSmootherStep
 from heliograph.linear.lift import check_model, lifted_system
 from heliograph.linear.memory import memory_system
 from heliograph.linear.recursion import lmmse
@@ -93,9 +93,9 @@ class PolynomialFilter(AbstractFilter):
     def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
         """Lift z and correct the inner filter."""
         z = jnp.asarray(z)
-        z = z if self.centre is None else z - at(self.centre, k).heard @ state.mean
-        after, heard = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
-        return Centred(after, state.mean), _of_degree_one(heard, z, self.degree)
+        z = z if self.centre is None else z - at(self.centre, k).received @ state.mean
+        after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
+        return Centred(after, state.mean), _of_degree_one(innovation, z, self.degree)
 
     @in_float64
     def estimate(self, state: Centred) -> Estimate:
@@ -106,20 +106,27 @@ class PolynomialFilter(AbstractFilter):
         """The inner filter's, about the mean."""
         return _moved(self.inner.after_step(state.inner, k), state.mean)
 
-    def retain(
-        self, before: Centred, prior: Centred, after: Centred, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self,
+        before: Centred,
+        prior: Centred,
+        after: Centred,
+        innovation: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
         """The inner filter's, on the lifted system, about the mean."""
         z = jnp.asarray(z)
-        z = z if self.centre is None else z - at(self.centre, k).heard @ prior.mean
-        inner = before.inner, prior.inner, after.inner, heard, monomials(z, self.degree)[:-1]
-        return replace(self.inner.retain(*inner, u, k), shift=jnp.asarray(after.mean))
+        z = z if self.centre is None else z - at(self.centre, k).received @ prior.mean
+        inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
+        return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """The inner filter planned."""
         return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
 
-    def with_past(self, steps: AbstractRetained) -> AbstractFilter:
+    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
         """The inner filter with what the steps retained."""
         return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
 
@@ -128,11 +135,11 @@ def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
     return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
 
 
-def _of_degree_one(heard: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
+def _of_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
     """The part of a lifted innovation that is z itself."""
     m, places = len(z), position(len(z) + 1, degree)
-    own = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
-    value, covariance = heard.value[own], heard.covariance[own][:, own]
+    values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
+    value, covariance = innovation.value[values], innovation.covariance[values][:, values]
     return Innovation(value, covariance, log_density(value, covariance, jnp.abs(z)))
 
 
@@ -157,7 +164,7 @@ def polynomial_filter(
     centre, system = _lifted(plant, sensor, channel, degree, horizon)
     claim = lmmse(system, claim_of(channel)).claim
     inner = LinearSystemFilter(system, claim, first(plant).states)
-    return PolynomialFilter(inner, degree, _settled(plant, sensor, channel, system), centre)
+    return PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
 
 
 def _lifted(
@@ -170,7 +177,7 @@ def _lifted(
     return centre, lifted_system(about, sensor, channel, degree, horizon)
 
 
-def _settled(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
+def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
     """Whether a model that does not vary has come to matrices that do not change any more, to rounding."""
     if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
         return False
@@ -231,8 +238,8 @@ class MemoryFilter(AbstractFilter):
         z = jnp.asarray(z)
         linear, _ = self.linear.correct(state.linear, z, k)
         lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
-        products, heard = self.products.correct(state.products, lifted, k)
-        return MemoryState(linear, products), _of_degree_one(heard, z, 2)
+        products, innovation = self.products.correct(state.products, lifted, k)
+        return MemoryState(linear, products), _of_degree_one(innovation, z, 2)
 
     @in_float64
     def estimate(self, state: MemoryState) -> Estimate:
@@ -265,5 +272,5 @@ def claim_of(channel: Channel) -> Claim:
     """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
     if first(channel).remembers:
         return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
-    each: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
-    return "exact" if all(c.corner_count() == 1 for c in each) else "nominal"
+    items: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
+    return "exact" if all(c.corner_count() == 1 for c in items) else "nominal"

@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.small_matrix import (
+    diagonal_of,
     identity,
-    own,
     root,
     sum_of_squares,
     summed,
@@ -56,10 +56,10 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     start = root(prior)
     turn, components = _components(start, output, noise)
     begin = jnp.broadcast_to(start, (n, n, *runs)), jnp.zeros((n, m, *runs), start.dtype)
-    gain = times(jax.lax.scan(_heard, begin, components)[0][1], turn)
+    gain = times(jax.lax.scan(_use_component, begin, components)[0][1], turn)
     after = sum_of_squares(prior, start, gain, output, noise)
-    kept = jnp.asarray(identity(n, gain)) - times(gain, output)
-    return gain, jnp.where(_has_digits(prior, start, kept, after), after, jnp.nan)
+    remaining = jnp.asarray(identity(n, gain)) - times(gain, output)
+    return gain, jnp.where(_has_digits(prior, start, remaining, after), after, jnp.nan)
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
@@ -73,26 +73,26 @@ def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[
     return turn, Component(jnp.asarray(identity(m, output)), rows, variance, least)
 
 
-def _has_digits(prior: jax.Array, start: jax.Array, kept: jax.Array, after: jax.Array) -> jax.Array:
+def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
     """Whether each variance of P+ is well above eps |I - K H| |P| |I - K H|', or the square of the mean's rounding."""
     n, eps = len(prior), float(np.finfo(prior.dtype).eps)
-    kept, left = jnp.abs(kept), own(after)
-    lost, reach = summed(times(kept, jnp.abs(prior)) * kept, 1), times(kept, jnp.abs(start))
-    of_mean = summed(reach * reach, 1) + own(prior)
+    remaining, left = jnp.abs(remaining), diagonal_of(after)
+    lost, reach = summed(times(remaining, jnp.abs(prior)) * remaining, 1), times(remaining, jnp.abs(start))
+    of_mean = summed(reach * reach, 1) + diagonal_of(prior)
     return jnp.all((LEFT * eps * lost <= left) | (left <= (4 * (n + 2) * eps) ** 2 * of_mean), axis=0)
 
 
-def _heard(state: tuple[jax.Array, jax.Array], one: Component) -> tuple[tuple[jax.Array, jax.Array], None]:
+def _use_component(state: tuple[jax.Array, jax.Array], item: Component) -> tuple[tuple[jax.Array, jax.Array], None]:
     """Root R (n, n) and gain G (n, m), m + G (T z - T H m), with one component more."""
     before, gain = state
-    f = times_vector(transpose(before), one.row)
-    total = summed(f * f, 0) + one.variance
-    used = total > one.least
+    f = times_vector(transpose(before), item.row)
+    total = summed(f * f, 0) + item.variance
+    used = total > item.least
     safe = jnp.where(used, total, 1.0)
     shared = times_vector(before, f)
     column = jnp.where(used, shared / safe, 0.0)
-    noisy = one.variance > 0
-    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * one.variance, 1.0)), 0.0)
+    noisy = item.variance > 0
+    both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * item.variance, 1.0)), 0.0)
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
-    news = one.number - times_vector(transpose(gain), one.row)
+    news = item.number - times_vector(transpose(gain), item.row)
     return (before - shared[:, None] * turned[None], gain + column[:, None] * news[None]), None

@@ -50,8 +50,8 @@ class PredictionFilter(AbstractFilter):
     @corrects
     def correct(self, state: Ahead, z: ArrayLike, k: Step = 0) -> tuple[Ahead, Innovation]:
         """Use what arrived of z for the next step; the estimate stays."""
-        belief, heard = self.base.correct(state.belief, z, k)
-        return Ahead(belief, state.prior), heard
+        belief, innovation = self.base.correct(state.belief, z, k)
+        return Ahead(belief, state.prior), innovation
 
     @in_float64
     def estimate(self, state: Ahead) -> Estimate:

@@ -17,7 +17,7 @@ from heliograph.numerics.types import Array
 START = 0.1
 SWEEPS = 200  # most steps towards the scalars; about 5 are needed
 LONGEST = 5.0  # Newton step in the logarithm of a scalar: a longer one is not trusted
-SETTLED = 1e-5  # change of a logarithm after which one more Newton step leaves 1e-10 squared
+CONVERGED = 1e-5  # change of a logarithm after which one more Newton step leaves 1e-10 squared
 LOOP = 1000  # units of rounding below which an iteration makes no progress
 SMALLEST_SCALAR = 1e-12  # keeps 1/beta finite where nothing is gained by a larger one
 
@@ -37,7 +37,7 @@ def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
     free = jnp.isnan(given)
 
     def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
-        return jnp.any(free & (jnp.abs(t - previous) > rounding(SETTLED, t, LOOP)), axis=0)
+        return jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)), axis=0)
 
     def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
         t, previous, sweeps = carry
@@ -80,9 +80,9 @@ def young_sweep(
     moved, known = trace(ws), trace(wm)
     by_first = [2 / beta[0] * inner(transpose(s), x) for x in (ws, wm)]  # d tr W X / d log beta_1
     by_second = [2 / beta[1] * inner(transpose(s), x) - 2 * beta[1] * inner(transpose(m), x) for x in (ws, wm)]
-    one, one_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
+    item, one_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
     two, two_slopes = _root_ratio(moved, [by_first[0], by_second[0]], known, [by_first[1], by_second[1]])
-    return jnp.stack([one, two]), [one_slopes, two_slopes]
+    return jnp.stack([item, two]), [one_slopes, two_slopes]
 
 
 def zero_mean_sweep(

@@ -13,8 +13,8 @@ from heliograph.filters.belief import Belief
 from heliograph.filters.correction import covariance_after
 from heliograph.filters.innovation import gaussian_innovation
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import linear_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import linear_smoother_step
 from heliograph.linear.recursion import RANK_TOLERANCE
 from heliograph.linear.schedule import Gains, Schedule
 from heliograph.linear.system import LinearSystem, Steps
@@ -94,11 +94,11 @@ class ScheduledFilter(AbstractFilter):
         g: Gains = at(self.gains, k)
         z = jnp.asarray(z)
         present = ~jnp.isnan(z)
-        heard = jnp.where(present, z - state.expected, 0.0)
+        observed = jnp.where(present, z - state.expected, 0.0)
         unused = jnp.all(g.gain == 0, axis=0) & jnp.all(g.direct == 0, axis=0)
         after = ScheduleState(
-            state.value + g.gain @ heard,
-            state.mean + g.direct @ heard,
+            state.value + g.gain @ observed,
+            state.mean + g.direct @ observed,
             state.expected,
             state.complete & jnp.all(present | unused),
             jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
@@ -139,7 +139,7 @@ class LinearSystemFilter(AbstractFilter):
     steps: OverTime
     mean: np.ndarray
     covariance: np.ndarray
-    want: np.ndarray
+    projection: np.ndarray
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     inputs: tuple[str, ...] = eqx.field(static=True)
@@ -148,9 +148,9 @@ class LinearSystemFilter(AbstractFilter):
     def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
         instance("system", system, LinearSystem, "a LinearSystem")
         self.steps = OverTime(system.steps)
-        self.mean, self.covariance, self.want = system.mean, system.covariance, system.want
+        self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
         self.claim, self.inputs = claim, ()
-        self.states = names("state names", states, len(system.want), "x")
+        self.states = names("state names", states, len(system.projection), "x")
         self.received = system.steps.offset.shape[-1]
 
     @in_float64
@@ -172,35 +172,44 @@ class LinearSystemFilter(AbstractFilter):
         present = ~jnp.isnan(z)
         expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
         cross = jnp.where(present[:, None], s.output @ spread, 0.0)
-        heard, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
+        observed, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
         used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
         solved = pseudo_solve(used, cross)
         after = Belief(
             mean + solved.T @ jnp.where(present, z - expected, 0.0),
-            covariance_after(spread, cross, used, solved, heard, noise),
+            covariance_after(spread, cross, used, solved, observed, noise),
         )
         return after, gaussian_innovation(z, expected, total)
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
         """What is to be known of the belief."""
-        want = jnp.asarray(self.want)
-        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+        projection = jnp.asarray(self.projection)
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
-    def retain(
-        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation_: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
         """The update itself."""
         s: Steps = at(self.steps, k)
         innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
         total = s.output @ prior.covariance @ s.output.T + s.noise
-        return linear_retained(
-            after, prior, s.transition, s.process, s.output, innovation, total, self.claim, self.want, pseudo_solve
+        return linear_smoother_step(
+            after,
+            prior,
+            s.transition,
+            s.process,
+            s.output,
+            innovation,
+            total,
+            self.claim,
+            self.projection,
+            pseudo_solve,
         )
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
-        return plan(self, inputs, self.want)
+        return plan(self, inputs, self.projection)
 
 
 def pseudo_solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:

@@ -10,8 +10,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.belief import Belief, predicted
 from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import moments_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import moments_smoother_step
 from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
 from heliograph.model.over_time import alike, at, first, stack
 from heliograph.numerics.check import fail, instance, items
@@ -52,36 +52,36 @@ class SequentialFilter(AbstractFilter):
             arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
 
             def correct(belief: Belief, item: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
-                one: GaussianFilter = eqx.combine(item[0], rest)
-                return one.correct(belief, item[1], k)
+                single: GaussianFilter = eqx.combine(item[0], rest)
+                return single.correct(belief, item[1], k)
 
-            state, heard = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
-            return state, _joined([jax.tree.map(lambda leaf: leaf[i], heard) for i in range(len(self.filters))])  # noqa: B023
-        ends, each = np.cumsum([item.received for item in self.filters]), []
+            state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
+            return state, _joined([jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))])  # noqa: B023
+        ends, parts = np.cumsum([item.received for item in self.filters]), []
         for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
-            state, one = item.correct(state, part, k)
-            each.append(one)
-        return state, _joined(each)
+            state, single = item.correct(state, part, k)
+            parts.append(single)
+        return state, _joined(parts)
 
     @in_float64
     def estimate(self, state: Belief) -> Estimate:
         """The belief, as the first node's filter tells it."""
-        told = self.filters[0].estimate(state)
-        return Estimate(told.mean, told.covariance, self.claim)
+        estimate_ = self.filters[0].estimate(state)
+        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
 
-    def retain(
-        self, before: Belief, prior: Belief, after: Belief, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
         """The moments around all nodes' updates."""
         item = self.filters[0]
         cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
-        return moments_retained(after, prior, cross, self.claim, first(item.plant).angles)
+        return moments_smoother_step(after, prior, cross, self.claim, first(item.plant).angles)
 
 
-def _joined(each: Sequence[Innovation]) -> Innovation:
-    covariance = jax.scipy.linalg.block_diag(*(one.covariance for one in each))
-    total = jnp.sum(jnp.stack([jnp.asarray(one.log_likelihood) for one in each]))
-    return Innovation(jnp.concatenate([one.value for one in each]), covariance, total)
+def _joined(parts: Sequence[Innovation]) -> Innovation:
+    covariance = jax.scipy.linalg.block_diag(*(item.covariance for item in parts))
+    total = jnp.sum(jnp.stack([jnp.asarray(item.log_likelihood) for item in parts]))
+    return Innovation(jnp.concatenate([item.value for item in parts]), covariance, total)
 
 
 def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.modal import Heard, heard_over
+from heliograph.filters.modal import ObservationModel, observation_models
 from heliograph.filters.plan import Plan, PlannedFilter
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import at, first
@@ -69,17 +69,17 @@ def true_error(
     if first(channel).past:
         plant, sensor, channel = with_past(plant, sensor, channel)
     begin, total = first(plant), len(first(plant).states)
-    initial, world = heard_over(channel)
-    want = np.eye(n) if planned.want is None else np.asarray(planned.want)
+    initial, world = observation_models(channel)
+    projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
     mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
     square = np.outer(mean, mean)
     square[:total, :total] += begin.initial_covariance
     moments, true = np.asarray(initial)[:, None, None] * square, []
-    row = np.concatenate([np.eye(n, total + 1), -want], axis=1)
+    row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
     for k in range(horizon):
         rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
         moments = _moved(moments, at(plant, k), at(planned.steps, k), u[k], rows)
-        moments = _heard(moments, at(sensor, k), at(world, k), at(planned.steps, k))
+        moments = _corrected_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
         true.append(row @ moments.sum(axis=0) @ row.T)
     return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
 
@@ -98,7 +98,7 @@ def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, r
     return moved
 
 
-def _heard(moments: np.ndarray, sensor: LinearSensor, world: Heard, plan: Plan) -> np.ndarray:
+def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
     """s = s- + K (z - C s- - c), z = (G, n) of the mode of y~ = C~ x~ + v."""
     n, p = sensor.matrix.shape[1], sensor.matrix.shape[0]
     size, gain = moments.shape[-1], np.asarray(plan.gain)
@@ -106,15 +106,15 @@ def _heard(moments: np.ndarray, sensor: LinearSensor, world: Heard, plan: Plan) 
     measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
     noise[:p, :p] = sensor.noise.covariance
     result = []
-    for one, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
-        law = one[n, n]
+    for moment, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
+        law = moment[n, n]
         use = np.eye(size)
         use[n + 1 :, : n + 1] += gain @ mean @ measure
         use[n + 1 :, n + 1 :] -= gain @ plan.output
         use[n + 1 :, n] -= gain @ plan.offset
-        second = measure @ one[: n + 1, : n + 1] @ measure.T + law * noise
+        second = measure @ moment[: n + 1, : n + 1] @ measure.T + law * noise
         added = np.einsum("mlab,ab->ml", spread, second) + law * mean @ noise @ mean.T
-        after = use @ one @ use.T
+        after = use @ moment @ use.T
         after[n + 1 :, n + 1 :] += gain @ added @ gain.T
         result.append(after)
     return np.array(result)

@@ -14,21 +14,21 @@ import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.modal import (
-    Heard,
-    beside_common,
+    ObservationModel,
     claim_of_modes,
-    heard_linearly,
-    heard_over,
     joined,
     known_part,
+    linear_observation,
     measured_about,
     moved_about,
+    observation_models,
     prior_of_modes,
     sum_of_modes,
+    without_common,
 )
 from heliograph.filters.plan import plan
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import moments_retained
+from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_steps import moments_smoother_step
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import OverTime, at, first
@@ -65,7 +65,7 @@ class UncertainModalFilter(AbstractFilter):
 
     plant: AnyPlant
     sensor: AnySensor
-    channel: Heard | OverTime
+    channel: ObservationModel | OverTime
     initial: Float[Array, " M"]
     claim: Claim = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
@@ -108,36 +108,36 @@ class UncertainModalFilter(AbstractFilter):
         sensor, channel, z = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
         gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(sensor, state.centre)
         second = measure @ state.second @ measure.T + noise
-        each = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
-        added = _worst(each, *_middle(state.low, state.high))
-        output, common = beside_common(gains @ measure, state.law)
-        heard = joined(output)
-        expected = common + heard @ (state.mean - known_part(state.law, state.centre))
-        mean, covariance, innovation = heard_linearly(state.mean, state.covariance, heard, added, expected, z)
+        items = jnp.einsum("jmlab,ab->jml", jnp.asarray(channel.spread), second) + gains @ noise @ gains.swapaxes(1, 2)
+        added = _worst(items, *_middle(state.low, state.high))
+        output, common = without_common(gains @ measure, state.law)
+        observed = joined(output)
+        expected = common + observed @ (state.mean - known_part(state.law, state.centre))
+        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
         return state._replace(mean=mean, covariance=covariance), innovation
 
     @in_float64
     def estimate(self, state: UncertainBelief) -> Estimate:
         """x = sum_j zeta^j."""
-        want = sum_of_modes(len(self.states), len(self.initial))
-        return Estimate(want @ state.mean, want @ state.covariance @ want.T, self.claim)
+        projection = sum_of_modes(len(self.states), len(self.initial))
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
 
-    def retain(
+    def smoother_step(
         self,
         before: UncertainBelief,
         prior: UncertainBelief,
         after: UncertainBelief,
-        heard: Innovation,
+        innovation: Innovation,
         z: ArrayLike,
         u: ArrayLike,
         k: Step,
-    ) -> AbstractRetained:
+    ) -> AbstractSmootherStep:
         """The moments of zeta around the update; what is proved of the filter's bound is not of theirs."""
         move, _, _ = moved_about(at(self.plant, k), u, before.centre)
         rows = jnp.where(before.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(before.law)))
         cross = before.covariance @ jnp.kron(rows.T, move).T
-        want = sum_of_modes(len(self.states), len(self.initial))
-        return replace(moments_retained(after, prior, cross, "nominal"), want=jnp.asarray(want))
+        projection = sum_of_modes(len(self.states), len(self.initial))
+        return replace(moments_smoother_step(after, prior, cross, "nominal"), projection=jnp.asarray(projection))
 
     def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
         """With all covariances and gains computed before."""
@@ -169,11 +169,11 @@ def _middle(low: jax.Array, high: jax.Array) -> tuple[jax.Array, jax.Array]:
     return middle, jnp.maximum(high - middle, middle - low)
 
 
-def _worst(each: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
+def _worst(items: jax.Array, middle: jax.Array, reach: jax.Array) -> jax.Array:
     """Above sum_i p_i X_i for all laws p: sum_i middle_i X_i + sum_i reach_i |X_i - mean of all|."""
-    values, vectors = jax.vmap(eigh)(each - jnp.mean(each, axis=0))
+    values, vectors = jax.vmap(eigh)(items - jnp.mean(items, axis=0))
     sizes = (vectors * jnp.abs(values)[:, None, :]) @ vectors.swapaxes(1, 2)
-    return jnp.einsum("i,iab->ab", middle, each) + jnp.einsum("i,iab->ab", reach, sizes)
+    return jnp.einsum("i,iab->ab", middle, items) + jnp.einsum("i,iab->ab", reach, sizes)
 
 
 def _worst_diagonal(low: jax.Array, high: jax.Array) -> jax.Array:
@@ -209,7 +209,7 @@ def _largest(payoff: jax.Array, low: jax.Array, high: jax.Array) -> jax.Array:
 
 def uncertain_modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> UncertainModalFilter:
     """A linear filter behind a channel with an uncertain chain; `linear_filter` has checked that the parts fit."""
-    start, (initial, described) = first(plant), heard_over(channel)
+    start, (initial, described) = first(plant), observation_models(channel)
     return UncertainModalFilter(
         plant=plant,
         sensor=sensor,

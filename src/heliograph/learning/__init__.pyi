@@ -4,7 +4,7 @@ from .choice import (
     Comparison as Comparison,
     compare_laws as compare_laws,
 )
-from .foretelling import (
+from .predictive_density import (
     Predictive as Predictive,
     predictive as predictive,
 )
@@ -43,7 +43,7 @@ from .fitting import (
 from .identification import (
     Identifiability as Identifiability,
 )
-from .many import (
+from .recordings_apart import (
     FitEach as FitEach,
     fit_each as fit_each,
 )

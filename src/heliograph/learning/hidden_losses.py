@@ -80,8 +80,8 @@ class Runs:
 
     def __init__(self, kind: np.ndarray, length: np.ndarray):
         self.kind = kind
-        each = {int(one): kind == one for one in np.unique(kind)}
-        self.places = {one: (here, *np.unique(length[here], return_inverse=True)) for one, here in each.items()}
+        items = {int(item): kind == item for item in np.unique(kind)}
+        self.places = {name: (here, *np.unique(length[here], return_inverse=True)) for name, here in items.items()}
 
     @staticmethod
     def of(fates: Fates) -> "Runs":
@@ -100,9 +100,9 @@ class Runs:
     def _log(self, shares: np.ndarray) -> np.ndarray:
         """Log-likelihoods for several sets of shares (sets, 4)."""
         good, bad, fails, recovers = shares.T
-        one = np.ones_like(good)
+        item = np.ones_like(good)
         moved = _matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
-        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [one, one]}
+        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [item, item]}
         away = fails + recovers
         start = _matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
         parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)

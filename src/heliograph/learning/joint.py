@@ -22,14 +22,14 @@ def joint_world(network: Network) -> tuple[AnyPlant, AnySensor, Channel]:
     if network.relays is not None:
         raise fail("network to be learned", "nodes that hear sensors through channels", "relays that filter")
     if network.common is not None:
-        return network.plant, network.common.sensor, _heard(network.common.channel)
+        return network.plant, network.common.sensor, _joint_channel(network.common.channel)
     nodes = [node for name in network.names if isinstance(node := network.nodes[name], Node)]
     if len(nodes) == 1:
-        return network.plant, nodes[0].sensor, _heard(nodes[0].channel)
+        return network.plant, nodes[0].sensor, _joint_channel(nodes[0].channel)
     if any(isinstance(part, OverTime) for node in nodes for part in (node.sensor, node.channel)):
         raise fail("network to be learned", "one node, where its sensor or channel varies over time", len(nodes))
     sensors = {name: first(node.sensor) for name, node in zip(network.names, nodes, strict=True)}
-    return network.plant, _joined(sensors), parallel([first(_heard(node.channel)) for node in nodes])
+    return network.plant, _joined(sensors), parallel([first(_joint_channel(node.channel)) for node in nodes])
 
 
 def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
@@ -41,10 +41,10 @@ def _joined(sensors: dict[str, AbstractSensor]) -> AbstractSensor:
     return LinearSensor(library(matrices).concatenate(matrices), Independent([part.noise for part in parts]), outputs)
 
 
-def _heard(channel: Channel) -> Channel:
+def _joint_channel(channel: Channel) -> Channel:
     """Losses that are told leave rows out; of a channel that remembers they tell its modes, and stay."""
     if first(channel).remembers or not first(channel).erases:
         return channel
     if isinstance(channel, OverTime):
-        return over_time([arrived(one) for one in unstack(channel)])
+        return over_time([arrived(item) for item in unstack(channel)])
     return arrived(channel)

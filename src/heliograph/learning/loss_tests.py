@@ -26,7 +26,7 @@ class LossMemory(NamedTuple):
     runs_p: float
 
     @property
-    def found(self) -> bool:
+    def result(self) -> bool:
         """Whether the likelihood ratio rejects independence at 1 %."""
         return self.likelihood_p < 0.01
 

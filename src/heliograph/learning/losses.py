@@ -20,7 +20,7 @@ INDEPENDENT, HIDDEN, RUNNING = "independent", "hidden", "running"
 LONG = 4  # packets back that the longer of the two chains looks
 
 
-class Foretold(NamedTuple):
+class HeldOutScores(NamedTuple):
     """What a law says of packets that it was not fitted to.
 
     log_likelihood: mean over packets, nats. gain: more than independent losses say, with its standard error, which
@@ -46,13 +46,13 @@ class Losses:
     lost: int
     laws: dict[str, AbstractLossLaw]
     memory: LossMemory
-    held_out: dict[str, Foretold]
+    held_out: dict[str, HeldOutScores]
     best: str
 
     def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
         """The link with the losses of the law that foretells best among those that a channel can have."""
         able = [name for name in self.laws if name != RUNNING]
-        name = max(able, key=lambda one: self.held_out[one].log_likelihood) if self.held_out else self.best
+        name = max(able, key=lambda item: self.held_out[item].log_likelihood) if self.held_out else self.best
         return self.laws[name].channel(link)
 
 
@@ -72,10 +72,10 @@ def learn_losses(fates: object, held_out: float = 1 / 3) -> Losses:
         raise fail("held-out share", "less than 1: something must be fitted", share)
     known = ~np.isnan(np.concatenate(parts))
     cut = int(np.floor(known.sum() * (1 - share)))
-    foretold = _foretold(parts, known, cut) if 0 < cut < known.sum() else {}
-    best = max(foretold, key=lambda name: foretold[name].log_likelihood) if foretold else HIDDEN
+    held_out_scores = _held_out_scores(parts, known, cut) if 0 < cut < known.sum() else {}
+    best = max(held_out_scores, key=lambda name: held_out_scores[name].log_likelihood) if held_out_scores else HIDDEN
     lost = int(np.nansum(np.concatenate(parts)))
-    return Losses(int(known.sum()), lost, _fitted(parts, True), loss_memory(parts), foretold, best)
+    return Losses(int(known.sum()), lost, _fitted(parts, True), loss_memory(parts), held_out_scores, best)
 
 
 def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict[str, Losses]:
@@ -84,7 +84,7 @@ def learn_losses_of(fates: Mapping[str, Fates], held_out: float = 1 / 3) -> dict
     Raises:
         ValueError: as `learn_losses`.
     """
-    return {name: learn_losses(own, held_out) for name, own in table("fates", fates, "fates").items()}
+    return {name: learn_losses(item, held_out) for name, item in table("fates", fates, "fates").items()}
 
 
 def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
@@ -97,7 +97,7 @@ def _fitted(parts: Fates, intervals: bool) -> dict[str, AbstractLossLaw]:
     }
 
 
-def _foretold(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Foretold]:
+def _held_out_scores(parts: Fates, known: np.ndarray, cut: int) -> dict[str, HeldOutScores]:
     """Fit to the first `cut` known packets, judge on the others, each given all before it."""
     everything = np.concatenate(parts)
     late = known & (np.cumsum(known) > cut)
@@ -106,7 +106,7 @@ def _foretold(parts: Fates, known: np.ndarray, cut: int) -> dict[str, Foretold]:
     laws = _fitted(np.split(early, ends), False)
     said = {name: law.log_likelihoods(parts)[late] for name, law in laws.items()}
     result = {}
-    for name, own in said.items():
-        gain, error = mean_and_error(own - said[INDEPENDENT])
-        result[name] = Foretold(float(own.mean()), gain, error)
+    for name, item in said.items():
+        gain, error = mean_and_error(item - said[INDEPENDENT])
+        result[name] = HeldOutScores(float(item.mean()), gain, error)
     return result

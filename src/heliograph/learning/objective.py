@@ -13,7 +13,7 @@ from heliograph.filters.base import AbstractFilter
 from heliograph.filters.gaussian import cubature_filter
 from heliograph.filters.innovation import log_density
 from heliograph.filters.linear import LinearFilter, linear_filter
-from heliograph.learning import settling
+from heliograph.learning import steady_gains
 from heliograph.learning.description import Description
 from heliograph.learning.joint import joint_world
 from heliograph.model.fading import without_memory
@@ -47,7 +47,7 @@ class Data(NamedTuple):
         return not self.inputs.shape[2] and not np.isnan(self.measurements).any()
 
 
-class Found(NamedTuple):
+class Evaluation(NamedTuple):
     """At points of the line: log-likelihoods and scores of each step, and the Gauss-Newton information of both halves.
 
     Shapes: density (points, recordings, steps), score (points, recordings, steps, p), halves (points, 2, p, p).
@@ -110,14 +110,14 @@ class Objective:
 
         def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
             k, z_k, u_k = row
-            after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
-            return after, (jnp.asarray(heard.value), jnp.asarray(heard.covariance))
+            after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+            return after, (jnp.asarray(innovation.value), jnp.asarray(innovation.covariance))
 
         start = jax.tree.map(jnp.asarray, item.init())
-        found: tuple[jax.Array, jax.Array] = jax.lax.scan(
+        result: tuple[jax.Array, jax.Array] = jax.lax.scan(
             body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u))
         )[1]
-        return found
+        return result
 
 
 def objectives(network: Description) -> list[Objective]:
@@ -138,13 +138,13 @@ def objectives(network: Description) -> list[Objective]:
 def forms_of(network: Network) -> list[Form]:
     """The forms that a network allows."""
     plant, sensor, channel = joint_world(network)
-    one = first(channel)
-    plain = not one.remembers and not one.past
+    item = first(channel)
+    plain = not item.remembers and not item.past
     if not is_linear(plant, sensor) or first(plant).circular or first(sensor).circular:
-        if one.past:
+        if item.past:
             raise fail("network to be learned", "a linear plant and sensor behind links that are late", "others")
         return ["conditional"]
-    if not plain or has_known_gain(one) or not has_random_gain(one, second_order(one)):
+    if not plain or has_known_gain(item) or not has_random_gain(item, second_order(item)):
         return ["linear"]
     return ["linear", "conditional"]
 
@@ -152,8 +152,8 @@ def forms_of(network: Network) -> list[Form]:
 def _settles(network: Network) -> bool:
     """Whether the linear filter is one that neither remembers nor waits, and nothing varies over time."""
     world = joint_world(network)
-    one = first(world[2])
-    return not one.remembers and not one.past and not any(isinstance(part, OverTime) for part in world)
+    item = first(world[2])
+    return not item.remembers and not item.past and not any(isinstance(part, OverTime) for part in world)
 
 
 def filter_of(network: Network, form: Form) -> AbstractFilter:
@@ -164,61 +164,63 @@ def filter_of(network: Network, form: Form) -> AbstractFilter:
     return cubature_filter(plant, sensor, without_memory(channel))
 
 
-def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Found:
+def at_points(objective: Objective, x: Float[np.ndarray, "points p"], data: Data, lanes: int) -> Evaluation:
     """Likelihood, scores and information at points of the line, `lanes` of them at a time in one compiled program.
 
     Where gains settle, one at a time: there is enough to do side by side within a recording.
     """
-    every: dict[int, Found] = {}
+    every: dict[int, Evaluation] = {}
     with jax.enable_x64(True):
         for i, point in enumerate(x if objective.settles and data.plain else ()):
-            found, settled = to_numpy(_settling(objective, point, data.measurements))
-            if settled:
-                every[i] = found
+            result, converged = to_numpy(_with_steady_gains(objective, point, data.measurements))
+            if converged:
+                every[i] = result
         left = [i for i in range(len(x)) if i not in every]
         for begin in range(0, len(left), lanes):
             places = left[begin : begin + lanes]
             full = x[places + places[-1:] * (lanes - len(places))]
-            found = to_numpy(_many(objective, full, data.measurements, data.inputs))
-            every |= {i: Found(*(leaf[lane] for leaf in found)) for lane, i in enumerate(places)}
-    return Found(*(np.stack(each) for each in zip(*(every[i] for i in range(len(x))), strict=True)))
+            result = to_numpy(_at_points(objective, full, data.measurements, data.inputs))
+            every |= {i: Evaluation(*(leaf[lane] for leaf in result)) for lane, i in enumerate(places)}
+    return Evaluation(*(np.stack(item) for item in zip(*(every[i] for i in range(len(x))), strict=True)))
 
 
 @quickly_compiled
-def _many(objective: Objective, x: Array, z: Array, u: Array) -> Found:
-    one: Found = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
-    return one
+def _at_points(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+    evaluation: Evaluation = jax.vmap(lambda point: all_recordings(objective, point, z, u))(jnp.asarray(x))
+    return evaluation
 
 
 @quickly_compiled
-def _settling(objective: Objective, x: Array, z: Array) -> tuple[Found, jax.Array]:
+def _with_steady_gains(objective: Objective, x: Array, z: Array) -> tuple[Evaluation, jax.Array]:
     def numbers(x: Array) -> PyTree:
         return eqx.filter(objective.filter(x), eqx.is_inexact_array)
 
     item, directions = objective.filter(jnp.asarray(x)), jnp.eye(len(x))
     slopes = jax.vmap(lambda along: jax.jvp(numbers, (jnp.asarray(x),), (along,))[1])(directions)
     assert isinstance(item, LinearFilter)  # the objective settles
-    heard, derivatives, settled = settling.innovations(item, slopes, z, objective.random)
+    received, derivatives, converged = steady_gains.innovations(item, slopes, z, objective.random)
     scored = jax.vmap(_scored, in_axes=(0, None, 1, None, 0))
-    found = Found(*scored(heard.value, heard.covariance, derivatives.value, derivatives.covariance, jnp.asarray(z)))
-    return found._replace(halves=jnp.sum(found.halves, axis=0)), settled
+    result = Evaluation(
+        *scored(received.value, received.covariance, derivatives.value, derivatives.covariance, jnp.asarray(z))
+    )
+    return result._replace(halves=jnp.sum(result.halves, axis=0)), converged
 
 
-def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Found:
+def all_recordings(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
     """At one point: (recordings, steps), (recordings, steps, p), (2, p, p)."""
-    found = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
-    return Found(found.density, found.score, jnp.sum(found.halves, axis=0))
+    result = jax.vmap(lambda z, u: one_recording(objective, x, z, u))(jnp.asarray(z), jnp.asarray(u))
+    return Evaluation(result.density, result.score, jnp.sum(result.halves, axis=0))
 
 
-def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Found:
+def one_recording(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
     """Of one recording: density (steps,), score (steps, p) and information (2, p, p).
 
     s = -de' S^-1 e - tr(S^-1 dS) / 2 + e' S^-1 dS S^-1 e / 2, I = sum de' S^-1 de + tr(S^-1 dS S^-1 dS) / 2, over the
     components that arrived; derivatives run forward through the scan.
     """
-    own = partial(objective.innovations, z=z, u=u)
-    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(own, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
-    return Found(*_scored(e, s, de, ds, jnp.asarray(z)))
+    local = partial(objective.innovations, z=z, u=u)
+    (e, s), (de, ds) = jax.vmap(lambda along: jax.jvp(local, (x,), (along,)), out_axes=(None, 0))(jnp.eye(len(x)))
+    return Evaluation(*_scored(e, s, de, ds, jnp.asarray(z)))
 
 
 def _scored(

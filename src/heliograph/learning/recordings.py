@@ -25,7 +25,7 @@ def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[A
     )
     if not len(several):
         raise fail("recordings", "at least one", "none")
-    parts = [part for i, one in enumerate(several) for part in _parts(network, one, _inputs_of(inputs, i, several))]
+    parts = [part for i, item in enumerate(several) for part in _parts(network, item, _inputs_of(inputs, i, several))]
     for z, _ in parts:
         network.check_horizon(len(z))
     longest = max(len(z) for z, _ in parts)
@@ -49,7 +49,7 @@ def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
 def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
     """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
     held = getattr(recording, "measurements", recording)
-    own = getattr(recording, "inputs", None) if inputs is None else inputs
+    local = getattr(recording, "inputs", None) if inputs is None else inputs
     if not isinstance(held, Mapping):
         if len(network.names) > 1:
             raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
@@ -57,25 +57,25 @@ def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarr
     if set(held) != set(network.names):
         raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
     runs = _runs([np.asarray(held[name]) for name in network.names])
-    found = []
-    for each in runs:
+    results = []
+    for run in runs:
         columns: list[np.ndarray] = []
-        for name, z in zip(network.names, each, strict=True):
+        for name, z in zip(network.names, run, strict=True):
             like = len(columns[0]) if columns else None
             found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
             columns.append(np.asarray(found_rows))
         steps, count = len(columns[0]), len(network.inputs)
-        if own is None and count:
+        if local is None and count:
             raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
-        u = np.zeros((steps, 0)) if own is None else rows("inputs", own, steps, count, missing=False)
-        found.append((np.concatenate(columns, axis=1), np.asarray(u)))
-    return found
+        u = np.zeros((steps, 0)) if local is None else rows("inputs", local, steps, count, missing=False)
+        results.append((np.concatenate(columns, axis=1), np.asarray(u)))
+    return results
 
 
 def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
     """The runs of a simulation one by one; a recording is one."""
     if all(value.ndim == 3 for value in values):
-        return [list(each) for each in zip(*values, strict=True)]
+        return [list(item) for item in zip(*values, strict=True)]
     return [values]
 
 
@@ -92,7 +92,7 @@ def _check_enough(data: Data, free: int) -> None:
     if count < FEWEST * free:
         raise fail("recording", f"at least {FEWEST * free} numbers that arrived for {free} free ones", count)
     flat = z.reshape(-1, z.shape[-1])
-    heard = [column[~np.isnan(column)] for column in flat.T]
-    still = [i for i, column in enumerate(heard) if len(column) and np.ptp(column) == 0]
-    if len(still) == sum(len(column) > 0 for column in heard):
-        raise fail("recording", "measurements that vary", f"{array('m', heard[still[0]], (None,))[0]:g} throughout")
+    received = [column[~np.isnan(column)] for column in flat.T]
+    still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
+    if len(still) == sum(len(column) > 0 for column in received):
+        raise fail("recording", "measurements that vary", f"{array('m', received[still[0]], (None,))[0]:g} throughout")

@@ -52,8 +52,8 @@ def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13)
         return -value, -slope
 
     bounds = [(-END, END)] * len(starts[0])
-    found = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
-    best = min(found, key=lambda one: float(one.fun))
+    results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
+    best = min(results, key=lambda item: float(item.fun))
     return np.asarray(best.x), -float(best.fun)
 
 

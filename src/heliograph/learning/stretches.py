@@ -30,24 +30,24 @@ def fates_of_sequence(sequence: ArrayLike, sent: ArrayLike | None = None, jump: 
     numbers = array("sequence numbers", sequence, (None,))
     if not len(numbers) or np.any(numbers != np.round(numbers)):
         raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
-    heard = numbers.astype(np.int64)
+    received = numbers.astype(np.int64)
     if sent is not None:
-        when = array("times of sending", sent, heard.shape)
-        heard = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
+        when = array("times of sending", sent, received.shape)
+        received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
     parts: list[list[int]] = [[]]
-    for number in heard.tolist():
-        own = parts[-1]
-        if sent is None and number in own[-COPY:]:
+    for number in received.tolist():
+        local = parts[-1]
+        if sent is None and number in local[-COPY:]:
             continue
-        if own and (number <= own[-1] or number - own[-1] >= jump):
+        if local and (number <= local[-1] or number - local[-1] >= jump):
             parts.append([])
         parts[-1].append(number)
     return [_gaps(np.array(part)) for part in parts]
 
 
-def _gaps(heard: np.ndarray) -> Float[np.ndarray, " packets"]:
-    lost = np.ones(heard[-1] - heard[0] + 1)
-    lost[heard - heard[0]] = 0.0
+def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:
+    lost = np.ones(received[-1] - received[0] + 1)
+    lost[received - received[0]] = 0.0
     return lost
 
 
@@ -86,17 +86,17 @@ def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
     result: dict[str, Fates] = {}
     before: np.ndarray | None = None
     for name, value in arrived.items():
-        heard = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
-        if np.any((heard != 0) & (heard != 1)):
+        received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
+        if np.any((received != 0) & (received != 1)):
             raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
-        before = np.ones(len(heard)) if before is None else before
-        if np.any(heard > before):
-            packet = int(np.argmax(heard > before))
+        before = np.ones(len(received)) if before is None else before
+        if np.any(received > before):
+            packet = int(np.argmax(received > before))
             raise fail(
                 f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
             )
-        result[name] = [np.where(before == 1, 1.0 - heard, np.nan)]
-        before = heard
+        result[name] = [np.where(before == 1, 1.0 - received, np.nan)]
+        before = received
     return result
 
 
@@ -114,9 +114,9 @@ def fates_of_measurements(measurements: Mapping[str, ArrayLike]) -> dict[str, Fa
     result: dict[str, Fates] = {}
     for node, value in table("measurements", measurements, "arrays").items():
         name = f"measurements of {node!r}"
-        found = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
+        values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
         gone = np.isnan(
-            array(f"measurements of {node!r}", found[:, None] if found.ndim == 1 else found, (None, None), True)
+            array(f"measurements of {node!r}", values[:, None] if values.ndim == 1 else values, (None, None), True)
         )
         if np.all(gone == gone[:, :1]):
             result[node] = [gone[:, 0].astype(float)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from heliograph.learning.maximise import Evaluated, Maximum, maximise
-from heliograph.learning.objective import Data, Found, Objective, at_points
+from heliograph.learning.objective import Data, Evaluation, Objective, at_points
 from heliograph.numerics.types import Bool, Float
 
 LANES = 8  # points at a time
@@ -32,7 +32,7 @@ class Surface:
 
     objective: Objective
     data: Data
-    _last: list[tuple[np.ndarray, Found]] = field(default_factory=list, repr=False, compare=False)
+    _last: list[tuple[np.ndarray, Evaluation]] = field(default_factory=list, repr=False, compare=False)
 
     @property
     def lanes(self) -> int:
@@ -41,7 +41,7 @@ class Surface:
         p = self.objective.description.parameters.size
         return int(np.clip(ROOM // (r * t * m * (m + 2) * (p + 1)), 1, LANES))
 
-    def found(self, x: Float[np.ndarray, "points p"]) -> Found:
+    def result(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """All that is known at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
@@ -49,8 +49,8 @@ class Surface:
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
         """Likelihood, gradient and information at points."""
-        found = self.found(x)
-        return found.total, found.gradient, found.information
+        result = self.result(x)
+        return result.total, result.gradient, result.information
 
     def climb(
         self, start: Float[np.ndarray, "points p"], active: Bool[np.ndarray, "points p"], watch: Watch
@@ -75,15 +75,15 @@ class Surface:
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
         """-d2 l by central differences of the scores, among active coordinates; the information for the others."""
-        information: np.ndarray = self.found(x[None]).information[0]
-        own = np.diag(information)
-        width = np.where(own > 0, DIFFERENCE / np.sqrt(np.where(own > 0, own, 1.0)), 0.0)
-        moving = np.flatnonzero(active & (own > 0))
+        information: np.ndarray = self.result(x[None]).information[0]
+        local = np.diag(information)
+        width = np.where(local > 0, DIFFERENCE / np.sqrt(np.where(local > 0, local, 1.0)), 0.0)
+        moving = np.flatnonzero(active & (local > 0))
         shifts = np.zeros((len(moving), len(x)))
         shifts[np.arange(len(moving)), moving] = width[moving]
         if not len(moving):
             return information
-        gradient = self.found(np.concatenate([x + shifts, x - shifts])).gradient
+        gradient = self.result(np.concatenate([x + shifts, x - shifts])).gradient
         result: np.ndarray = information.copy()
         slopes = -(gradient[: len(moving)] - gradient[len(moving) :]) / (2 * width[moving][:, None])
         block = slopes[:, moving]

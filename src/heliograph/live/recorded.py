@@ -75,10 +75,10 @@ def _joined(parts: Sequence[Record]) -> Record:
 
 
 def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    found = [part for _, part in parts]
+    results = [part for _, part in parts]
     estimates = {
-        node: {name: _stacked([part[node][name] for part in found], np.stack) for name in filters}
-        for node, filters in (found[0] if found else {}).items()
+        node: {name: _stacked([part[node][name] for part in results], np.stack) for name in filters}
+        for node, filters in (results[0] if results else {}).items()
     }
     return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
 

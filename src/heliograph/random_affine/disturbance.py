@@ -119,10 +119,10 @@ def _known(matrix: np.ndarray) -> DisturbedGain:
 
 def _place(part: DisturbedGain, shared: int, parts: list[DisturbedGain], index: int) -> DisturbedGain:
     """The same map in the joint columns of `parts`: `shared` ones first, then those of each part in turn."""
-    own = [p.mean.shape[1] - shared for p in parts]
-    start = shared + sum(own[:index])
-    columns = [*range(shared), *range(start, start + own[index])]
-    m, total = part.mean.shape[0], shared + sum(own)
+    local = [p.mean.shape[1] - shared for p in parts]
+    start = shared + sum(local[:index])
+    columns = [*range(shared), *range(start, start + local[index])]
+    m, total = part.mean.shape[0], shared + sum(local)
     mean, second = np.zeros((m, total)), np.zeros((m, total, m, total))
     mean[:, columns] = part.mean
     second[np.ix_(range(m), columns, range(m), columns)] = part.second

@@ -162,9 +162,9 @@ class Independent(AbstractNoise):
         value: Number = 1.0
         start = 0
         for part in self.parts:
-            own = tuple(powers[start : start + part.dimension])
+            local = tuple(powers[start : start + part.dimension])
             start += part.dimension
-            value *= part.moment(own) if any(own) else 1.0
+            value *= part.moment(local) if any(local) else 1.0
         return value
 
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from heliograph.numerics.kept import kept
+from heliograph.numerics.caching import cached
 from heliograph.numerics.module import Module
-from heliograph.numerics.small_matrix import contract, diagonal, own, summed
+from heliograph.numerics.small_matrix import contract, diagonal, diagonal_of, summed
 from heliograph.numerics.traced import is_traced, library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
@@ -43,7 +43,7 @@ class QuadraticMap(Module):
         mask = present[:, None] & present[None, :]
         center = self.middle(second_moment, present)
         entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
-        unit = jnp.sqrt(_or_one(jnp.abs(own(center)) + own(entries)))
+        unit = jnp.sqrt(_or_one(jnp.abs(diagonal_of(center)) + diagonal_of(entries)))
         return center + diagonal(unit * summed(entries / unit, 1))
 
     def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
@@ -102,7 +102,7 @@ def has_known_gain(channel: AbstractRandomAffine) -> bool:
     return False
 
 
-@kept
+@cached
 def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     """Worst cases over the polytope of probabilities: exact for a gain common to all components, else dominating.
 
@@ -123,13 +123,15 @@ def second_order(channel: AbstractRandomAffine) -> SecondOrder:
     elif isinstance(channel, Stack):
         parts = _from_stack(channel)
     elif _few_corners(channel):
-        corners = (Moments(one, nominal.outputs, nominal.inputs, 2) for one in channel.corner_moments(2))
-        stacks = zip(*(_tensors(one, mean) for one in corners), strict=True)
+        corners = (
+            Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
+        )
+        stacks = zip(*(_tensors(corner, mean) for corner in corners), strict=True)
         parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
     else:
         parts = _from_intervals(channel, nominal, mean)
-    own = parts[0] if known else nominal_spread(channel)
-    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], own, not known)
+    local = parts[0] if known else nominal_spread(channel)
+    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], local, not known)
 
 
 def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
@@ -170,9 +172,9 @@ def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
 def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
     """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
     raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
-    own = moments.mean[:-1]
-    spread = raw - symmetric_product(mean, own) - symmetric_product(own, mean) + symmetric_product(mean, mean)
-    return spread, symmetric_product(own - mean, own - mean), _of_signal(raw)
+    local = moments.mean[:-1]
+    spread = raw - symmetric_product(mean, local) - symmetric_product(local, mean) + symmetric_product(mean, mean)
+    return spread, symmetric_product(local - mean, local - mean), _of_signal(raw)
 
 
 def _of_signal(tensor: Tensor) -> Tensor:
@@ -199,10 +201,10 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     xp = library(tensors, mean)
     shape = symmetric_product(mean[:, :-1], mean[:, :-1])
     gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
-    each: Matrix = xp.abs(mean[:, :-1])
-    own = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(each, each)
+    items: Matrix = xp.abs(mean[:, :-1])
+    local = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(items, items)
     loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
-    reach = xp.sqrt(xp.einsum("iiaa->ia", own))[:, None, :] * loud[:, None]
+    reach = xp.sqrt(xp.einsum("iiaa->ia", local))[:, None, :] * loud[:, None]
     size = xp.sum(shape**2)
     multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
     residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
@@ -210,7 +212,7 @@ def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | ja
     unit = xp.sqrt(xp.diagonal(largest))
     unit = _still(xp.where(unit > 0, unit, 1.0))
     gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
-    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * own)
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * local)
     holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
     corner = np.zeros((mean.shape[1], mean.shape[1]))
     corner[-1, -1] = 1.0
@@ -234,11 +236,11 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     reach = []
     for part in channel.maps:
         stop = start + part.outputs
-        own = second_order(part)
+        moments = second_order(part)
         low, high = moment_interval(part, 1)
         xp = library(low, high, mean)
         reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
-        blocks.append([_on_diagonal(q, start, n) for q in (own.spread, own.shift, own.power)])
+        blocks.append([_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
         start = stop
     label = np.repeat(np.arange(len(channel.maps)), [part.outputs for part in channel.maps])
     apart = (label[:, None] != label[None, :])[:, :, None, None]
@@ -249,8 +251,8 @@ def _from_stack(channel: Stack) -> list[QuadraticMap]:
     centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
     radii = (cross, cross, power_cross)
     return [
-        QuadraticMap(sum(q.center for q in own) + apart * center, sum(q.radius for q in own) + apart * radius)
-        for own, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+        QuadraticMap(sum(q.center for q in item) + apart * center, sum(q.radius for q in item) + apart * radius)
+        for item, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
     ]
 
 

@@ -20,13 +20,13 @@ from .output import (
     Refused as Refused,
     Told as Told,
 )
-from .nowhere import (
-    Nowhere as Nowhere,
+from .in_memory_store import (
+    InMemoryStore as InMemoryStore,
 )
 from .store import (
     Store as Store,
 )
-from .whose import (
+from .identity import (
     identity as identity,
 )
 from .transport import (

@@ -23,7 +23,7 @@ class Broker(Protocol):
     async def send(self, bodies: Sequence[bytes]) -> None:
         """Send messages as a sensor does, in order; return when the broker has them."""
 
-    async def told(self) -> Sequence[bytes]:
+    async def published(self) -> Sequence[bytes]:
         """The bodies of all outputs that a reader has heard so far, in order."""
 
 
@@ -66,10 +66,10 @@ class _Check:
             await self._for_a_while(transport)
         sent += await self._sent()
         async with self._service() as transport:
-            found = await self._until(transport, sent)
-            assert set(found) == set(sent), "acknowledge: expected no more than what was not acknowledged"
+            result = await self._until(transport, sent)
+            assert set(result) == set(sent), "acknowledge: expected no more than what was not acknowledged"
         await self._published()
-        return found == sent
+        return result == sent
 
     @asynccontextmanager
     async def _service(self) -> AsyncIterator[Transport]:
@@ -83,11 +83,11 @@ class _Check:
     async def _listening(self, transport: Transport) -> None:
         """Greet until the service hears: before its first start a broker may keep nothing."""
         greeting = self._bodies(1)
-        hearing = asyncio.ensure_future(self._until(transport, greeting))
-        while not hearing.done():
+        observation = asyncio.ensure_future(self._until(transport, greeting))
+        while not observation.done():
             await self._soon("send", self.broker.send(greeting))
-            await asyncio.wait({hearing}, timeout=self.silence / 2)
-        assert await hearing == greeting, "receive: expected the bytes that were sent"
+            await asyncio.wait({observation}, timeout=self.silence / 2)
+        assert await observation == greeting, "receive: expected the bytes that were sent"
         await self._silent(transport)
 
     async def _published(self) -> None:
@@ -97,16 +97,16 @@ class _Check:
         async with self._service() as transport:
             await self._soon("publish", transport.publish([]))
             await self._soon("publish", transport.publish([now, *outputs]))
-        wanted, found = [each.body for each in outputs], list[bytes]()
+        expected, result = [output.body for output in outputs], list[bytes]()
         for _ in range(1 + int(self.patience / PAUSE)):
-            told = await self._soon("told", self.broker.told())
-            found = _once(body for body in told if body != now.body)
-            if len(found) >= len(wanted):
+            published = await self._soon("told", self.broker.published())
+            result = _once(body for body in published if body != now.body)
+            if len(result) >= len(expected):
                 break
             await asyncio.sleep(PAUSE)
-        missing = len(set(wanted) - set(found))
-        assert not missing, f"publish: expected {len(wanted)} outputs at the broker, {missing} are not"
-        assert found == wanted, "publish: expected the outputs in order, and nothing else"
+        missing = len(set(expected) - set(result))
+        assert not missing, f"publish: expected {len(expected)} outputs at the broker, {missing} are not"
+        assert result == expected, "publish: expected the outputs in order, and nothing else"
 
     async def _sent(self) -> list[bytes]:
         bodies = self._bodies(self.messages)
@@ -115,19 +115,19 @@ class _Check:
 
     async def _until(self, transport: Transport, bodies: Sequence[bytes], acknowledge: bool = True) -> list[bytes]:
         """Receive until all of these have come; each once, in the order in which they came first."""
-        found = list[bytes]()
+        result = list[bytes]()
 
         async def listen() -> None:
-            while set(bodies) - set(found):
-                found.extend(await self._taken(await transport.receive(), acknowledge))
+            while set(bodies) - set(result):
+                result.extend(await self._taken(await transport.receive(), acknowledge))
 
         try:
             await asyncio.wait_for(listen(), self.patience)
         except TimeoutError:
-            missing, many = len(set(bodies) - set(found)), len(bodies)
-            what = f"receive: expected {many} messages within {self.patience:g} s, {missing} did not come"
+            missing, count_ = len(set(bodies) - set(result)), len(bodies)
+            what = f"receive: expected {count_} messages within {self.patience:g} s, {missing} did not come"
             raise AssertionError(what) from None
-        return _once(found)
+        return _once(result)
 
     async def _for_a_while(self, transport: Transport, acknowledge: bool = False) -> list[bytes]:
         """What comes until the wait is cancelled."""
@@ -154,10 +154,10 @@ class _Check:
         except TimeoutError:
             raise AssertionError(f"{what}: expected an end within {self.patience:g} s") from None
 
-    def _bodies(self, many: int) -> list[bytes]:
+    def _bodies(self, count_: int) -> list[bytes]:
         """Bodies that were not sent before; the first is long."""
         return [
-            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(many)
+            b'{"number":%d,"\xce\xa9":"%s"}' % (next(self._numbers), b"" if i else b"x" * LONG) for i in range(count_)
         ]
 
 

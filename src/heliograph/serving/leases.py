@@ -43,8 +43,8 @@ class Leases:
             mine = [number for number, process in sorted(held) if process == self.process]
             taken = {number for number, _ in held}
             free = [number for number in range(self.parts) if number not in taken]
-            wanted = (mine + free)[:fair]
-            return {number for number in wanted if self._lease(connection, number, now)}
+            expected = (mine + free)[:fair]
+            return {number for number in expected if self._lease(connection, number, now)}
 
     def release(self, number: int) -> None:
         """Leave a part to others."""
@@ -63,8 +63,8 @@ class Leases:
         new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
         connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
         alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
-        each, over = divmod(self.parts, len(alive))
-        return each + (alive.index(self.process) < over)
+        items, over = divmod(self.parts, len(alive))
+        return items + (alive.index(self.process) < over)
 
     def _lease(self, connection: Connection, number: int, now: float) -> bool:
         """Whether the part is ours: it was, or its lease was over."""

@@ -154,9 +154,9 @@ class _Writer(_Connection):
         sent = set()
         for output in outputs:
             topic = f"{self.address.topic}/out/{output.kind}/{word(output.plant)}"
-            one = self.client.publish(topic, output.body, 0 if output.number is None else AT_LEAST_ONCE)
+            item = self.client.publish(topic, output.body, 0 if output.number is None else AT_LEAST_ONCE)
             if output.number is not None:
-                sent.add(one.mid)
+                sent.add(item.mid)
         with self.room:
             self.room.wait_for(lambda: sent <= self._arrived or not self.open)
             self._arrived.clear()

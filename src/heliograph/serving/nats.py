@@ -25,7 +25,7 @@ from nats.js.errors import NotFoundError
 from heliograph.numerics.check import fail
 from heliograph.serving.output import Output
 from heliograph.serving.partition import WHOLE, Part, word
-from heliograph.serving.retry import Retry, still_wanted
+from heliograph.serving.retry import Retry, still_needed
 from heliograph.serving.transport import Batch, TakenOverError
 from heliograph.serving.url import Address
 
@@ -33,7 +33,7 @@ MOST = 1000  # messages of a batch
 WAIT = 5.0  # seconds that one request for messages stays open
 ANSWER = 30.0  # seconds that the server has for an answer
 UNTOUCHED = 600.0  # seconds before the server would send again by itself: newer messages would then have gone before
-KEPT = 7 * 86400.0  # seconds that outputs stay on the server
+RETENTION = 7 * 86400.0  # seconds that outputs stay on the server
 AWAY = (Error, OSError, asyncio.TimeoutError)
 
 T = TypeVar("T")
@@ -54,12 +54,12 @@ class Nats:
         self._client = Client()
         self._server: JetStreamContext | None = None
         self._reader: JetStreamContext.PullSubscription | None = None
-        self._name, self._read, self._settled = "", 0, 0
+        self._name, self._read, self._acknowledged = "", 0, 0
         self._retry, self._opening = Retry(str(address)), asyncio.Lock()
 
     async def receive(self) -> Batch | None:
         while True:
-            still_wanted()
+            still_needed()
             reader = await self._persist(self._reading)
             try:
                 messages = await reader.fetch(MOST, WAIT)
@@ -76,11 +76,11 @@ class Nats:
                 self._reader = None
                 continue
             self._read = count
-            return Batch([message.data for message in messages], partial(self._settle, messages[-1]))
+            return Batch([message.data for message in messages], partial(self._solve_steady, messages[-1]))
 
-    async def _settle(self, last: Msg) -> None:
+    async def _solve_steady(self, last: Msg) -> None:
         """Everything up to this message is kept; if the server does not hear of it they come again, as duplicates."""
-        self._settled = last.metadata.sequence.stream
+        self._acknowledged = last.metadata.sequence.stream
         with contextlib.suppress(*AWAY):
             await last.ack_sync()
 
@@ -95,15 +95,15 @@ class Nats:
 
     async def _tell(self, outputs: Sequence[Output]) -> None:
         """Provisional estimates as they pass; what has a number stays, once, if it is told again soon."""
-        server, kept = await self._open(), []
+        server, stored = await self._open(), []
         for output in outputs:
             subject = f"{self.topic}.out.{output.kind}.{word(output.plant)}"
             if output.number is None:
                 await self._client.publish(subject, output.body)
             else:
                 name = {"Nats-Msg-Id": f"{subject}:{output.number}"}
-                kept.append(await server.publish_async(subject, output.body, headers=name))
-        await asyncio.wait_for(asyncio.gather(*kept), ANSWER)
+                stored.append(await server.publish_async(subject, output.body, headers=name))
+        await asyncio.wait_for(asyncio.gather(*stored), ANSWER)
 
     async def _persist(self, act: Callable[[], Awaitable[T]]) -> T:
         """Do it, however long the server is away."""
@@ -138,7 +138,7 @@ class Nats:
             )
             server = self._client.jetstream(timeout=ANSWER)
             subjects = [f"{self.topic}.out.{kind}.*" for kind in ("final", "refused")]
-            await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=KEPT))
+            await _stream(server, StreamConfig(f"{self.stream}-out", subjects=subjects, max_age=RETENTION))
             self._server = server
             return server
 
@@ -153,8 +153,8 @@ class Nats:
         if self._name and others and self._name not in [c.name for c in others]:
             raise TakenOverError(f"{self.address}, part {self.part.number}: expected one reader, another took over")
         floors = [c.ack_floor.stream_seq for c in others if c.ack_floor is not None]
-        begun = self._settled if others else 0  # a stream without its consumers is a new one
-        self._settled = min(max([begun, *floors]), newest)
+        begun = self._acknowledged if others else 0  # a stream without its consumers is a new one
+        self._acknowledged = min(max([begun, *floors]), newest)
         self._name, self._read = mine + uuid.uuid4().hex[:12], 0
         await server.add_consumer(self.stream, self._consumer())
         self._reader = await server.pull_subscribe_bind(self._name, self.stream)
@@ -166,7 +166,7 @@ class Nats:
         return ConsumerConfig(
             durable_name=self._name,
             deliver_policy=DeliverPolicy.BY_START_SEQUENCE,
-            opt_start_seq=self._settled + 1,
+            opt_start_seq=self._acknowledged + 1,
             ack_policy=AckPolicy.ALL,
             ack_wait=UNTOUCHED,
             max_ack_pending=4 * MOST,
@@ -181,20 +181,20 @@ class Nats:
         source, parts = f"{self.topic}.in.*", self.part.of
         target = f"{self.topic}.in.{{{{partition({parts},1)}}}}.{{{{wildcard(1)}}}}"
         transform = SubjectTransform(source, target) if parts > 1 else None
-        wanted = StreamConfig(self.stream, subjects=[source], storage=StorageType.FILE, subject_transform=transform)
-        found = await _stream(server, wanted)
-        told = found.config.subject_transform
-        if (told.dest if told else None) != (target if transform else None):
+        expected = StreamConfig(self.stream, subjects=[source], storage=StorageType.FILE, subject_transform=transform)
+        result = await _stream(server, expected)
+        known = result.config.subject_transform
+        if (known.dest if known else None) != (target if transform else None):
             raise fail(f"stream {self.stream} of {self.address}", f"one of {parts} parts", "one of another number")
-        return found.state.last_seq
+        return result.state.last_seq
 
 
-async def _stream(server: JetStreamContext, wanted: StreamConfig) -> StreamInfo:
+async def _stream(server: JetStreamContext, expected: StreamConfig) -> StreamInfo:
     """The stream of this name as it is, made if there is none."""
     try:
-        return await server.stream_info(str(wanted.name))
+        return await server.stream_info(str(expected.name))
     except NotFoundError:
-        return await server.add_stream(wanted)
+        return await server.add_stream(expected)
 
 
 async def _silent(_: Exception) -> None:

@@ -25,7 +25,7 @@ class Told(BaseModel):
     covariance: list[list[float | None]] | None = Field(description="Null of a filter that claims none.")
     claim: Claim = Field(description="What the covariance is: exact, upper, nominal, or none.")
     nis: float | None = Field(None, description="Normalised innovation squared of what was heard; null if nothing was.")
-    heard: int = Field(0, description="How many numbers were heard: what nis should be on average.")
+    received: int = Field(0, description="How many numbers were heard: what nis should be on average.")
     implausible: str = Field("", description="Why this filter alone did not use what was heard, where it did not.")
 
 

@@ -50,13 +50,13 @@ def recorded(path: Path, network: Network) -> tuple[list[Event], np.datetime64 |
     steps = TIME_STEP not in network.inputs
     time = (table.time - origin).astype(np.int64) / 1e9 if dated else np.asarray(table.time, dtype=float)
     time = np.arange(float(len(time))) if steps else time
-    own = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
+    local = [i for i, name in enumerate(network.inputs) if name != TIME_STEP]
     events = []
     for k, at in enumerate(time.tolist()):
-        if own and (steps or k):
-            events.append(Event(INPUTS, k, at if steps else float(time[k - 1]), table.inputs[k, own]))
-        heard = {node: z[k] for node, z in table.measurements.items() if not np.isnan(z[k]).all()}
-        events += [Event(node, k, at, z) for node, z in heard.items()]
+        if local and (steps or k):
+            events.append(Event(INPUTS, k, at if steps else float(time[k - 1]), table.inputs[k, local]))
+        received = {node: z[k] for node, z in table.measurements.items() if not np.isnan(z[k]).all()}
+        events += [Event(node, k, at, z) for node, z in received.items()]
     return events, None if steps else origin
 
 
@@ -76,17 +76,17 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     falls = 1.0 if loss == 1 else loss * (1 - stays) / (1 - loss) if link.run > 1 else loss
     if falls > 1:
         raise fail("run", f"at least {loss / (1 - loss):g}, for so many losses", link.run)
-    found, lost = list[Event](), dict[str, bool]()
+    result, lost = list[Event](), dict[str, bool]()
     for event in events:
         if event.node == INPUTS:
-            found.append(_heard(event, 0.0))
+            result.append(_heard(event, 0.0))
             continue
         before = lost.get(event.node, chance.random() < loss)
         now = chance.random() < (stays if before and link.run > 1 else falls)
         lost[event.node] = now
         copies = 0 if now else 1 + (chance.random() < twice)
-        found += [_heard(event, chance.exponential(link.delay)) for _ in range(copies)]
-    return _in_order(found)
+        result += [_heard(event, chance.exponential(link.delay)) for _ in range(copies)]
+    return _in_order(result)
 
 
 def along(events: Sequence[Event], trace: Path) -> list[Event]:
@@ -102,10 +102,10 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
     delays = np.asarray(columns[DELAY], dtype=float)
     if np.any(delays < 0):
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
-    heard = [event for event in events if event.node != INPUTS]
-    told = zip(heard, np.resize(delays, len(heard)).tolist(), strict=True)
-    found = [_heard(event, delay) for event, delay in told if not np.isnan(delay)]
-    return _in_order(found + [_heard(event, 0.0) for event in events if event.node == INPUTS])
+    received = [event for event in events if event.node != INPUTS]
+    known = zip(received, np.resize(delays, len(received)).tolist(), strict=True)
+    results = [_heard(event, delay) for event, delay in known if not np.isnan(delay)]
+    return _in_order(results + [_heard(event, 0.0) for event in events if event.node == INPUTS])
 
 
 def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:

@@ -8,7 +8,7 @@ LOG = logging.getLogger("heliograph.serving")
 FIRST, LONGEST = 0.25, 30.0  # seconds
 
 
-def still_wanted() -> None:
+def still_needed() -> None:
     """Go on cancelling what was cancelled: a client may take it for the end of a wait of its own, and return.
 
     Raises:
@@ -27,7 +27,7 @@ class Retry:
 
     async def wait(self, error: Exception) -> None:
         """Say what failed, and wait before the next try."""
-        still_wanted()
+        still_needed()
         wait = self._wait * random.uniform(0.5, 1.0)
         LOG.warning("%s: %s; trying again in %.1f s", self.what, type(error).__name__, wait)
         self._wait = min(2 * self._wait, LONGEST)

@@ -13,11 +13,21 @@ from sqlalchemy.exc import SQLAlchemyError
 from heliograph.live.identity import Identity, check_same
 from heliograph.numerics.check import InputError, fail, table
 from heliograph.serving.database import engine_at
-from heliograph.serving.keeping import ConflictError, Damage, Entry, Kept
 from heliograph.serving.output import Output
-from heliograph.serving.tables import JOURNAL, LAYOUT, NUMBERS, PLANTS, TABLES, WHOSE, checksum, is_named, is_whole
+from heliograph.serving.store_protocol import ConflictError, Damage, Entry, StoredPlant
+from heliograph.serving.tables import (
+    IDENTITY_TABLE,
+    JOURNAL,
+    LAYOUT,
+    NUMBERS,
+    PLANTS,
+    TABLES,
+    checksum,
+    is_named,
+    is_whole,
+)
 
-TOLD, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
+PUBLISHED, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
 IDENTITY = "identity"
 AT_ONCE = 500  # names in one question
 MEND = "its plants go on in a new store with --store NEW --from-snapshot"
@@ -48,7 +58,7 @@ class Store:
         mine = table("identity of a store", mine, "texts") | {"layout of the store": LAYOUT}
         try:
             with self._saying("a database that can be written"):
-                check_same(f"store {self.name}", mine, self._whose(mine))
+                check_same(f"store {self.name}", mine, self._stored_identity(mine))
                 self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
         except InputError as error:
             self.close()
@@ -65,28 +75,30 @@ class Store:
             said = getattr(error, "orig", None) or type(error).__name__
             raise fail(f"store {self.name}", expected, str(said)) from None
 
-    def _whose(self, mine: Identity) -> Identity:
+    def _stored_identity(self, mine: Identity) -> Identity:
         """What the store is of: of this network, if it is new."""
         there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
         if there and there != set(TABLES.tables):
             raise self._broken(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
         TABLES.create_all(self._engine)
         with self._engine.begin() as connection:
-            kept = connection.execute(select(WHOSE.c.value).where(WHOSE.c.name == IDENTITY)).scalar()
-            if kept is None:
+            stored = connection.execute(
+                select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
+            ).scalar()
+            if stored is None:
                 if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
                     raise self._broken("no network that it is of")
-                connection.execute(self._insert(WHOSE), [{"name": IDENTITY, "value": json.dumps(mine)}])
+                connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
                 return mine
         try:
-            found = dict(json.loads(kept))
+            result = dict(json.loads(stored))
         except (ValueError, TypeError):
             raise self._broken("no network that it is of") from None
-        return {"layout of the store": "1"} | found
+        return {"layout of the store": "1"} | result
 
     def _damaged(self) -> dict[str, Damage]:
         """Plants whose rows are damaged, by name."""
-        found: dict[str, Damage] = {}
+        results: dict[str, Damage] = {}
         with self._engine.connect() as connection:
             if self._engine.dialect.name == "sqlite":
                 said = connection.exec_driver_sql("PRAGMA integrity_check(1)").scalar()
@@ -95,8 +107,8 @@ class Store:
             for rows in connection.execution_options(yield_per=AT_ONCE).execute(select(PLANTS)).partitions():
                 for name, version, body, written in rows:
                     if not is_whole(written, name, version, body):
-                        found[str(name)] = Damage(is_named(written, name), written)
-        return found
+                        results[str(name)] = Damage(is_named(written, name), written)
+        return results
 
     def _broken(self, what: str) -> InputError:
         return fail(f"store {self.name}", "a database as it was written", f"one that is damaged: {what}")
@@ -107,20 +119,22 @@ class Store:
         url = self._engine.url
         return url.database or "" if url.get_backend_name() == "sqlite" else url.render_as_string(hide_password=True)
 
-    def load(self, names: Iterable[str]) -> dict[str, Kept]:
+    def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
         """The plants of these names that are kept, and those of which only damage is left."""
         names = list(names)
         with self._saying("a database that can be read"), self._engine.connect() as connection:
             rows = _of(connection, list(PLANTS.c), names)
-        found = {}
+        results = {}
         for name, version, body, written in rows:
             whole = is_whole(written, name, version, body)
-            found[name] = Kept(version, body) if whole else Kept(0, b"", self._damage(name, "a damaged one"))
+            results[name] = (
+                StoredPlant(version, body) if whole else StoredPlant(0, b"", self._damage(name, "a damaged one"))
+            )
         nameless = [name for name, damage in self.damaged.items() if not damage.named]
         for name in names if nameless else ():
             got = f"none of that name, and damaged ones that may have had it: {', '.join(map(repr, nameless))}"
-            found.setdefault(name, Kept(0, b"", self._damage(name, got)))
-        return found
+            results.setdefault(name, StoredPlant(0, b"", self._damage(name, got)))
+        return results
 
     def _damage(self, name: str, got: str) -> str:
         anew = f"--anew {quote(name)} begins it anew"
@@ -141,42 +155,46 @@ class Store:
                     raise fail(f"store {self.name}, --anew", "the name of a plant that it has", repr(name))
 
     def commit(
-        self, plants: Mapping[str, Kept], entries: Sequence[Entry], malformed: int, told: int | None
+        self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
-        """Keep plants, of the versions they had before, and what is to be told; `told`: up to where it was.
+        """Keep plants, of the versions they had before, and what is to be told; `published`: up to where it was.
 
         Raises:
             ConflictError: a plant has another version.
         """
         with self._saying("a database that takes a commit"):
-            return self._committed(plants, entries, malformed, told)
+            return self._committed(plants, entries, malformed, published)
 
     def _committed(
-        self, plants: Mapping[str, Kept], entries: Sequence[Entry], malformed: int, told: int | None
+        self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
     ) -> list[Output]:
         with self._engine.begin() as connection:
             newest = self._count(connection, NEWEST, len(entries))
-            found = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
-            if any(found.get(name, 0) != kept.version for name, kept in plants.items()):
+            result = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
+            if any(result.get(name, 0) != plant.version for name, plant in plants.items()):
                 raise ConflictError
             outputs = [entry.numbered(newest - len(entries) + i) for i, entry in enumerate(entries, 1)]
             if plants:
-                after = ((name, kept.version + 1, kept.body) for name, kept in plants.items())
+                after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
                 self._put(connection, PLANTS, [_row(PLANTS, *row) for row in after])
             if outputs:
-                lines = b"\n".join([each.body for each in outputs]).decode()
+                lines = b"\n".join([output.body for output in outputs]).decode()
                 connection.execute(JOURNAL.insert(), [_row(JOURNAL, newest, self.process, lines)])
                 connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
             if malformed:
                 self._count(connection, MALFORMED, malformed)
-            if told is not None:
-                self._put(connection, NUMBERS, [_row(NUMBERS, TOLD.format(self.process), told)])
+            if published is not None:
+                self._put(connection, NUMBERS, [_row(NUMBERS, PUBLISHED.format(self.process), published)])
         return outputs
 
-    def untold(self) -> list[Output]:
+    def unpublished(self) -> list[Output]:
         """What this process committed and may not have told."""
-        told = self.number(TOLD.format(self.process))
-        return [each for each in self.entries(told, self.process) if each.number is not None and each.number > told]
+        published = self.number(PUBLISHED.format(self.process))
+        return [
+            entry
+            for entry in self.entries(published, self.process)
+            if entry.number is not None and entry.number > published
+        ]
 
     def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
         """What the journal keeps from the batch on that has number `after` + 1; of one process, or of all.
@@ -184,16 +202,16 @@ class Store:
         Raises:
             ValueError: an entry that is damaged.
         """
-        wanted = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
-        found = list[Output]()
+        expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
+        result = list[Output]()
         with self._saying("a database that can be read"), self._engine.connect() as connection:
-            for last, by, lines, written in connection.execute(wanted):
+            for last, by, lines, written in connection.execute(expected):
                 if not is_whole(written, last, by, lines):
                     got = f"damage in those up to number {last}; {MEND} {self.name}"
                     raise fail(f"store {self.name}, journal", "entries as they were written", got)
                 if process in (None, by):
-                    found += [_output(line) for line in lines.split("\n")]
-        return found
+                    result += [_output(line) for line in lines.split("\n")]
+        return result
 
     def number(self, name: str) -> int:
         """A count that is kept.
@@ -255,10 +273,10 @@ class Store:
 
 def _of(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
     """Columns of the plants of these names."""
-    found: list[Any] = []
+    results: list[Any] = []
     for i in range(0, len(names), AT_ONCE):
-        found += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
-    return found
+        results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
+    return results
 
 
 def _row(table: Table, *values: Any) -> dict[str, object]:

@@ -13,7 +13,7 @@ JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, 
                 Column("process", String(200)), Column("lines", Text), Column("checksum", BigInteger))  # fmt: skip
 NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger),
                 Column("checksum", BigInteger))  # fmt: skip
-WHOSE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
+IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
 
 
 def checksum(name: str | int, *values: str | int | bytes) -> int:
@@ -37,8 +37,8 @@ def is_named(written: object, name: object) -> bool:
 
 
 def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
-    found = crc32(f"{name}".encode())
+    result = crc32(f"{name}".encode())
     for value in values:
         data = value if isinstance(value, bytes) else f"{value}".encode()
-        found = crc32(data, crc32(f"\0{len(data)}\0".encode(), found))
-    return found
+        result = crc32(data, crc32(f"\0{len(data)}\0".encode(), result))
+    return result

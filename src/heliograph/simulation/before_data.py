@@ -40,12 +40,12 @@ class CrossCovariances:
     state: Float[np.ndarray, "n sources"]
     bias: Float[np.ndarray, "node n"]
     shared: Float[np.ndarray, "node n sources"]
-    own: Float[np.ndarray, "node n n"]
+    local: Float[np.ndarray, "node n n"]
 
     @property
     def joint(self) -> Float[np.ndarray, "node n node n"]:
         """Cov(e_i, e_j) of all pairs."""
-        return _joint(self.shared, self.own)
+        return _joint(self.shared, self.local)
 
     @property
     def of_state(self) -> Float[np.ndarray, "node n n"]:
@@ -59,9 +59,9 @@ class CrossCovariances:
 
     def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
         """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
-        weights = _weights(self.shared, self.own)
-        shared, own = _weighted(weights, self.shared, self.own)
-        return weights, shared @ shared.T + own
+        weights = _weights(self.shared, self.local)
+        shared, local = _weighted(weights, self.shared, self.local)
+        return weights, shared @ shared.T + local
 
     def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
         """Relays that forward the matrix-weighted estimate of the nodes each hears, as the nodes of the next level.
@@ -73,42 +73,44 @@ class CrossCovariances:
         Raises:
             ValueError: no relays, a relay that hears nobody, unknown nodes, a node that two relays hear.
         """
-        heard = [name for names in relays.values() for name in names]
-        unknown = sorted(set(heard) - set(self.nodes))
+        received = [name for names in relays.values() for name in names]
+        unknown = sorted(set(received) - set(self.nodes))
         if not relays or unknown or not all(relays.values()):
             raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
-        if len(set(heard)) < len(heard):
-            raise fail("nodes", "one relay for each", f"several for {sorted({n for n in heard if heard.count(n) > 1})}")
+        if len(set(received)) < len(received):
+            raise fail(
+                "nodes", "one relay for each", f"several for {sorted({n for n in received if received.count(n) > 1})}"
+            )
         place = {name: i for i, name in enumerate(self.nodes)}
         parts = []
         for names in relays.values():
             mine = [place[name] for name in names]
-            shared, own = self.shared[mine], self.own[mine]
-            parts.append(_weighted(_weights(shared, own), shared, own))
-        shared, own = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+            shared, local = self.shared[mine], self.local[mine]
+            parts.append(_weighted(_weights(shared, local), shared, local))
+        shared, local = (np.stack(leaves) for leaves in zip(*parts, strict=True))
         bias = np.zeros((len(relays), len(self.mean)))
-        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, own)
+        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, local)
 
 
-def _weights(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "n node n"]:
-    scale = np.sqrt(np.einsum("iaa->ia", own) + np.einsum("ias,ias->ia", shared, shared))
+def _weights(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", local) + np.einsum("ias,ias->ia", shared, shared))
     scale = np.where(scale > 0, scale, 1.0)
-    least = np.linalg.eigvalsh(own / (scale[:, :, None] * scale[:, None]))[:, 0].min()
-    return np.asarray(factored_weights(shared, own) if least > REGULAR else matrix_weights(_joint(shared, own)))
+    least = np.linalg.eigvalsh(local / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, local) if least > REGULAR else matrix_weights(_joint(shared, local)))
 
 
 def _weighted(
-    weights: np.ndarray, shared: np.ndarray, own: np.ndarray
+    weights: np.ndarray, shared: np.ndarray, local: np.ndarray
 ) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
     """What a weighted sum of the errors shares with others, and the covariance of its own part."""
-    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, own, weights)
+    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, local, weights)
 
 
-def _joint(shared: np.ndarray, own: np.ndarray) -> Float[np.ndarray, "node n node n"]:
+def _joint(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "node n node n"]:
     count, n, _ = shared.shape
-    flat, each = shared.reshape(count * n, -1), np.arange(count)
+    flat, items = shared.reshape(count * n, -1), np.arange(count)
     result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
-    result[each, :, each, :] += own
+    result[items, :, items, :] += local
     return result
 
 
@@ -129,8 +131,8 @@ def cross_covariances(network: Network, filter: str, horizon: int, inputs: Array
     alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
     filters, u = _prepared(alone, horizon, inputs)
     with jax.enable_x64(True):
-        found: Factors = to_numpy(_factors(filters, u))
-    parts = found.mean, found.state, found.bias, found.shared, found.own
+        result: Factors = to_numpy(_factors(filters, u))
+    parts = result.mean, result.state, result.bias, result.shared, result.local
     return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
 
 
@@ -147,8 +149,8 @@ def fused_covariances(
     instance("network", network, Network, "a Network")
     filters, u = _prepared(network, horizon, inputs)
     with jax.enable_x64(True):
-        found: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
-    return found
+        results: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
+    return results
 
 
 def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
@@ -168,16 +170,16 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
     (centre,) = filters.informed
 
     def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
-        (own, factors), (k, u_k) = carry, row
-        local = centre.gathered(filters.matrices(centre, own, u_k, k))
+        (separate, factors), (k, u_k) = carry, row
+        local = centre.gathered(filters.matrices(centre, separate, u_k, k))
         spread = factors.state @ factors.state.T
         motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
-        return (filters.followed(own, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+        return (filters.followed(separate, u_k, k), advance_factors(factors, step, motion, noise, k)), None
 
-    own, _, _, known, _ = filters.init()
+    separate, _, _, known, _ = filters.init()
     nodes, n = known[0].errors.bias.shape
-    each = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
-    start = own, initial_factors(known[0].errors, each * len(u))
+    items = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
+    start = separate, initial_factors(known[0].errors, items * len(u))
     result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
     return result
 
@@ -185,15 +187,15 @@ def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
 @quickly_compiled
 def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
     def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
-        (own, known), (k, u_k) = carry, row
-        told: dict[str, jax.Array] = {}
+        (local, known), (k, u_k) = carry, row
+        published: dict[str, jax.Array] = {}
         following = []
         for centre, state in zip(filters.informed, known, strict=True):
             means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
-            after, found = centre.step(state, filters.matrices(centre, own, u_k, k), means, u_k, k)
+            after, result = centre.step(state, filters.matrices(centre, local, u_k, k), means, u_k, k)
             following.append(after)
-            told |= {name: jnp.asarray(estimate.covariance) for name, estimate in found.items()}
-        return (filters.followed(own, u_k, k), tuple(following)), told
+            published |= {name: jnp.asarray(estimate.covariance) for name, estimate in result.items()}
+        return (filters.followed(local, u_k, k), tuple(following)), published
 
-    own, _, _, known, _ = filters.init()
-    return jax.lax.scan(body, (own, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]
+    local, _, _, known, _ = filters.init()
+    return jax.lax.scan(body, (local, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]

@@ -11,11 +11,11 @@ from heliograph.simulation.uplinks import SentReports, Uplink
 
 
 def reports_by_name(
-    network: Network, found: dict[str, tuple[np.ndarray, np.ndarray]]
+    network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
 ) -> dict[str, dict[str, SentReports]]:
     """Reports by fusion and node, without the rows that a node has not, from (..., node, m) and (..., node)."""
     result: dict[str, dict[str, SentReports]] = {}
-    for name, (values, delay) in found.items():
+    for name, (values, delay) in outcome.items():
         fusion = network.fused[name]
         assert isinstance(fusion, Fusion)  # nothing else hears reports
         nodes, n = network.nodes_with(fusion.filter), len(network.states)
@@ -29,12 +29,12 @@ def reports_by_name(
 
 def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
     """Measurements by node, in the given order, from those of the groups (..., node, received)."""
-    heard = {
+    received = {
         name: np.asarray(z)[..., i, :]
         for names, z in zip(network.groups, groups, strict=True)
         for i, name in enumerate(names)
     }
-    return {name: heard[name] for name in network.names}
+    return {name: received[name] for name in network.names}
 
 
 def by_name(
@@ -55,10 +55,10 @@ def by_name(
     return result
 
 
-def uplinks_by_name(network: Network, found: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
+def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
     """Uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
     result = {}
-    for name, fusion in network.fused.items() if found else ():
-        if isinstance(fusion, Fusion) and name in found:
-            result[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **found[name])
+    for name, fusion in network.fused.items() if outcome else ():
+        if isinstance(fusion, Fusion) and name in outcome:
+            result[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **outcome[name])
     return result

@@ -21,25 +21,25 @@ def trajectories(
     """
     start, varies, tree = _start(init, keys)
     example = jax.tree.map(lambda leaf: leaf[0], rows)
-    one = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
+    item = [leaf[..., 0] if v else leaf for leaf, v in zip(start, varies, strict=True)]
     traced, shape = jax.make_jaxpr(
         lambda carry, key, row: step(jax.tree.unflatten(tree, carry), key, row), return_shape=True
-    )(one, keys[0], example)
+    )(item, keys[0], example)
     body = _needed(traced)
     known = [False] * len(jax.tree.leaves(example))
-    spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(one)], varies)
-    differ = _dependent(body, [*spread, True, *known])[len(one) :]
+    spread = _unchanging(lambda marks: _dependent(body, [*marks, True, *known])[: len(item)], varies)
+    differ = _dependent(body, [*spread, True, *known])[len(item) :]
     row_axes: list[int | None] = [None] * len(known)
     advance = jax.vmap(jaxpr_as_fun(body), in_axes=[*_axes(spread), 0, *row_axes], out_axes=_axes([*spread, *differ]))
 
     def scanned(carry: list[jax.Array], row: PyTree) -> tuple[list[jax.Array], list[jax.Array]]:
         results = advance(*carry, keys, *jax.tree.leaves(row))
-        return results[: len(one)], results[len(one) :]
+        return results[: len(item)], results[len(item) :]
 
     begin = [_with_runs(leaf, len(keys)) if s and not v else leaf
              for leaf, v, s in zip(start, varies, spread, strict=True)]  # fmt: skip
-    found = jax.lax.scan(scanned, begin, rows)[1]
-    result = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(found, differ, strict=True)]
+    outcome = jax.lax.scan(scanned, begin, rows)[1]
+    result = [jnp.moveaxis(leaf, -1, 0) if d else leaf[None] for leaf, d in zip(outcome, differ, strict=True)]
     return jax.tree.unflatten(jax.tree.structure(shape[1]), result)
 
 
@@ -51,16 +51,16 @@ def each_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     leaves, tree = jax.tree.flatten(values)
     runs = max(len(leaf) for leaf in leaves)
     varies = [len(leaf) == runs for leaf in leaves]
-    one = [leaf[0] for leaf in leaves]
-    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*one)
-    wanted = range(len(traced.jaxpr.outvars))
-    tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in wanted])[1]) for i in wanted]
+    item = [leaf[0] for leaf in leaves]
+    traced, shape = jax.make_jaxpr(lambda *leaves: function(jax.tree.unflatten(tree, leaves)), return_shape=True)(*item)
+    expected = range(len(traced.jaxpr.outvars))
+    tells = [_any_of(varies, dce_jaxpr(traced.jaxpr, [i == j for j in expected])[1]) for i in expected]
     over = jax.vmap(
         jaxpr_as_fun(traced), in_axes=_axes(varies), out_axes=_axes(tells), axis_size=runs
     )  # runs last, as everywhere
     given = [jnp.moveaxis(leaf, 0, -1) if v else leaf[0] for leaf, v in zip(leaves, varies, strict=True)]
-    told = [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(over(*given), tells, strict=True)]
-    return jax.tree.unflatten(jax.tree.structure(shape), told)
+    outputs = [jnp.moveaxis(leaf, -1, 0) if t else leaf[None] for leaf, t in zip(over(*given), tells, strict=True)]
+    return jax.tree.unflatten(jax.tree.structure(shape), outputs)
 
 
 def _any_of(varies: Sequence[bool], used: Sequence[bool]) -> bool:

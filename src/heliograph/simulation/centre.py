@@ -15,8 +15,8 @@ from heliograph.filters.plan import Plan, is_linear_filter, linear_step
 from heliograph.fusion.cross_covariance import (
     Errors,
     ErrorStep,
-    Hearing,
     Motion,
+    Observation,
     advance,
     error_step,
     initial_errors,
@@ -43,67 +43,69 @@ class Listening(Module):
     sensor: AnySensor
     channel: SecondOrder | OverTime
 
-    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Hearing:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
         """What a plant with these moments lets the nodes hear at step k, with rows of zeros up to `size`."""
 
-        def one(sensor: AnySensor, channel: SecondOrder | OverTime) -> Hearing:
-            return _heard(at(sensor, k), at(channel, k), mean, covariance)
+        def single(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
+            return _linear_observation(at(sensor, k), at(channel, k), mean, covariance)
 
-        gain, offset, noise = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
+        gain, offset, noise = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
             self.sensor, self.channel
         )
         more = (0, size - offset.shape[-1])
-        return Hearing(
+        return Observation(
             jnp.pad(gain, ((0, 0), more, (0, 0))),
             jnp.pad(offset, ((0, 0), more)),
             jnp.pad(noise, ((0, 0), more, more)),
         )
 
 
-def _heard(sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array) -> Hearing:
+def _linear_observation(
+    sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
+) -> Observation:
     """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and what the gain adds."""
     c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
     signal = c @ mean + sensor.noise.mean
     second = homogeneous(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
     gain = jnp.asarray(channel.mean_gain)
     spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
-    return Hearing(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
+    return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
 
 
-class AbstractHears(Module):
+class AbstractObservation(Module):
     """What the nodes hear of the plant, in the nodes' order, with rows of zeros up to the longest measurement."""
 
-    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """At step k, when the plant has these moments."""
         raise NotImplementedError
 
 
-class Apart(AbstractHears):
+class Apart(AbstractObservation):
     """Nodes that share nothing, by groups; `order` brings them into the order of the nodes."""
 
     groups: tuple[Listening, ...]
     order: np.ndarray
     size: int = eqx.field(static=True)
 
-    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """Group after group."""
-        parts = [item.hears(mean, covariance, k, self.size) for item in self.groups]
-        return Hearing(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+        parts = [item.observe(mean, covariance, k, self.size) for item in self.groups]
+        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
 
 
-class Together(AbstractHears):
+class Together(AbstractObservation):
     """One sensor and one channel, of which each node hears some `rows`; -1 stands for none."""
 
     sensor: AnySensor
     channel: SecondOrder | OverTime
     rows: np.ndarray
 
-    def hears(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Hearing:
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
         """The rows of each node, and how their noises are correlated."""
-        gain, offset, noise = _heard(at(self.sensor, k), at(self.channel, k), mean, covariance)
+        gain, offset, noise = _linear_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
         gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
         noise = jnp.pad(noise, (0, 1))
-        return Hearing(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
+        return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
 
 
 class CentreState(NamedTuple):
@@ -121,7 +123,7 @@ class Centre(Module):
     """
 
     plant: AnyPlant
-    listening: AbstractHears
+    listening: AbstractObservation
     rules: dict[str, AbstractInformedFusion]
     order: np.ndarray
     sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -148,21 +150,21 @@ class Centre(Module):
         plant: LinearPlant = at(self.plant, k)
         shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
         motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
-        hearing = self.listening.hears(*moved_state(mean, covariance, motion), k)
-        return motion, error_step(local, motion, hearing), hearing.noise
+        observation = self.listening.observe(*moved_state(mean, covariance, motion), k)
+        return motion, error_step(local, motion, observation), observation.noise
 
     def gathered(self, parts: Sequence[Plan]) -> Plan:
         """Matrices of the sources' filters in the order of the nodes, with rows of zeros for what is not heard."""
 
-        def padded(one: Plan) -> Plan:
-            more = (0, self.size - one.offset.shape[-1])
+        def padded(plan: Plan) -> Plan:
+            more = (0, self.size - plan.offset.shape[-1])
             return Plan(
-                one.transition,
-                one.drift,
-                jnp.pad(one.gain, ((0, 0), (0, 0), more)),
-                jnp.pad(one.output, ((0, 0), more, (0, 0))),
-                jnp.pad(one.offset, ((0, 0), more)),
-                jnp.pad(one.innovation, ((0, 0), more, more)),
+                plan.transition,
+                plan.drift,
+                jnp.pad(plan.gain, ((0, 0), (0, 0), more)),
+                jnp.pad(plan.output, ((0, 0), more, (0, 0))),
+                jnp.pad(plan.offset, ((0, 0), more)),
+                jnp.pad(plan.innovation, ((0, 0), more, more)),
             )
 
         return Plan(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
@@ -173,11 +175,11 @@ class Centre(Module):
         """Next state, and estimates by the fusions' names, from the sources' matrices and means after the step."""
         happened = self.moved(state.errors, self.gathered(parts), u, k)
         reports = jnp.concatenate(means)[self.order]
-        after, found = {}, {}
+        after, results = {}, {}
         for name, rule in self.rules.items():
             after[name], (mean, covariance) = rule.use(state.rules[name], happened, reports)
-            found[name] = Estimate(mean, covariance, self.claim)
-        return CentreState(happened.errors, after), found
+            results[name] = Estimate(mean, covariance, self.claim)
+        return CentreState(happened.errors, after), results
 
 
 def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Listening:
@@ -188,7 +190,7 @@ def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> List
 def described(channel: Channel) -> SecondOrder | OverTime:
     """The channel's second moments where all of it arrives, for each step where it varies."""
     if isinstance(channel, OverTime):
-        return over_time([second_order(arrived(one)) for one in unstack(channel)])
+        return over_time([second_order(arrived(item)) for item in unstack(channel)])
     return second_order(arrived(channel))
 
 
@@ -205,8 +207,8 @@ def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Cl
     """
     for name, (_, channel, _) in nodes.items():
         if first(channel).remembers:
-            wanted = f"fusion by {rule}: node {name!r}"
-            raise fail(wanted, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
+            expected = f"fusion by {rule}: node {name!r}"
+            raise fail(expected, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
     refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
     if along_estimates(nodes):
         _check_along_estimates(rule, nodes, shared)
@@ -248,7 +250,7 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
     Raises:
         ValueError: nodes that lose measurements, of which a report that does not come cannot tell.
     """
-    lossy = [name for name, hears_all in complete.items() if not hears_all]
+    lossy = [name for name, receives_all in complete.items() if not receives_all]
     if lossy:
         raise fail(f"fusion by {rule} over uplinks", "nodes that lose no measurements, of which the centre would have "
                    "to know", f"losses at {lossy}")  # fmt: skip
@@ -262,7 +264,7 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 def _uncertain(channel: Channel) -> bool:
     """Whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(arrived(one).corner_count() > 1 for one in _each(channel))
+        return any(arrived(item).corner_count() > 1 for item in _each(channel))
     except ValueError:  # too many corners to list
         return True
 

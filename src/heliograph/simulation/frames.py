@@ -65,7 +65,7 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
     for i, (node, name, quantity, component, other) in enumerate(frame.columns):
         values = frame.iloc[:, i].to_numpy().reshape(lead)
         parts.setdefault((node, name, quantity), {})[component, other] = values
-    joined = {key: np.stack(list(found.values()), axis=-1) for key, found in parts.items()}
+    joined = {key: np.stack(list(part.values()), axis=-1) for key, part in parts.items()}
     states: tuple[str, ...] = ()
     measurements: dict[str, np.ndarray] = {}
     estimates: dict[str, dict[str, Estimate]] = {}
@@ -83,44 +83,44 @@ def record_of_frame(frame: "pd.DataFrame") -> "Record":
             covariance = values.reshape(*lead, n, n)
             estimates.setdefault(node, {})[name] = Estimate(mean, covariance, COVARIANCE[quantity])
     uplinks = {
-        name: Uplink(tuple(found), *(np.stack(each, axis=-2) for each in zip(*found.values(), strict=True)))
-        for name, found in sent.items()
+        name: Uplink(tuple(item), *(np.stack(item, axis=-2) for item in zip(*item.values(), strict=True)))
+        for name, item in sent.items()
     }
     time = np.asarray(frame.index.get_level_values("time"))[:steps]
     return Record(time, states, joined.get(("", "", "truth")), measurements, estimates, uplinks)
 
 
-def statistics_frame(found: "StatisticsByName") -> "pd.DataFrame":
+def statistics_frame(result: "StatisticsByName") -> "pd.DataFrame":
     """A row for each node and filter: claim, runs, RMSE and NEES with errors, then each state's RMSE and claim."""
     import pandas as pd
 
     rows, index = [], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the row says in how many runs it failed
-        for node, filters in found.items():
-            for name, one in filters.items():
+        for node, filters in result.items():
+            for name, filter_ in filters.items():
                 index.append((node, name))
-                rows.append(_summary(one, found.states))
+                rows.append(_summary(filter_, result.states))
     names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
     return pd.DataFrame(rows, index=names)
 
 
-def _summary(one: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
-    nees, low, high = one.nees_per_dimension()
-    rmse, error = one.rmse()
-    by_state = zip(states, *one.rmse_by_state(), one.deviation_by_state(), strict=True)
+def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+    nees, low, high = item.nees_per_dimension()
+    rmse, error = item.rmse()
+    by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
     total = {
-        "claim": one.claim,
-        "runs": one.runs,
-        "failed runs": one.failed_runs,
+        "claim": item.claim,
+        "runs": item.runs,
+        "failed runs": item.failed_runs,
         "rmse": rmse,
         "rmse error": error,
         "nees": nees,
         "nees low": low,
         "nees high": high,
     }
-    for state, own, spread, claimed in by_state:
-        total |= {f"rmse of {state}": own, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
+    for state, single, spread, claimed in by_state:
+        total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
     return total
 
 
@@ -135,8 +135,8 @@ def _labels(columns: Sequence[Column]) -> Any:
 
 def _of_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
     mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
-    found: dict[Column, np.ndarray] = {(node, name, "mean", s, ""): mean[..., i] for i, s in enumerate(states)}
-    for i, one in enumerate(states):
+    results: dict[Column, np.ndarray] = {(node, name, "mean", s, ""): mean[..., i] for i, s in enumerate(states)}
+    for i, state in enumerate(states):
         for j, other in enumerate(states):
-            found[node, name, f"covariance ({estimate.claim})", one, other] = covariance[..., i, j]
-    return found
+            results[node, name, f"covariance ({estimate.claim})", state, other] = covariance[..., i, j]
+    return results

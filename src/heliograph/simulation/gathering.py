@@ -17,7 +17,7 @@ from heliograph.numerics.angle import Angles, nearest, wrapped
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array
 from heliograph.simulation.centre import (
-    AbstractHears,
+    AbstractObservation,
     Apart,
     Centre,
     Together,
@@ -25,7 +25,7 @@ from heliograph.simulation.centre import (
     described,
     listening,
 )
-from heliograph.simulation.hearing import CentreFilter
+from heliograph.simulation.centre_filter import CentreFilter
 from heliograph.simulation.linearised import LinearisedCentre
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
@@ -72,8 +72,8 @@ class Fused(Module):
         combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
         mean, covariance = combine(self.rules, means, covariances)
         mean = wrapped(mean, self.angles)
-        each = enumerate(zip(self.names, self.claims, strict=True))
-        return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in each}, uplinks
+        items = enumerate(zip(self.names, self.claims, strict=True))
+        return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
 
     def _gathered(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
         """(fusion, node, ...)."""
@@ -131,9 +131,11 @@ def _fused(
     sources, order = [], []
     for item, mine in zip(items, nodes, strict=True):
         source = tuple({places[node, item.filter][:2]: None for node in mine})
-        found = {node: i for i, node in enumerate(n for k, _ in source for n in network.groups[network.kinds[k].group])}
+        results = {
+            node: i for i, node in enumerate(n for k, _ in source for n in network.groups[network.kinds[k].group])
+        }
         sources.append(source)
-        order.append([found[node] for node in mine])
+        order.append([results[node] for node in mine])
     quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
     rules = stack([item.rule for item in items])
     angles = first(network.plant).angles
@@ -161,7 +163,7 @@ def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion
         return LinearisedCentre(network.plant, rules, order, sources, size, claim)
     return Centre(
         plant=network.plant,
-        listening=_hears(network, mine, groups, order, size),
+        listening=_observe(network, mine, groups, order, size),
         rules=rules,
         order=order,
         sources=sources,
@@ -176,18 +178,18 @@ def gathering(
     """Kinds and filters that hold the nodes' estimates, and what brings these into the order of the nodes."""
     sources = tuple({places[node, name][:2]: None for node in nodes})
     groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
-    found = {node: i for i, node in enumerate(node for names in groups for node in names)}
-    return sources, np.array([found[node] for node in nodes])
+    results = {node: i for i, node in enumerate(node for names in groups for node in names)}
+    return sources, np.array([results[node] for node in nodes])
 
 
-def _hears(
+def _observe(
     network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
-) -> AbstractHears:
+) -> AbstractObservation:
     """What a centre knows of how these nodes hear."""
     if network.common is not None:
         rows = network.rows()
         padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
         return Together(network.common.sensor, described(network.common.channel), np.array(padded))
     parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
-    each = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
-    return Apart(each, order, size)
+    items = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    return Apart(items, order, size)

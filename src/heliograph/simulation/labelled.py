@@ -65,10 +65,10 @@ def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...]
     return result
 
 
-def claims_of(sizes: tuple[int, ...], found: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
+def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
     """What each filter claims, at its place; empty elsewhere."""
     result = np.full(sizes, "", dtype="U7")
-    for place, item in found:
+    for place, item in outcome:
         claim: Claim = item.claim
         result[place] = claim
     return result
@@ -80,16 +80,16 @@ def uplink_variables(
     """What quantizers did, by fusion and sender; each keeps its kind of number."""
     if not uplinks:
         return {}
-    senders = list(dict.fromkeys(node for each in uplinks.values() for node in each.nodes))
+    senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
     fusions, first = list(uplinks), next(iter(uplinks.values()))
     place = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
     parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *place.shape, n), getattr(first, name).dtype)
              for name in ("saturated", "symbols")}  # fmt: skip
-    for i, each in enumerate(uplinks.values()):
-        for j, node in enumerate(each.nodes):
+    for i, uplink in enumerate(uplinks.values()):
+        for j, node in enumerate(uplink.nodes):
             place[i, senders.index(node)] = j
             for name, values in parts.items():
-                values[..., i, senders.index(node), :] = getattr(each, name)[..., j, :]
+                values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
     axes = [*lead, "fusion", "sender", "state"]
     named = {"fusion": (["fusion"], text(fusions)), "sender": (["sender"], text(senders))}
     return {"place": (["fusion", "sender"], place), **{name: (axes, v) for name, v in parts.items()}, **named}
@@ -140,11 +140,11 @@ def dataset_of(
     return xr.Dataset(data, coordinates, attributes)
 
 
-def told(found: Any) -> str:
+def claims_text(result: Any) -> str:
     """Claims for people: `node/filter: claim`."""
-    every = found.estimates if hasattr(found, "estimates") else found
+    every = result.estimates if hasattr(result, "estimates") else result
     return visible(
-        ", ".join(f"{node}/{name}: {one.claim}" for node, each in every.items() for name, one in each.items())
+        ", ".join(f"{node}/{name}: {single.claim}" for node, item in every.items() for name, single in item.items())
     )
 
 
@@ -182,5 +182,5 @@ def units_of(dataset: "xr.Dataset") -> dict[str, str]:
     time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
     if "unit" not in dataset.coords:
         return time
-    each = zip(names_of(dataset, "state"), dataset["unit"].values, strict=True)
-    return {state: str(unit) for state, unit in each if unit} | time
+    items = zip(names_of(dataset, "state"), dataset["unit"].values, strict=True)
+    return {state: str(unit) for state, unit in items if unit} | time

@@ -10,10 +10,10 @@ from heliograph.simulation.labelled import (
     TIME,
     check_title,
     claims_of,
+    claims_text,
     dataset_of,
     filled,
     names_of,
-    told,
     units_of,
     uplink_variables,
     uplinks_from,
@@ -34,35 +34,35 @@ def record_dataset(record: "Record") -> "xr.Dataset":
     A filter that a node does not have is NaN, and its `claim` is empty.
     """
     nodes = list(dict.fromkeys([*record.measurements, *record.estimates]))
-    filters = list(dict.fromkeys(name for each in record.estimates.values() for name in each))
+    filters = list(dict.fromkeys(name for estimate in record.estimates.values() for name in estimate))
     lead, axes = _lead(record), [] if record.runs is None else ["run"]
     n, sizes = len(record.states), (len(nodes), len(filters))
-    found = [
+    results = [
         ((nodes.index(node), filters.index(name)), estimate)
-        for node, each in record.estimates.items()
-        for name, estimate in each.items()
+        for node, estimate_ in record.estimates.items()
+        for name, estimate in estimate_.items()
     ]
-    heard = [((nodes.index(node),), z) for node, z in record.measurements.items()]
-    most = max((z.shape[-1] for _, z in heard), default=0)
+    received = [((nodes.index(node),), z) for node, z in record.measurements.items()]
+    most = max((z.shape[-1] for _, z in received), default=0)
     variables = {
-        "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), heard)),
+        "measurement": ([*axes, TIME, "node", "received"], filled(lead, (len(nodes),), (most,), received)),
         "length": (["node"], _per_node(nodes, {node: z.shape[-1] for node, z in record.measurements.items()})),
         "estimated": (["node"], np.array([node in record.estimates for node in nodes], dtype=bool)),
-        "claim": (["node", "filter"], claims_of(sizes, found)),
+        "claim": (["node", "filter"], claims_of(sizes, results)),
         "mean": (
             [*axes, TIME, "node", "filter", "state"],
-            filled(lead, sizes, (n,), [(place, np.asarray(e.mean)) for place, e in found]),
+            filled(lead, sizes, (n,), [(place, np.asarray(e.mean)) for place, e in results]),
         ),
         "covariance": (
             [*axes, TIME, "node", "filter", "state", "other"],
-            filled(lead, sizes, (n, n), [(place, np.asarray(e.covariance)) for place, e in found]),
+            filled(lead, sizes, (n, n), [(place, np.asarray(e.covariance)) for place, e in results]),
         ),
         **uplink_variables(record.uplinks, [*axes, TIME], n),
     }
     if record.truth is not None:
         variables["truth"] = ([*axes, TIME, "state"], record.truth)
     labels = {"node": nodes, "filter": filters, "state": record.states, "other": record.states}
-    return dataset_of(RECORD, variables, labels, record.time, record.units, told(record))
+    return dataset_of(RECORD, variables, labels, record.time, record.units, claims_text(record))
 
 
 def record_from(dataset: "xr.Dataset") -> "Record":
@@ -81,7 +81,7 @@ def record_from(dataset: "xr.Dataset") -> "Record":
     covariance = values_of(dataset, "covariance", [*lead, "node", "filter", "state", "other"])
     claim = values_of(dataset, "claim", ["node", "filter"])
     length, estimated = values_of(dataset, "length", ["node"]), values_of(dataset, "estimated", ["node"])
-    estimates: dict[str, dict[str, Estimate]] = {node: {} for node, kept in zip(nodes, estimated, strict=True) if kept}
+    estimates: dict[str, dict[str, Estimate]] = {node: {} for node, item in zip(nodes, estimated, strict=True) if item}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         value = Estimate(mean[..., i, j, :].copy(), covariance[..., i, j, :, :].copy(), cast(Claim, str(claim[i, j])))
         estimates[nodes[i]][filters[j]] = value

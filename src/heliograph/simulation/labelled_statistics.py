@@ -10,10 +10,10 @@ from heliograph.simulation.labelled import (
     TIME,
     check_title,
     claims_of,
+    claims_text,
     dataset_of,
     filled,
     names_of,
-    told,
     units_of,
     uplink_variables,
     uplinks_from,
@@ -30,44 +30,47 @@ if TYPE_CHECKING:  # an extra
 STATISTICS = "heliograph statistics"  # the title of a dataset that holds them
 
 
-def statistics_dataset(found: "StatisticsByName") -> "xr.Dataset":
+def statistics_dataset(result: "StatisticsByName") -> "xr.Dataset":
     """Statistics with dimensions time, node, filter, state and other, and the sums by batch that they are made from."""
-    nodes = list(found)
-    filters = list(dict.fromkeys(name for each in found.values() for name in each))
+    nodes = list(result)
+    filters = list(dict.fromkeys(name for item in result.values() for name in item))
     every = [
-        ((nodes.index(node), filters.index(name)), one) for node, each in found.items() for name, one in each.items()
+        ((nodes.index(node), filters.index(name)), single)
+        for node, item in result.items()
+        for name, single in item.items()
     ]
     if not every:
         raise fail("statistics", "those of one filter at least", "none")
-    sizes, n, first = (len(nodes), len(filters)), len(found.states), every[0][1]
+    sizes, n, first = (len(nodes), len(filters)), len(result.states), every[0][1]
     batch, steps = (len(first.count), first.nees.shape[1]), first.nees.shape[1]
 
     def of(name: str) -> np.ndarray:
         """Sums of pairs i <= j as symmetric matrices."""
-        return filled(batch, sizes, (n, n), [(place, matrices(getattr(one, name))) for place, one in every])
+        return filled(batch, sizes, (n, n), [(place, matrices(getattr(item, name))) for place, item in every])
 
-    squares = [(place, np.diagonal(one.actual(), axis1=-2, axis2=-1)) for place, one in every]
-    claimed = [(place, np.diagonal(one.claimed(), axis1=-2, axis2=-1)) for place, one in every]
-    distances = [(place, one.nees.sum(axis=0) / one.runs / n) for place, one in every]
-    by_step = [(place, np.full(steps, np.nan) if one.failed is None else one.failed) for place, one in every]
-    failed = [(place, np.array(one.failed_runs)) for place, one in every]
+    squares = [(place, np.diagonal(item.actual(), axis1=-2, axis2=-1)) for place, item in every]
+    claimed = [(place, np.diagonal(item.claimed(), axis1=-2, axis2=-1)) for place, item in every]
+    distances = [(place, item.nees.sum(axis=0) / item.runs / n) for place, item in every]
+    by_step = [(place, np.full(steps, np.nan) if item.failed is None else item.failed) for place, item in every]
+    failed = [(place, np.array(item.failed_runs)) for place, item in every]
     filters_of = ["node", "filter"]
+    uplinks = {name: item.uplink for name, item in result.get(FUSED, {}).items() if item.uplink}
     variables = {
         "runs": (["batch"], first.count),
         "errors": (["batch", TIME, *filters_of, "state", "other"], of("pairs")),
         "claimed": (["batch", TIME, *filters_of, "state", "other"], of("claimed_pairs")),
-        "nees": (["batch", TIME, *filters_of], filled(batch, sizes, (), [(place, one.nees) for place, one in every])),
+        "nees": (["batch", TIME, *filters_of], filled(batch, sizes, (), [(place, item.nees) for place, item in every])),
         "claim": (filters_of, claims_of(sizes, every)),
         "failed": ([TIME, *filters_of], filled((steps,), sizes, (), by_step)),
         "failed_runs": (filters_of, filled((), sizes, (), failed)),
         "rmse": ([TIME, *filters_of, "state"], np.sqrt(filled((steps,), sizes, (n,), squares))),
         "deviation": ([TIME, *filters_of, "state"], _root(filled((steps,), sizes, (n,), claimed))),
         "nees_per_dimension": ([TIME, *filters_of], filled((steps,), sizes, (), distances)),
-        **uplink_variables({name: one.uplink for name, one in found.get(FUSED, {}).items() if one.uplink}, [TIME], n),
+        **uplink_variables(uplinks, [TIME], n),
     }  # fmt: skip
-    labels = {"node": nodes, "filter": filters, "state": found.states, "other": found.states}
+    labels = {"node": nodes, "filter": filters, "state": result.states, "other": result.states}
     time = np.arange(1.0, steps + 1)
-    return dataset_of(STATISTICS, variables, labels, time, found.units, told(found))
+    return dataset_of(STATISTICS, variables, labels, time, result.units, claims_text(result))
 
 
 def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
@@ -90,10 +93,10 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
     )
     failed_runs, count = values_of(dataset, "failed_runs", of), values_of(dataset, "runs", ["batch"])
     uplinks = uplinks_from(dataset, [TIME])
-    found: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in nodes}
+    results: dict[str, dict[str, ErrorStatistics]] = {node: {} for node in nodes}
     for i, j in zip(*np.nonzero(claim != ""), strict=True):
         by_step = None if np.isnan(failed[:, i, j]).any() else failed[:, i, j].copy()
-        found[nodes[i]][filters[j]] = ErrorStatistics(
+        results[nodes[i]][filters[j]] = ErrorStatistics(
             count=count.copy(),
             pairs=errors[:, :, i, j].copy(),
             claimed_pairs=claimed[:, :, i, j].copy(),
@@ -103,7 +106,7 @@ def statistics_from(dataset: "xr.Dataset") -> "StatisticsByName":
             failed=by_step,
             failed_runs=int(failed_runs[i, j]),
         )
-    return StatisticsByName(found, tuple(states), units_of(dataset))
+    return StatisticsByName(results, tuple(states), units_of(dataset))
 
 
 def _root(variance: np.ndarray) -> np.ndarray:

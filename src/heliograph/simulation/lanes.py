@@ -55,16 +55,16 @@ class Lanes:
         numbers = np.arange(start, start + blocks)
         runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
         lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
-        kept = self._vectorised(runs, lanes) if self.wide else self._threads(runs, lanes)
+        recorded = self._vectorised(runs, lanes) if self.wide else self._threads(runs, lanes)
         used = np.concatenate(lanes)
-        return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *kept)
+        return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *recorded)
 
     def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
         def go(lane: int) -> PyTree:
             with jax.enable_x64(True):
                 carry = self.start() if self.carries[lane] is None else self.carries[lane]
-                self.carries[lane], kept = self.alone(runs[lanes[lane]], carry)
-                return to_numpy(kept)
+                self.carries[lane], recorded = self.alone(runs[lanes[lane]], carry)
+                return to_numpy(recorded)
 
         if self.pool is None:
             self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
@@ -76,8 +76,8 @@ class Lanes:
             every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
             self.carries = jax.device_put(every, shared)
         dealt = jax.device_put(np.stack([runs[mine] for mine in lanes]), shared)
-        self.carries, kept = self.together(dealt, self.carries)
-        on_host = to_numpy(kept)
+        self.carries, recorded = self.together(dealt, self.carries)
+        on_host = to_numpy(recorded)
         return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
 
     def total(self) -> PyTree:
@@ -96,8 +96,8 @@ def _plus(total: PyTree, more: PyTree) -> PyTree:
     return jax.tree.map(jnp.add, total, more)
 
 
-def _in_order(kept: np.ndarray, used: np.ndarray) -> np.ndarray:
+def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
     """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
-    result = np.empty_like(kept)
-    result[used] = kept
-    return result.reshape(-1, *kept.shape[2:])
+    result = np.empty_like(recorded)
+    result[used] = recorded
+    return result.reshape(-1, *recorded.shape[2:])

@@ -10,7 +10,7 @@ import numpy as np
 
 from heliograph.filters.plan import Linearised, linearised_step
 from heliograph.fusion.all_reports import AllReports, Knowledge
-from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, heard_noise, initial_errors
+from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, initial_errors, observation_noise
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.model.over_time import at
@@ -23,7 +23,7 @@ class Followed(NamedTuple):
     """Of one fusion: moments of the errors, what it told last, and its rule's state."""
 
     errors: Errors
-    told: jax.Array
+    known: jax.Array
     rule: PyTree
 
 
@@ -64,30 +64,30 @@ class LinearisedCentre(Module):
         local, reports = self._gathered(parts), jnp.concatenate(means)[self.order]
         plant = at(self.plant, k)
         keep = jnp.eye(reports.shape[-1]) - local.gain @ local.output
-        following, found = {}, {}
+        following, results = {}, {}
         for name, rule in self.rules.items():
             before = state[name]
-            matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.told)
-            moved = plant.transition(before.told, u) + plant.noise_mean()
-            motion = Motion(matrix, moved - matrix @ before.told, plant.noise_covariance(u))
+            matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
+            moved = plant.transition(before.known, u) + plant.noise_mean()
+            motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
             step = _shared_step(matrix, keep, local.gain)
             errors = _advanced(before.errors, step, motion.noise, local.noise)
             if isinstance(rule, AllReports):
-                step = step._replace(drift=_surprise(before.rule, matrix, moved, keep, local))
+                step = step._replace(drift=_nis(before.rule, matrix, moved, keep, local))
             after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, local.noise, errors), reports)
-            following[name], found[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
-        return following, found
+            following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
+        return following, results
 
     def _gathered(self, parts: Sequence[Linearised]) -> Linearised:
         """In the order of the nodes, with rows of zeros for what is not heard."""
 
-        def padded(one: Linearised) -> Linearised:
-            more = (0, self.size - one.gain.shape[-1])
+        def padded(item: Linearised) -> Linearised:
+            more = (0, self.size - item.gain.shape[-1])
             return Linearised(
-                one.predicted,
-                jnp.pad(one.gain, ((0, 0), (0, 0), more)),
-                jnp.pad(one.output, ((0, 0), more, (0, 0))),
-                jnp.pad(one.noise, ((0, 0), more, more)),
+                item.predicted,
+                jnp.pad(item.gain, ((0, 0), (0, 0), more)),
+                jnp.pad(item.output, ((0, 0), more, (0, 0))),
+                jnp.pad(item.noise, ((0, 0), more, more)),
             )
 
         return Linearised(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
@@ -99,17 +99,17 @@ def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorSt
     return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
 
 
-def _surprise(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
+def _nis(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
     """F_i (E e_i- - A E e_i): what each filter predicts is known, so that E e_i- = E x- - m_i-."""
     nodes, n, _ = keep.shape
     before = state.mean[n:].reshape(nodes, n)
     return jnp.einsum("iab,ib->ia", keep, moved - local.predicted - before @ matrix.T)
 
 
-def _advanced(errors: Errors, step: ErrorStep, noise: Array, heard: Array) -> Errors:
+def _advanced(errors: Errors, step: ErrorStep, noise: Array, received: Array) -> Errors:
     """All pairs at once; moments of the plant itself are not known."""
     once = jnp.einsum("iab,ibjc->iajc", step.transition, errors.joint)
     both = jnp.einsum("iajb,jcb->iajc", once, step.transition)
     shared = jnp.einsum("iab,bc,jdc->iajd", step.of_noise, noise, step.of_noise)
     bias = jnp.einsum("iab,ib->ia", step.transition, errors.bias)
-    return errors._replace(bias=bias, joint=both + shared + heard_noise(step.gain, heard))
+    return errors._replace(bias=bias, joint=both + shared + observation_noise(step.gain, received))

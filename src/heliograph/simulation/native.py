@@ -112,8 +112,8 @@ def _made(
     """`_program`, or why there is none: either is found once. It hangs on JAX's way to count draws, `counting`."""
     try:
         return _program(tree, held, fixed, known)
-    except Unsupported as found:
-        return found
+    except Unsupported as error:
+        return error
 
 
 def _program(
@@ -127,13 +127,13 @@ def _program(
 
     def run(key: jax.Array, *leaves: Any) -> list[jax.Array]:
         *arrays, number = leaves
-        each = iter(arrays)
-        whole = [value if h else next(each) for value, h in zip(fixed, held, strict=True)]
+        items = iter(arrays)
+        whole = [value if h else next(items) for value, h in zip(fixed, held, strict=True)]
         world, later, inputs, reducer = jax.tree.unflatten(tree, whole)
         run_key, u = jax.random.fold_in(key, number), jnp.asarray(inputs)
-        found = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
-        summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (found.sums, found.ever))
-        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], found.collected))
+        result = _run(world, u, reducer, run_key) if later is None else _smoothed(world, later, u, reducer, run_key)
+        summed = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), (result.sums, result.ever))
+        results, structure = jax.tree.flatten(OfStep(summed[0], summed[1], result.collected))
         form[:] = [structure, len(jax.tree.leaves(summed))]
         return results
 
@@ -153,11 +153,11 @@ def _run(world: World, inputs: jax.Array, reducer: AbstractReducer[Any], key: ja
     """What is kept of a run: stacked over time, but for what was ever so at some step."""
 
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, OfStep]:
-        state, found = world.step(state, key, row)
-        return state, reducer.of_step(found)
+        state, result = world.step(state, key, row)
+        return state, reducer.of_step(result)
 
-    _, kept = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    return kept._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), kept.ever))
+    _, recorded = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
+    return recorded._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), recorded.ever))
 
 
 def _smoothed(
@@ -168,13 +168,13 @@ def _smoothed(
     def step(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         return world.step(state, key, row)
 
-    def kept(found: PyTree) -> OfStep:
-        _, each = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), found)
-        return each._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), each.ever))
+    def recorded(result: PyTree) -> OfStep:
+        _, items = jax.lax.scan(lambda carry, row: (carry, reducer.of_step(row)), (), result)
+        return items._replace(ever=jax.tree.map(lambda leaf: jnp.any(leaf, axis=0), items.ever))
 
-    _, found = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
-    both = one_run(later.both, found)
-    filtered, smoothed = kept(both["filtered"]), kept(both["smoothed"])
+    _, result = jax.lax.scan(step, world.init(key), (jnp.arange(len(inputs)), inputs))
+    both = one_run(later.both, result)
+    filtered, smoothed = recorded(both["filtered"]), recorded(both["smoothed"])
     return OfStep(
         (filtered.sums, smoothed.sums, both["surprise"]),
         (filtered.ever, smoothed.ever),
@@ -190,20 +190,20 @@ def _lowered(made: ClosedJaxpr, known: Sequence[_Known]) -> Program:
     number = Buffer("input", "u32", (), graph.top)
     inputs = [words]
     values: list[Any] = [keys_of(InMemory.whole(words).nodes(graph))]
-    for one in known:
-        fixed, numbers = one.numbers()
+    for item in known:
+        fixed, numbers = item.numbers()
         if not _is_given(numbers):
             values.append(lowering.known(numbers))
             continue
         type: Type = "f64" if numbers.dtype.kind == "f" else "u32"
-        buffer = Buffer("input", type, one.shape, graph.top)
+        buffer = Buffer("input", type, item.shape, graph.top)
         inputs.append(buffer)
         if numbers.size > LONG:
             values.append(InMemory.whole(buffer))
         else:
             entries = zip(fixed.ravel().tolist(), numbers.ravel().tolist(), range(numbers.size), strict=True)
             values.append(
-                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], one.shape)
+                array_of([graph.constant(x, type) if f else graph.load(buffer, i) for f, x, i in entries], item.shape)
             )
     values.append(InMemory.whole(number))
     outputs = lowering.inline(made, values)

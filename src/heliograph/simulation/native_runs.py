@@ -12,13 +12,13 @@ from heliograph.codegen.engine import attempted
 from heliograph.codegen.summed import folded
 from heliograph.model.over_time import first
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.air import air_of
 from heliograph.simulation.lanes import BLOCK, LANES
+from heliograph.simulation.medium import medium_of
 from heliograph.simulation.native import Native, native
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.reducer import AbstractReducer, Result
-from heliograph.simulation.smoothed import Beside, Part
+from heliograph.simulation.smoothed import Part, WithSmoothed
 from heliograph.simulation.statistics import BATCHES
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
@@ -44,15 +44,17 @@ def natively(
     share nothing but the plant: they are simulated a few at a time.
     """
     if part is not None:
-        both: Beside[Result] = Beside(reducer)
+        both: WithSmoothed[Result] = WithSmoothed(reducer)
         code = attempted(lambda: _code(network, inputs, key, reducer, part))
         if code is None:
             return None
-        return both.finished(*_kept(code, both, first_run, runs, chunk, progress), network, part)
+        return both.finished(*_recorded(code, both, first_run, runs, chunk, progress), network, part)
     if len(network.names) <= NODES or not _is_apart(network) or type(reducer).joined is AbstractReducer.joined:
         code = attempted(lambda: _code(network, inputs, key, reducer))
         return (
-            None if code is None else reducer.finish(*_kept(code, reducer, first_run, runs, chunk, progress), network)
+            None
+            if code is None
+            else reducer.finish(*_recorded(code, reducer, first_run, runs, chunk, progress), network)
         )
     results, parts = [], list(_parts(network))
     for number, some in enumerate(parts):
@@ -64,14 +66,14 @@ def natively(
             if progress is not None:
                 progress((number * total + done) // len(parts), total)  # noqa: B023
 
-        results.append(reducer.finish(*_kept(code, reducer, first_run, runs, chunk, shown), some))
+        results.append(reducer.finish(*_recorded(code, reducer, first_run, runs, chunk, shown), some))
     return reducer.joined(results, network)
 
 
 def _is_apart(network: Network) -> bool:
     """Whether nodes, each with filters, share nothing but the plant: no fusion, sensor, hop or memory of a channel."""
-    own = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
-    return len(own) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in own)
+    local = [node for node in network.nodes.values() if isinstance(node, Node) and node.filters]
+    return len(local) == len(network.nodes) and not network.fused and not any(first(n.channel).remembers for n in local)
 
 
 def _parts(network: Network) -> Iterator[Network]:
@@ -85,10 +87,12 @@ def _code(
     network: Network, inputs: np.ndarray, key: jax.Array, reducer: AbstractReducer[Any], part: Part | None = None
 ) -> Native:
     filters = AllFilters(network, part and part.kinds)
-    return native(World(network.plant, air_of(network), filters), inputs, key, reducer, part and part.smoother(filters))
+    return native(
+        World(network.plant, medium_of(network), filters), inputs, key, reducer, part and part.smoother(filters)
+    )
 
 
-def _kept(
+def _recorded(
     code: Native, reducer: AbstractReducer[Any], first_run: int, runs: int, chunk: int, progress: Progress | None
 ) -> tuple[PyTree, PyTree]:
     """What the reducer holds after all runs, and what it collected of them, chunk by chunk."""
@@ -128,9 +132,9 @@ class NativeLanes:
             sums = self.sums[lane] = self.sums[lane] or self.code.begun.zeros()
             return self.code.begun.add(dealt[lane], sums)
 
-        found = list(threads().map(go, used))
+        result = list(threads().map(go, used))
         order = np.argsort(np.concatenate([dealt[lane] for lane in used]), kind="stable")
-        return [None if each[0] is None else np.concatenate(each)[order] for each in zip(*found, strict=True)]
+        return [None if item[0] is None else np.concatenate(item)[order] for item in zip(*result, strict=True)]
 
     def _runs(self, blocks: np.ndarray) -> np.ndarray:
         runs = (self.first_run + BLOCK * blocks[:, None] + np.arange(BLOCK)).ravel()
@@ -143,9 +147,9 @@ class NativeLanes:
         code = self.code.begun
         summed = code.program.summed.outputs
         leaves, common = [], []
-        for one, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
+        for item, is_summed, shared in zip(code.shared, summed, code.program.common, strict=True):
             value = next(totals) if is_summed else None
-            leaves.append(one if shared else value)
+            leaves.append(item if shared else value)
             common.append(shared)
         count = np.bincount(np.arange(self.first_run, self.stop) % BATCHES, minlength=BATCHES).astype(float)
         sums, same = (jax.tree.unflatten(self.code.tree, x) for x in (leaves, common))
@@ -154,9 +158,9 @@ class NativeLanes:
     def joined(self, parts: Sequence[list[np.ndarray | None]]) -> PyTree:
         """What was collected of all runs, (run, ...); a view of one where they share it."""
         leaves: list[Any] = []
-        for one, *each in zip(self.code.begun.shared, *parts, strict=True):
-            if one is not None:
-                leaves.append(np.broadcast_to(one, (self.stop - self.first_run, *one.shape)))
+        for item, *single in zip(self.code.begun.shared, *parts, strict=True):
+            if item is not None:
+                leaves.append(np.broadcast_to(item, (self.stop - self.first_run, *item.shape)))
             else:
-                leaves.append(None if each[0] is None else np.concatenate(each) if len(each) > 1 else each[0])
+                leaves.append(None if single[0] is None else np.concatenate(single) if len(single) > 1 else single[0])
         return jax.tree.unflatten(self.code.tree, leaves).collected

@@ -48,30 +48,30 @@ def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: in
         first, last = core * share * width, min((core + 1) * share * width, runs)
         parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
         with jax.enable_x64(True):
-            found = to_numpy(_blocks(function, parts))
-        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], found)
+            result = to_numpy(_blocks(function, parts))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], result)
 
     with ThreadPoolExecutor(cores) as pool:
-        found = list(pool.map(work, range(-(-runs // (share * width)))))
-        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), found[0])
+        result = list(pool.map(work, range(-(-runs // (share * width)))))
+        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), result[0])
 
         def place(core: int) -> None:  # copied by all cores too: large results take their time
-            into, part = jax.tree.leaves(whole), jax.tree.leaves(found[core])
+            into, part = jax.tree.leaves(whole), jax.tree.leaves(result[core])
             for target, leaf in zip(into, part, strict=True):
                 target[core * share * width :][: len(leaf)] = leaf
 
-        list(pool.map(place, range(len(found))))
+        list(pool.map(place, range(len(result))))
     return whole
 
 
 def _numbers(value: PyTree) -> np.ndarray:
     try:
-        found = np.asarray(value)
+        values = np.asarray(value)
     except ValueError:  # rows of different lengths
         raise fail("arrays over runs", "arrays of numbers", shown(value)) from None
-    if found.dtype.kind not in "biufc":
+    if values.dtype.kind not in "biufc":
         raise fail("arrays over runs", "arrays of numbers", shown(value))
-    return found
+    return values
 
 
 def _filled(part: np.ndarray, count: int) -> np.ndarray:

@@ -31,41 +31,41 @@ def plot_record(
         raise fail("run", f"one of {record.runs}, counted from 0", run)
     which: Any = ... if record.runs is None else run
     drawn = _axes(axes, len(places), record.time, record.units)
-    for one, i in zip(drawn, places, strict=True):
+    for item, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
             estimate, colour = record.estimates[node][name], _colour(number)
             mean = np.asarray(estimate.mean)[which][..., i]
             variance = np.asarray(estimate.covariance)[which][..., i, i]
-            one.plot(record.time, mean, color=colour, label=in_figure(name))
+            item.plot(record.time, mean, color=colour, label=in_figure(name))
             if estimate.claim != "none":
                 band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
-                one.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+                item.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
         if record.truth is not None:
-            one.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
-        one.set_ylabel(_with_unit(record.states[i], record.units))
+            item.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
+        item.set_ylabel(_with_unit(record.states[i], record.units))
     drawn[0].legend(frameon=False)
     return drawn
 
 
 def plot_statistics(
-    found: "StatisticsByName",
+    result: "StatisticsByName",
     node: str | None,
     filters: Sequence[str] | None,
     states: Sequence[str] | None,
     axes: "Axes | Sequence[Axes] | None",
 ) -> "list[Axes]":
     """Draw RMSE over time, and dashed the root of the mean claimed variance."""
-    node, filters = _chosen(found, node, filters)
-    places = _places(states, found.states)
-    time = np.arange(1.0, found[node][filters[0]].nees.shape[1] + 1)
-    drawn = _axes(axes, len(places), time, found.units)
-    for one, i in zip(drawn, places, strict=True):
+    node, filters = _chosen(result, node, filters)
+    places = _places(states, result.states)
+    time = np.arange(1.0, result[node][filters[0]].nees.shape[1] + 1)
+    drawn = _axes(axes, len(places), time, result.units)
+    for single, i in zip(drawn, places, strict=True):
         for number, name in enumerate(filters):
-            item, colour = found[node][name], _colour(number)
+            item, colour = result[node][name], _colour(number)
             claimed = item.claimed()[:, i, i]
-            one.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
-            one.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
-        one.set_ylabel(f"RMSE of {_with_unit(found.states[i], found.units)}")
+            single.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
+            single.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+        single.set_ylabel(f"RMSE of {_with_unit(result.states[i], result.units)}")
     drawn[0].legend(frameon=False, title="dashed: claimed")
     return drawn
 
@@ -74,7 +74,7 @@ def _chosen(
     known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
 ) -> tuple[str, list[str]]:
     """The node and its filters that are drawn: the first with any, and all."""
-    there = [each for each, mine in known.items() if mine]
+    there = [name for name, mine in known.items() if mine]
     if not there or node not in (None, *there):
         raise fail("node", f"one with filters: {', '.join(there) or 'there is none'}", repr(node))
     chosen = there[0] if node is None else node
@@ -105,10 +105,10 @@ def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) 
         )
         grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else _with_unit("time", units))
         return list(grid[:, 0])
-    found = list(np.ravel(np.asarray(axes, dtype=object)))
-    if len(found) != count:
-        raise fail("axes", f"{count}, one for each state", len(found))
-    return found
+    result = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(result) != count:
+        raise fail("axes", f"{count}, one for each state", len(result))
+    return result
 
 
 def _colour(number: int) -> str:

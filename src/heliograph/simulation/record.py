@@ -76,7 +76,7 @@ class Record(Saved):
     def check_filter(self, node: str, name: str) -> None:
         """Raise ValueError unless the node has a filter of this name."""
         if name not in self.estimates.get(node, {}):
-            known = [f"{each}/{of}" for each, filters in self.estimates.items() for of in filters]
+            known = [f"{element}/{of}" for element, filters in self.estimates.items() for of in filters]
             raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
 
     def rmse(self, node: str, name: str) -> dict[str, float]:

@@ -71,7 +71,7 @@ class AbstractReducer(Module, Generic[Result]):
         """The result of a network from those of its parts, each of some of its nodes with the same plant and runs."""
         raise NotImplementedError
 
-    def beside(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
+    def others(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
         """The result with the one made of smoothed estimates, whose claims these are, beside it.
 
         Raises:
@@ -102,18 +102,18 @@ class Trajectories(AbstractReducer[Record]):
 
     def joined(self, results: Sequence[Record], network: Network) -> Record:
         """All nodes, in the network's order."""
-        measurements = {name: z for one in results for name, z in one.measurements.items()}
-        estimates = {name: filters for one in results for name, filters in one.estimates.items()}
+        measurements = {name: z for result in results for name, z in result.measurements.items()}
+        estimates = {name: filters for result in results for name, filters in result.estimates.items()}
         return replace(
             results[0],
             measurements={name: measurements[name] for name in network.names},
             estimates={name: estimates[name] for name in network.names},
         )
 
-    def beside(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
+    def others(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
         """As `Record.smoothed`, for the last steps if there are fewer."""
         estimates = {
-            node: {name: replace(found, claim=claims[node][name]) for name, found in filters.items()}
+            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
             for node, filters in smoothed.estimates.items()
         }
         time = result.time[-len(smoothed.time) :]

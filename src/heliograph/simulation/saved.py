@@ -101,8 +101,8 @@ def opened(path: str | Path) -> "xr.Dataset":
     if not path.exists():
         raise fail(str(path), "a file of results", "nothing of that name")
     try:
-        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as found:
-            dataset = found.load()
+        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as result:
+            dataset = result.load()
     except (OSError, ValueError, KeyError) as error:
         raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
     return dataset.assign_coords({name: (c.dims, _mapped(from_file, c), c.attrs) for name, c in _texts(dataset)})

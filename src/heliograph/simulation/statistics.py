@@ -93,8 +93,8 @@ class ErrorStatistics:
         """Root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
         self._tell()
         squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
-        found = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
-        return np.array([root for root, _ in found]), np.array([error for _, error in found])
+        results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
+        return np.array([root for root, _ in results]), np.array([error for _, error in results])
 
     def deviation_by_state(self) -> np.ndarray:
         """Root of the mean over runs and steps of each state's claimed variance, (n,)."""
@@ -134,8 +134,8 @@ class ErrorStatistics:
         broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
         self._tell()
         if np.any(broken):
-            nowhere = np.full(self.outer.shape[-1], np.nan)
-            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), nowhere)
+            none_at_all = np.full(self.outer.shape[-1], np.nan)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), none_at_all)
         halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
         return max(halves, key=lambda w: w.ratio)
 
@@ -174,8 +174,8 @@ def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
         ValueError: nothing to pool, or statistics of different runs.
     """
     parts = items("pooled statistics", statistics, "ErrorStatistics")
-    for one in parts:
-        instance("pooled statistics", one, ErrorStatistics, "ErrorStatistics")
+    for part in parts:
+        instance("pooled statistics", part, ErrorStatistics, "ErrorStatistics")
     if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
         raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
     return ErrorStatistics(
@@ -229,8 +229,8 @@ def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.nda
 
     In units of each component's own B_ii, and where that is zero of its A_ii.
     """
-    own = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
-    unit = np.where(own[0] > 0, own[0], np.where(own[1] > 0, own[1], 1.0))
+    local = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
+    unit = np.where(local[0] > 0, local[0], np.where(local[1] > 0, local[1], 1.0))
     both = unit[..., :, None] * unit[..., None, :]
     values, vectors = np.linalg.eigh(b / both)
     root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]

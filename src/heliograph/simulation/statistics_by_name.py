@@ -26,11 +26,11 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
 
     def __init__(
         self,
-        found: Mapping[str, dict[str, ErrorStatistics]],
+        result: Mapping[str, dict[str, ErrorStatistics]],
         states: tuple[str, ...],
         units: Mapping[str, str] | None = None,
     ):
-        super().__init__(found)
+        super().__init__(result)
         self.states, self.units = states, dict(units or {})
         self.smoothed: StatisticsByName | None = None
 
@@ -98,9 +98,11 @@ class StatisticsByName(dict[str, dict[str, ErrorStatistics]], Saved):
         """
         lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
         for node, filters in self.items():
-            lines += [f"{node}/{name}: {found.failure}" for name, found in filters.items() if found.failed_runs]
-            for name, found in filters.items():
-                for one, share in (found.uplink.saturated_share() if found.uplink else {}).items():
+            lines += [f"{node}/{name}: {filter_.failure}" for name, filter_ in filters.items() if filter_.failed_runs]
+            for name, filter_ in filters.items():
+                for single, share in (filter_.uplink.saturated_share() if filter_.uplink else {}).items():
                     if share:
-                        lines.append(f"{node}/{name}: the quantizer of node {one} saturated in {share:.2%} of samples")
+                        lines.append(
+                            f"{node}/{name}: the quantizer of node {single} saturated in {share:.2%} of samples"
+                        )
         return lines

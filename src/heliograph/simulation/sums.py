@@ -35,7 +35,8 @@ class Sums(Module):
     Run r goes to batch r mod BATCHES. A covariance that all runs share is summed once, without batches.
     failed (time, 2, part): runs whose mean is not finite, and whose error has no distance by the covariance, which is
     then not finite or indefinite; failed_runs (2, 1, part): in how many runs this happened at some step.
-    `order`: whose estimates the parts are, kinds first and then fused ones; the first `own` have their own covariances.
+    `order`: whose estimates the parts are, kinds first and then fused ones; the first `local` have their own
+    covariances.
     """
 
     count: jax.Array
@@ -47,7 +48,7 @@ class Sums(Module):
     failed_runs: jax.Array
     uplinks: PyTree
     order: tuple[int, ...] = eqx.field(static=True)
-    own: int = eqx.field(static=True)
+    local: int = eqx.field(static=True)
 
 
 class Statistics(AbstractReducer[StatisticsByName]):
@@ -56,9 +57,9 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def initial(self, shapes: PyTree) -> Sums:
         """Zero sums."""
         _, steps, n = shapes["truth"].shape
-        parts, order, own = _parts(shapes)
+        parts, order, local = _parts(shapes)
         sizes = [int(np.prod(parts[i].mean.shape[2:-1])) for i in order]
-        total, mine, pairs = sum(sizes), sum(sizes[:own]), n * (n + 1) // 2
+        total, mine, pairs = sum(sizes), sum(sizes[:local]), n * (n + 1) // 2
         return Sums(
             count=jnp.zeros(BATCHES),
             pairs=jnp.zeros((steps, total, pairs, BATCHES)),
@@ -69,7 +70,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
             failed_runs=jnp.zeros((2, 1, total)),
             uplinks=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["uplinks"]),
             order=order,
-            own=own,
+            local=local,
         )
 
     def reduce(self, carry: Sums, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[Sums, PyTree]:
@@ -126,7 +127,7 @@ class Statistics(AbstractReducer[StatisticsByName]):
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> Sums:
         """The same sums, with the covariances that all runs share last."""
         shared = common.sums["claimed"]
-        found, ever = jax.tree.map(
+        result, ever = jax.tree.map(
             lambda leaf, same: leaf[..., None] * count if same else leaf,
             (sums.sums | {"claimed": ()}, sums.ever),
             (common.sums | {"claimed": ()}, common.ever),
@@ -136,23 +137,23 @@ class Statistics(AbstractReducer[StatisticsByName]):
         sizes = [part.shape[1] for part in claimed]
         places = np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])
         into = np.concatenate([places[i] for i in order])
-        steps, _, pairs, _ = found["pairs"].shape
-        each: Any = count
+        steps, _, pairs, _ = result["pairs"].shape
+        items: Any = count
         mine: list[Any] = [np.zeros((steps, 0, pairs, BATCHES)), *(claimed[i] for i in order if not shared[i])]
         others: list[Any] = [np.zeros((steps, 0, pairs)), *(claimed[i] * count.sum() for i in order if shared[i])]
-        own: Any = np.concatenate(mine, axis=1)
+        local: Any = np.concatenate(mine, axis=1)
         common_to_all: Any = np.concatenate(others, axis=1)
         return Sums(
-            count=each,
-            pairs=found["pairs"][:, into],
-            nees=found["nees"][:, into],
-            claimed=own,
+            count=items,
+            pairs=result["pairs"][:, into],
+            nees=result["nees"][:, into],
+            claimed=local,
             shared=common_to_all,
-            failed=np.sum(found["failed"], axis=-1)[:, :, into],
+            failed=np.sum(result["failed"], axis=-1)[:, :, into],
             failed_runs=np.sum(ever, axis=-1)[:, None, into],
-            uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), found["uplinks"]),
+            uplinks=jax.tree.map(lambda leaf: np.sum(leaf, axis=-1), result["uplinks"]),
             order=order,
-            own=shared.count(False),
+            local=shared.count(False),
         )
 
     def finish(self, carry: Sums, collected: PyTree, network: Network) -> StatisticsByName:
@@ -161,11 +162,11 @@ class Statistics(AbstractReducer[StatisticsByName]):
         kinds = len(network.kinds)
         named = {"estimates": parts[:kinds], "fused": dict(zip(sorted(network.fused), parts[kinds:], strict=True))}
         axes = enumerate((-3, -2, -3, -2, -2))
-        each = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
+        items = [by_name(network, named, itemgetter(i), axis) for i, axis in axes]
         result = StatisticsByName({}, network.states)
         for node, claims in network.claims().items():
             result[node] = {
-                name: _statistics(count, [part[node][name] for part in each], claim) for name, claim in claims.items()
+                name: _statistics(count, [part[node][name] for part in items], claim) for name, claim in claims.items()
             }
         for name, uplink in uplinks_by_name(network, carry.uplinks).items():
             fused = result[FUSED][name]
@@ -175,18 +176,18 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
     def joined(self, results: Sequence[StatisticsByName], network: Network) -> StatisticsByName:
         """All nodes, in the network's order."""
-        found = {name: filters for one in results for name, filters in one.items()}
-        return StatisticsByName({name: found[name] for name in network.names}, network.states)
+        collected = {name: filters for result in results for name, filters in result.items()}
+        return StatisticsByName({name: collected[name] for name in network.names}, network.states)
 
-    def beside(
+    def others(
         self, result: StatisticsByName, smoothed: StatisticsByName, claims: Mapping[str, Mapping[str, Claim]]
     ) -> StatisticsByName:
         """As `StatisticsByName.smoothed`."""
-        found = {
-            node: {name: replace(one, claim=claims[node][name]) for name, one in filters.items()}
+        results = {
+            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
             for node, filters in smoothed.items()
         }
-        result.smoothed = StatisticsByName(found, smoothed.states)
+        result.smoothed = StatisticsByName(results, smoothed.states)
         return result
 
 
@@ -212,16 +213,16 @@ def _added(
     errors = jnp.concatenate([_error(truth, part) for part in parts], axis=2)  # (n, time, part, run)
     errors = jnp.where(valid, errors, 0.0)  # the others may hold anything
     unit = jnp.eye(len(errors)).reshape(len(errors), len(errors), 1, 1, 1)
-    mine = [jnp.where(valid, _claimed(part), unit) for part in parts[: sums.own]]
-    bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(part) for part in parts[sums.own :]]) if b]
+    mine = [jnp.where(valid, _claimed(part), unit) for part in parts[: sums.local]]
+    bounds = [jnp.concatenate(b, axis=3) for b in (mine, [_claimed(part) for part in parts[sums.local :]]) if b]
     split = [errors[:, :, : bounds[0].shape[3]], errors[:, :, bounds[0].shape[3] :]][: len(bounds)]
     size = truth.transpose(1, 0, 2)[:, :, None]
     nees = jnp.concatenate([_squared_distance(b, e, size) for b, e in zip(bounds, split, strict=True)], axis=1)
     bad = jnp.stack([~jnp.all(jnp.isfinite(errors), axis=0), jnp.isnan(nees)], axis=1) & valid  # (time, 2, part, run)
     claimed, shared = sums.claimed, sums.shared
-    if sums.own:
+    if sums.local:
         claimed = _added_from(claimed, _by_batch(jnp.where(valid, _pairs(bounds[0]), 0.0), start), first)
-    if sums.own < len(parts):
+    if sums.local < len(parts):
         shared = _added_from(shared, _pairs(bounds[-1])[..., 0] * jnp.sum(valid.astype(float)), first)
     dealt = _by_batch(errors, start)
     return replace(
@@ -282,16 +283,20 @@ def _split(carry: Sums, kinds: list[tuple[int, int]]) -> tuple[np.ndarray, list[
     Axes (batch, time, filter, node, pair) for the kinds, without filter and node for what is fused; views.
     """
     sums = carry.count, carry.pairs, carry.nees, carry.claimed
-    count, pairs, nees, own = (np.moveaxis(np.asarray(part), -1, 0) for part in sums)  # views: they are last in memory
-    own = own / np.maximum(count, 1.0).reshape(-1, *[1] * (own.ndim - 1))
+    count, pairs, nees, local = (
+        np.moveaxis(np.asarray(part), -1, 0) for part in sums
+    )  # views: they are last in memory
+    local = local / np.maximum(count, 1.0).reshape(-1, *[1] * (local.ndim - 1))
     failed, failed_runs = np.asarray(carry.failed).swapaxes(0, 1), np.asarray(carry.failed_runs)
     shared = np.broadcast_to(carry.shared / count.sum(), (BATCHES, *carry.shared.shape))
     result, place = {}, 0
     for position, i in enumerate(carry.order):
         axes = kinds[i] if i < len(kinds) else ()
         rows = slice(place, place + int(np.prod(axes)))
-        offset = own.shape[2] if position >= carry.own else 0
-        claimed = (shared if offset or position >= carry.own else own)[:, :, rows.start - offset : rows.stop - offset]
+        offset = local.shape[2] if position >= carry.local else 0
+        claimed = (shared if offset or position >= carry.local else local)[
+            :, :, rows.start - offset : rows.stop - offset
+        ]
         result[i] = tuple(
             a.reshape(*a.shape[:2], *axes, *a.shape[3:])
             for a in (pairs[:, :, rows], nees[:, :, rows], claimed, failed[:, :, rows], failed_runs[:, :, rows])
@@ -309,7 +314,7 @@ def error_statistics(record: Record, node: str, name: str) -> ErrorStatistics:
     instance("record", record, Record, "a Record")
     if record.truth is None or record.truth.ndim != 3:
         raise fail("error statistics", "Monte Carlo trajectories with truth", "a single recording")
-    known = [(each, of) for each, filters in record.estimates.items() for of in filters]
+    known = [(element, of) for element, filters in record.estimates.items() for of in filters]
     if not (isinstance(node, str) and isinstance(name, str) and (node, name) in known):
         raise fail("node and filter", f"one of {known}", shown((node, name)))
     estimate = record.estimates[node][name]

@@ -56,15 +56,15 @@ class RelayTree:
             ValueError: as many estimates as there are leaves are wanted, with leading axes as you like.
         """
         nodes, n, _ = self.covariances[0].shape
-        found = np.asarray(estimates, dtype=float)
-        if found.shape[-2:] != (nodes, n):
-            raise fail("estimates of the leaves", f"shape (..., {nodes}, {n})", f"shape {found.shape}")
+        values = np.asarray(estimates, dtype=float)
+        if values.shape[-2:] != (nodes, n):
+            raise fail("estimates of the leaves", f"shape (..., {nodes}, {n})", f"shape {values.shape}")
         for weights in self.weights:
-            lacking = len(weights) * self.degree - found.shape[-2]
-            filled = np.pad(found, [(0, 0)] * (found.ndim - 2) + [(0, lacking), (0, 0)])
+            lacking = len(weights) * self.degree - values.shape[-2]
+            filled = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, lacking), (0, 0)])
             apart = filled.reshape(*filled.shape[:-2], len(weights), self.degree, n)
-            found = np.einsum("raib,...rib->...ra", weights, apart)
-        return np.asarray(found[..., 0, :])
+            values = np.einsum("raib,...rib->...ra", weights, apart)
+        return np.asarray(values[..., 0, :])
 
 
 def relay_tree(
@@ -109,16 +109,16 @@ def relay_tree(
             if len(known[-1]) == 1:
                 return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(known), tuple(used))
             groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(known[-1]), degree)]
-            told = [to_numpy(_relay(group)) for group in groups]
-            used.append(np.stack([_padded(found, degree) for found, _ in told]))
-            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in told))
+            outputs = [to_numpy(_relay(group)) for group in groups]
+            used.append(np.stack([_padded(item, degree) for item, _ in outputs]))
+            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in outputs))
 
 
 class Level(NamedTuple):
     """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = own_i."""
 
     shared: Float[Array, "node n sources"]
-    own: Float[Array, "node n n"]
+    local: Float[Array, "node n n"]
 
 
 @quickly_compiled
@@ -129,25 +129,25 @@ def _followed(
     plant, name, node, degree = leaf
     nodes = eqx.filter_vmap(node)(numbers)
     count = len(jax.tree.leaves(numbers)[0])
-    channels = eqx.filter_vmap(lambda one: described(node(one).channel))(numbers)
+    channels = eqx.filter_vmap(lambda item: described(node(item).channel))(numbers)
     alike = Alike(nodes.filters[name], 0, 1, count)
     size = nodes.filters[name].received
-    hears = Apart((Listening(nodes.sensor, channels),), np.arange(count), size)
-    centre = Centre(plant, hears, {}, np.arange(count), ((0, 0),), size, "exact")
+    observe = Apart((Listening(nodes.sensor, channels),), np.arange(count), size)
+    centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")
     quiet = jnp.zeros((count, size))
 
     def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[tuple[PyTree, Factors], None]:
-        (own, factors), (k, u_k) = carry, row
-        local = alike.matrices(centre.read, own, 0, quiet, u_k, k)
+        (separate, factors), (k, u_k) = carry, row
+        local = alike.matrices(centre.read, separate, 0, quiet, u_k, k)
         spread = factors.state @ factors.state.T
         motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
-        return (alike.step(own, quiet, u_k, k)[0], advance_factors(factors, step, motion, noise, k)), None
+        return (alike.step(separate, quiet, u_k, k)[0], advance_factors(factors, step, motion, noise, k)), None
 
-    own = alike.init()
+    state = alike.init()
     n = len(first(plant).states)
-    begin = initial_factors(centre.init([own.mean]).errors, n * len(u))
-    found: Factors = jax.lax.scan(body, (own, begin), (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
-    level = Level(found.shared, found.own)
+    begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
+    result: Factors = jax.lax.scan(body, (state, begin), (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    level = Level(result.shared, result.local)
     full = count - count % degree
     weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
     if count > full:
@@ -165,21 +165,23 @@ def _relay(children: Level) -> tuple[jax.Array, Level]:
 
 
 def _fuse(children: Level) -> tuple[jax.Array, Level]:
-    shared, own = jnp.asarray(children.shared), jnp.asarray(children.own)
-    weights = matrix_weights(joint_of(shared, own))
-    return weights, Level(jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, own, weights))
+    shared, local = jnp.asarray(children.shared), jnp.asarray(children.local)
+    weights = matrix_weights(joint_of(shared, local))
+    return weights, Level(
+        jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, local, weights)
+    )
 
 
-def joint_of(shared: Array, own: Array) -> Float[jax.Array, "node n node n"]:
+def joint_of(shared: Array, local: Array) -> Float[jax.Array, "node n node n"]:
     """Cov(e_i, e_j) of all pairs."""
     count, n, _ = shared.shape
-    flat, each = jnp.asarray(shared).reshape(count * n, -1), np.arange(count)
-    return (flat @ flat.T).reshape(count, n, count, n).at[each, :, each, :].add(own)
+    flat, items = jnp.asarray(shared).reshape(count * n, -1), np.arange(count)
+    return (flat @ flat.T).reshape(count, n, count, n).at[items, :, items, :].add(local)
 
 
 def _spread(level: Level) -> Array:
     """Covariance of each error."""
-    return level.shared @ level.shared.swapaxes(-1, -2) + level.own
+    return level.shared @ level.shared.swapaxes(-1, -2) + level.local
 
 
 def _joined(levels: list[Level]) -> Level:

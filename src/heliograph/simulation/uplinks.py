@@ -98,11 +98,11 @@ class Uplinks(Module):
         for group in self.groups:
             places = jnp.asarray(group.places)
 
-            def one(channel: Channel, place: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+            def single(channel: Channel, place: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
                 drawn, late = jax.random.split(draw_key(key, k, place, CHANNEL))
                 return at(channel, k).sample(drawn), jax.random.choice(late, len(law), p=law)
 
-            both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0))
+            both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0))
             h, late = both(group.channel, group.checksums, jnp.asarray(self.delay)[places])
             size = h.shape[1] - 1
             gain = gain.at[places, :size].set(h[:, :-1, :-1])
@@ -127,23 +127,23 @@ class Uplinks(Module):
         if reports is None and not self.groups:
             return Drawn(*(np.broadcast_to(part, (steps, *np.shape(part))) for part in self.undrawn()))
         if reports is None or set(reports) != set(nodes):
-            found = "none" if reports is None else list(reports)
-            raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", found)
+            result = "none" if reports is None else list(reports)
+            raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", result)
         values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
         for i, node in enumerate(nodes):
-            sent, own = reports[node], self.received[i]
+            sent, local = reports[node], self.received[i]
             if isinstance(sent, SentReports):
                 delay[:, i] = self._checked_delay(f"delays of node {node!r}", sent.delay, steps, i)
                 sent = sent.values
-            values[:, i, :own] = array(f"reports of node {node!r}", sent, (steps, own), missing=True)
+            values[:, i, :local] = array(f"reports of node {node!r}", sent, (steps, local), missing=True)
         return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
 
     def _checked_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
-        found: np.ndarray = array(name, value, (steps,))
+        result: np.ndarray = array(name, value, (steps,))
         possible = np.flatnonzero(self.delay[node] > 0)
-        if not np.all(np.isin(found, possible)):
-            raise fail(name, f"each one of {possible.tolist()} steps", sorted(set(found.tolist())))
-        return found.astype(int)
+        if not np.all(np.isin(result, possible)):
+            raise fail(name, f"each one of {possible.tolist()} steps", sorted(set(result.tolist())))
+        return result.astype(int)
 
     @property
     def fixed_delay(self) -> jax.Array:
@@ -161,8 +161,8 @@ class Uplinks(Module):
         values, traffic = jnp.where(sending, means, jnp.nan), {}
         beyond = jnp.zeros(len(means), dtype=bool)
         if self.quantizers is not None:
-            one = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
-            quantizers, sent = one(self.quantizers, state.quantizers, values)
+            item = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
+            quantizers, sent = item(self.quantizers, state.quantizers, values)
             state, values = state._replace(quantizers=quantizers), sent.value
             beyond = jnp.any(sent.saturated, axis=1)
             traffic = {"saturated": sent.saturated, "symbols": jnp.where(sending, sent.symbols, 0)}
@@ -189,7 +189,9 @@ def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
     received = tuple(link.received(n) for link in mine)
     error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
     return Uplinks(
-        groups=tuple(_group([channels[i] for i in own], [nodes[i] for i in own], own) for own in groups.values()),
+        groups=tuple(
+            _group([channels[i] for i in group], [nodes[i] for i in group], group) for group in groups.values()
+        ),
         quantizers=stack(quantizers) if quantizers else None,
         links=_known([described(channel) for channel in channels], received, error),
         delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
@@ -204,19 +206,19 @@ def _group(channels: Sequence[Channel], names: Sequence[str], places: Sequence[i
     return Group(stack(list(channels)), checksums, np.array(places))
 
 
-def _known(told: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
+def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
     """What a centre knows of the uplinks, at each step if any varies."""
-    varying = [one.steps for one in told if isinstance(one, OverTime)]
+    varying = [item.steps for item in known if isinstance(item, OverTime)]
     if not varying:
-        return _links(told, received, error)
-    return over_time([_links([at(one, k) for one in told], received, error) for k in range(min(varying))])
+        return _links(known, received, error)
+    return over_time([_links([at(item, k) for item in known], received, error) for k in range(min(varying))])
 
 
-def _links(told: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
-    more = [(0, max(received) - own) for own in received]
-    gain = np.stack([np.pad(one.mean_gain, (a, (0, 0))) for one, a in zip(told, more, strict=True)])
-    offset = np.stack([np.pad(one.offset, a) for one, a in zip(told, more, strict=True)])
-    spread = [np.pad(one.nominal.center, (a, a, (0, 0), (0, 0))) for one, a in zip(told, more, strict=True)]
+def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
+    more = [(0, max(received) - item) for item in received]
+    gain = np.stack([np.pad(item.mean_gain, (a, (0, 0))) for item, a in zip(known, more, strict=True)])
+    offset = np.stack([np.pad(item.offset, a) for item, a in zip(known, more, strict=True)])
+    spread = [np.pad(item.nominal.center, (a, a, (0, 0), (0, 0))) for item, a in zip(known, more, strict=True)]
     return Links(gain, offset, np.stack(spread), error)
 
 

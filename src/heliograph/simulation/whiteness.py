@@ -37,7 +37,7 @@ class MemoryTest:
     power_error: float
 
     @property
-    def found(self) -> bool:
+    def result(self) -> bool:
         """Whether innovations one step apart are correlated, at 1 %."""
         return self.p_value < 0.01
 
@@ -84,8 +84,8 @@ def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> 
 
 def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
     """Innovations of unknown covariance, each component in units of its deviation."""
-    found = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
-    value = found[:, None] if found.ndim == 1 else found
+    values = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
+    value = values[:, None] if values.ndim == 1 else values
     largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
     value = value / np.where(largest > 0, largest, 1.0)
     deviation = np.sqrt(np.nansum(value**2, axis=0) / np.maximum(np.sum(~np.isnan(value), axis=0), 1))
@@ -110,7 +110,7 @@ def whitened_innovations(
         raise fail("filter", "one that claims a covariance", "one that claims none")
     z = rows("measurements", data, None, item.received, missing=True)
     given = np.zeros((len(z), 0)) if inputs is None else inputs
-    return np.asarray(heard_by(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False))[1])
+    return np.asarray(innovations_of(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False))[1])
 
 
 def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
@@ -131,7 +131,7 @@ def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
 
 
 @compiled
-def heard_by(
+def innovations_of(
     item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array]:
     """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance, by component.
@@ -141,12 +141,12 @@ def heard_by(
 
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
         k, z_k, u_k = row
-        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
-        there = ~jnp.isnan(heard.value)
-        covariance = jnp.where(there[:, None] & there, heard.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
-        white = whiten(covariance, jnp.where(there, heard.value, 0.0))
-        return after, (jnp.asarray(heard.log_likelihood), jnp.where(there, white, jnp.nan))
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        there = ~jnp.isnan(innovation.value)
+        covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
+        white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
+        return after, (jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan))
 
     start = jax.tree.map(jnp.asarray, item.init())
-    found = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
-    return found[0], found[1]
+    result = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return result[0], result[1]

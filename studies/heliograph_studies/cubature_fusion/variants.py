@@ -115,8 +115,8 @@ class MixedCross(AbstractFilter):
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        after, heard = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
-        return Propagated(*after, state.points), heard
+        after, innovation = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
+        return Propagated(*after, state.points), innovation
 
     def estimate(self, state: Propagated) -> Estimate:
         """The belief."""

@@ -117,8 +117,8 @@ def table_rows(outcome: Outcome) -> list[list[str]]:
     for name in NAMES:
         shown, scores = outcome.trials[0].scores[name], [t.scores[name] for t in outcome.trials]
         errors, nees = [s.position_rmse_m for s in scores], [s.nees_per_dimension for s in scores]
-        one = shown.position_rmse_m, shown.claimed_rmse_m, shown.nees_per_dimension
-        rows.append([name, *map(_short, one), f"{100 * shown.inside_95:.1f} %", _spread(errors), _spread(nees)])
+        item = shown.position_rmse_m, shown.claimed_rmse_m, shown.nees_per_dimension
+        rows.append([name, *map(_short, item), f"{100 * shown.inside_95:.1f} %", _spread(errors), _spread(nees)])
     return rows
 
 

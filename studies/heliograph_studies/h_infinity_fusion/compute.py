@@ -41,12 +41,14 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
         "horizon": [node.horizon for node in nodes],
         "zero_gain": [node.zero_gain for node in nodes],
     }
-    runs, told = stages(f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_told(setting)))
+    runs, known = stages(
+        f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_told(setting))
+    )
     constants, true = stages("growth constants", lambda: _growth(runs))
     second = stages("second example", lambda: discriminate(setting.runs, setting.seed))
     replayed = replay(runs)
     judged = stages("indices", lambda: indices(runs, replayed))
-    parts = Parts(setting, nodes, more, gap, broken, runs, told, replayed, judged, constants, true, second)
+    parts = Parts(setting, nodes, more, gap, broken, runs, known, replayed, judged, constants, true, second)
     return Outcome(numbers(parts), parts)
 
 

@@ -102,7 +102,8 @@ def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[st
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
     return {
-        name: hg.filters.h_infinity_filter(*parts, each[node], setting.guesses[node]) for name, each in designs.items()
+        name: hg.filters.h_infinity_filter(*parts, design[node], setting.guesses[node])
+        for name, design in designs.items()
     }
 
 
@@ -111,7 +112,7 @@ def simulate_told(setting: Setting) -> Runs:
     nodes = {
         node: hg.Node(
             setting.disturbed_sensor(i),
-            setting.disturbed_channel(setting.told),
+            setting.disturbed_channel(setting.known),
             {"ekf_told": prediction_of(extended(setting, i, setting.lossless))},
         )
         for i, node in enumerate(NODES)

@@ -103,11 +103,11 @@ def readings(setting: Setting) -> Readings:
 class TrueGrowth:
     """Levels (node, 2), for one and separate multipliers, with growth constants that the search did not refute.
 
-    one: the largest slope for f and f~; differences: 0.7 for f and the largest slope for f~; each_step: 0.7 for f and
-    each step's slope for f~. certified: whether every one of them is.
+    constant: the largest slope for f and f~; differences: 0.7 for f and the largest slope for f~; each_step: 0.7 for
+    f and each step's slope for f~. certified: whether every one of them is.
     """
 
-    one: np.ndarray
+    constant: np.ndarray
     differences: np.ndarray
     each_step: np.ndarray
     certified: bool

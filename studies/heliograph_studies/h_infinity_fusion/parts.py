@@ -16,7 +16,7 @@ from heliograph_studies.h_infinity_fusion.worst_disturbance import Worst
 
 @dataclass(frozen=True)
 class Parts:
-    """Everything that is worked out; `runs` are those of the paper's network, `told` of one that tells its losses."""
+    """Everything that is worked out; `runs` are those of the paper's network, `known` of one that tells its losses."""
 
     setting: Setting
     nodes: list[NodeDesigns]
@@ -24,7 +24,7 @@ class Parts:
     enumeration: float
     broken: Worst
     runs: Runs
-    told: Runs
+    known: Runs
     replayed: Replayed
     indices: Indices
     growth: Growth

@@ -53,11 +53,11 @@ def left_alone(folder: Path, lines: Sequence[bytes]) -> list[bytes]:
 
 def finals(bodies: Iterable[bytes]) -> list[bytes]:
     """Final estimates without the number that tells copies apart; what was told again counts once."""
-    found: dict[int, bytes] = {}
+    results: dict[int, bytes] = {}
     for body in bodies:
         if b'"kind":"final"' in body:
-            found.setdefault(json.loads(body)["id"], re.sub(rb'^\{"id":\d+,', b"{", body))
-    return list(found.values())
+            results.setdefault(json.loads(body)["id"], re.sub(rb'^\{"id":\d+,', b"{", body))
+    return list(results.values())
 
 
 async def killed(
@@ -94,8 +94,8 @@ async def killed(
         pictures = await asyncio.to_thread(look, f"http://127.0.0.1:{port}/")
         run.stop()
         bodies = await _everything(client)
-        found = finals(bodies)
-        return Killed(found, kills, len(bodies) - len(found), pictures)
+        result = finals(bodies)
+        return Killed(result, kills, len(bodies) - len(result), pictures)
     finally:
         run.kill()
         await client.close()
@@ -170,9 +170,9 @@ async def _everything(client: Client) -> list[bytes]:
     """All final estimates that the server keeps."""
     stream = client.jetstream(timeout=60)
     reader = await stream.subscribe(f"{TOPIC}.out.final.*", stream=f"{TOPIC}-out", ordered_consumer=True)
-    found = []
+    results = []
     while True:
         try:
-            found.append((await reader.next_msg(1)).data)
+            results.append((await reader.next_msg(1)).data)
         except nats.errors.TimeoutError:
-            return found
+            return results
