@@ -88,7 +88,7 @@ def test_all_of_it_runs_in_order(after_make_demo):
 def check_what_else_is_said_of_the_drive(result: dict) -> None:
     """The README's row beside peers, the start page and the page on learning, by the same summary."""
     aware, mean = (f"{result['position_rmse_m'][name]:.2f} m" for name in ("relay_aware", "mean_gain"))
-    row = beside_peers()["a sensor behind relays with random gains: error on the recorded drive"]
+    row = against_peers()["a sensor behind relays with random gains: error on the recorded drive"]
     assert row[:2] == [f"{mean}: the mean gain, in any package", aware]
     claimed, learned = result["claimed_rmse_m"]["mean_gain"], result["learned"]
     gyro = learned["parameters"]["gyro_rate"]
@@ -112,7 +112,7 @@ def shown(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def beside_peers() -> dict[str, list[str]]:
+def against_peers() -> dict[str, list[str]]:
     """The rows of the table beside the best peers, by what they are of: others, ours, and the command."""
     section = README.split("## Beside the best peers")[1].split("\n## ")[0]
     rows = [row.strip("| ").split(" | ") for row in section.splitlines() if row.startswith("| ")][1:]
@@ -121,7 +121,7 @@ def beside_peers() -> dict[str, list[str]]:
 
 def test_every_row_beside_peers_names_a_command_that_there_is():
     """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
-    rows = beside_peers()
+    rows = against_peers()
     assert len(rows) == 10
     for others, ours, command in rows.values():
         assert others and ours

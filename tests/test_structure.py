@@ -22,10 +22,10 @@ ORDER = [
     [
         "filters.base",
         "filters.plausibility",
-        "filters.retained",
+        "filters.smoother_step",
         "filters.smoother_step_linear",
         "filters.smoother_step_moments",
-        "filters.retaining",
+        "filters.smoother_steps",
         "filters.transform",
         "filters.scalars",
         "filters.precise",

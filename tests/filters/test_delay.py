@@ -19,7 +19,11 @@ PLANT, SENSOR = hg.LinearPlant(A, Q, START, SPREAD), hg.LinearSensor(C, R)
 WEIGHTS, STEPS = np.array([0.4, 0.35, 0.25]), 30
 LAW = hg.Discrete([0, 1, 2], WEIGHTS)
 LINK = hg.hop(1.0, N)
-UNTOLD, TOLD, FIXED = hg.hop(1.0, N, delay=LAW), hg.model.delayed(LINK, LAW, timestamped=True), hg.hop(1.0, N, delay=2)
+UNKNOWN, KNOWN, FIXED = (
+    hg.hop(1.0, N, delay=LAW),
+    hg.model.delayed(LINK, LAW, timestamped=True),
+    hg.hop(1.0, N, delay=2),
+)
 PARTS = oracle.signals(A, Q, C, R, START, SPREAD, STEPS)
 delayed, true_error = hg.model.delayed, hg.filters.true_error
 
@@ -44,19 +48,19 @@ def in_chain(initial, rows):
 @pytest.fixture(scope="module")
 def filters():
     """One of each kind."""
-    chosen = {"untold": UNTOLD, "told": TOLD, "fixed": FIXED}
+    chosen = {"untold": UNKNOWN, "told": KNOWN, "fixed": FIXED}
     results = {name: hg.linear_filter(PLANT, SENSOR, channel) for name, channel in chosen.items()}
-    return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNTOLD)}
+    return results | {"as_current": hg.filters.as_current_filter(PLANT, SENSOR, UNKNOWN)}
 
 
 def test_not_told_the_claim_is_the_error_and_the_usual_mistake_claims_a_fifth(filters):
     received = oracle.of_unknown(PARTS, independent(WEIGHTS), 1.0, 1.0, N)
-    result = true_error(filters["untold"], PLANT, SENSOR, UNTOLD, STEPS)
+    result = true_error(filters["untold"], PLANT, SENSOR, UNKNOWN, STEPS)
     best = np.array([oracle.best_linear(PARTS, received, k) for k in range(1, STEPS + 1)])
     np.testing.assert_allclose(result.claimed, best, rtol=1e-11, atol=1e-11 * np.abs(best).max())
     np.testing.assert_allclose(result.true, best, rtol=1e-9, atol=1e-11 * np.abs(best).max())
     assert result.true[-1, 0, 0] == pytest.approx(0.649, abs=5e-4)
-    wrong = true_error(filters["as_current"], PLANT, SENSOR, UNTOLD, STEPS)
+    wrong = true_error(filters["as_current"], PLANT, SENSOR, UNKNOWN, STEPS)
     weights, offset, claimed = oracle.kalman(A, Q, C, R + N, START, SPREAD, STEPS)
     np.testing.assert_allclose(wrong.claimed[-1], claimed, rtol=1e-11)
     np.testing.assert_allclose(wrong.true[-1], oracle.error_of(PARTS, received, weights, offset, STEPS), rtol=1e-10)
@@ -174,8 +178,8 @@ def simulated(filters):
     """A network of all of them and of late relays, and its record."""
     relayed = hg.amplify_and_forward(RELAYS)
     nodes = {
-        "untold": hg.Node(SENSOR, UNTOLD, {name: filters[name] for name in ("untold", "as_current")}),
-        "told": hg.Node(SENSOR, TOLD, {"told": filters["told"]}),
+        "untold": hg.Node(SENSOR, UNKNOWN, {name: filters[name] for name in ("untold", "as_current")}),
+        "told": hg.Node(SENSOR, KNOWN, {"told": filters["told"]}),
         "fixed": hg.Node(SENSOR, FIXED, {}),
         "relayed": hg.Node(SENSOR, relayed, {"exact": hg.linear_filter(PLANT, SENSOR, relayed)}),
     }
@@ -238,14 +242,14 @@ def test_the_contract(filters, name):
 
 
 REFUSED = {
-    "one without delays": lambda: hg.cubature_filter(PLANT, SENSOR, UNTOLD),
-    "a LinearPlant": lambda: hg.linear_filter(hg.Plant(lambda x, u: x, Q, START, SPREAD), SENSOR, UNTOLD),
+    "one without delays": lambda: hg.cubature_filter(PLANT, SENSOR, UNKNOWN),
+    "a LinearPlant": lambda: hg.linear_filter(hg.Plant(lambda x, u: x, Q, START, SPREAD), SENSOR, UNKNOWN),
     "one that forgets": lambda: hg.linear_filter(
         PLANT, SENSOR, delayed(hg.gilbert_elliott(LINK, LINK, 0.1, 0.2), LAW, timestamped=True)
     ),
     "at most the filter's 2": lambda: hg.filters.part_filter(hg.linear_filter(PLANT, SENSOR, LINK), 3),
     "delay: expected a whole number": lambda: hg.filters.late_filter(hg.linear_filter(PLANT, SENSOR, LINK), -1),
-    "depends on no data": lambda: true_error(hg.linear_filter(PLANT, SENSOR, TOLD), PLANT, SENSOR, TOLD, 3),
+    "depends on no data": lambda: true_error(hg.linear_filter(PLANT, SENSOR, KNOWN), PLANT, SENSOR, KNOWN, 3),
 }
 
 

@@ -40,7 +40,7 @@ def recording():
 
 
 @pytest.fixture(scope="module")
-def result(recording):
+def evaluations(recording):
     return hg.fit(network, recording, INPUTS, starts=3)
 
 
@@ -85,11 +85,11 @@ def test_scores_are_derivatives_of_the_likelihood(result, recording):
     for solution in result.solutions:
         surface = solution.surface
         x = solution.x + np.array([0.3, -0.2, 0.1, 0.4])
-        at = surface.result(x[None])
-        totals = surface.result(np.concatenate([x + shifts, x - shifts])).total
+        at = surface.evaluations(x[None])
+        totals = surface.evaluations(np.concatenate([x + shifts, x - shifts])).total
         np.testing.assert_allclose(at.gradient[0], (totals[:4] - totals[4:]) / (2 * step), rtol=1e-6, atol=1e-4)
         np.testing.assert_allclose(at.information, at.halves.sum(axis=1))
-        gradients = surface.result(solution.x[None]).gradient
+        gradients = surface.evaluations(solution.x[None]).gradient
         assert np.abs(gradients).max() < 1e-5
 
 
@@ -130,10 +130,10 @@ def test_several_recordings_are_one_likelihood(result, recording):
     surface = solution.surface
     parts = gathered(result.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
     assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
-    whole = Surface(surface.objective, parts).result(solution.x[None]).total
+    whole = Surface(surface.objective, parts).evaluations(solution.x[None]).total
     values = result.description.parameters.known(solution.x)
     short = oracle(values, z[:150], solution.form, INPUTS[:150])
-    assert whole == pytest.approx(surface.result(solution.x[None]).total + short, rel=1e-12)
+    assert whole == pytest.approx(surface.evaluations(solution.x[None]).total + short, rel=1e-12)
 
 
 def test_who_interrupts_keeps_the_best_so_far(recording):

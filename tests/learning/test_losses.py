@@ -124,7 +124,7 @@ def test_tests_of_memory_are_the_known_ones(bursts):
     table = hg.learning.MarkovLosses.fit(bursts).counts
     expected = chi2_contingency(table, correction=False, lambda_="log-likelihood")
     assert result.likelihood_ratio == pytest.approx(expected.statistic, rel=1e-10)
-    assert result.result and result.runs_z < -5
+    assert result.significant and result.runs_z < -5
 
 
 def test_tests_of_memory_find_none_where_there_is_none():
@@ -150,7 +150,7 @@ def test_the_law_that_foretells_best_is_chosen(learned):
 
 def test_independent_losses_are_told_from_bursts():
     result = hg.learning.learn_losses((np.random.default_rng(2).random(600) < 0.2).astype(float))
-    assert not result.memory.result
+    assert not result.memory.significant
     assert abs(result.held_out["hidden"].gain) < 3 * result.held_out["hidden"].gain_error + 1e-3
     assert result.held_out["markov_4"].gain < 0  # 16 numbers fitted for nothing
 

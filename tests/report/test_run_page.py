@@ -34,7 +34,7 @@ def health():
 
 def test_claims_are_judged_by_innovations(health):
     good, sure = (next(filter_ for filter_ in health.filters if filter_.filter == name) for name in ("good", "sure"))
-    assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.result
+    assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.significant
     assert good.white.shape == (STEPS, 2) and sure.test.power > 5
     assert sure.test.correlation[0] > 0.3  # a filter that follows too slowly is wrong the same way again
     # the whitened innovation of one step by hand: the first, whose prior is the plant's own

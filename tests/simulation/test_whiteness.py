@@ -25,7 +25,7 @@ def test_memory_is_found_where_a_filter_assumes_none(received):
     """Lag 1 is .30 and lag 2 .20; within four standard errors."""
     z, filters = received
     memory = hg.simulation.memory_test(z, filters["memoryless"])
-    assert memory.result and memory.p_value < 1e-6
+    assert memory.significant and memory.p_value < 1e-6
     assert np.all(np.abs(memory.correlation[:2] - [0.30, 0.20]) < 4 * memory.standard_error[:2])
     assert 0.05 < memory.predictable < 0.2
 
@@ -34,7 +34,7 @@ def test_memory_is_found_where_a_filter_assumes_none(received):
 def test_the_exact_filter_leaves_nothing_behind(received):
     z, filters = received
     memory = hg.simulation.memory_test(z, filters["exact"])
-    assert not memory.result and memory.predictable < 0.02
+    assert not memory.significant and memory.predictable < 0.02
     assert abs(memory.power - 1) < 4 * memory.power_error
 
 
@@ -42,10 +42,10 @@ def test_innovations_alone_and_gaps():
     generator = np.random.default_rng(0)
     white = generator.normal(size=(5000, 2)) * [1.0, 30.0]
     white[generator.random(5000) < 0.2] = np.nan
-    assert not hg.simulation.memory_test(white).result and np.isnan(hg.simulation.memory_test(white).power)
+    assert not hg.simulation.memory_test(white).significant and np.isnan(hg.simulation.memory_test(white).power)
     moved = white[1:] + 0.4 * white[:-1]  # a moving average: lag 1 is .4 / 1.16
     assert hg.simulation.memory_test(moved).correlation[0] == pytest.approx(0.4 / 1.16, abs=0.05)
-    assert hg.simulation.memory_test(moved[:, 0]).result
+    assert hg.simulation.memory_test(moved[:, 0]).significant
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -48,7 +48,7 @@ def test_the_summary(outcome):
     assert set(summary["e1"]) == set(summary["e2"]) == FILTERS == set(figures.ROWS)
     assert set(summary["e1"]["imm"]) == {"claim", "claimed", "true", "true_se"}
     assert summary["e1"]["exact"]["true_before_data"] == 0.1
-    assert summary["runs"] == {"e1": 9, "e2": 9} and set(summary["one_shadow"]) == TOGETHER
+    assert summary["runs"] == {"e1": 9, "e2": 9} and set(summary["one_fading"]) == TOGETHER
     assert summary["curve"] == {"lambda": [0.0, 0.5, 0.9], "ratio": [1.0, 1.5, 1.9]}
 
 

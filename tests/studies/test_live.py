@@ -15,7 +15,7 @@ from nats.js.errors import NoStreamResponseError
 from heliograph.serving.nats import Nats
 from heliograph.serving.url import address
 from heliograph_studies.live.compute import Outcome
-from heliograph_studies.live.killed import TOPIC, _reads, _send, _told, killed, left_alone
+from heliograph_studies.live.killed import TOPIC, _finals_read, _reads, _send, killed, left_alone
 from heliograph_studies.live.mower import read_drive
 from heliograph_studies.live.server import Server
 from heliograph_studies.live.speed import PLANTS, many_plants
@@ -48,7 +48,7 @@ def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
         transport = Nats(address(f"nats://127.0.0.1:{server.nats}/{TOPIC}", {}))
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
         await transport._open()
-        assert await _told(client, 0) and not await _reads(client)
+        assert await _finals_read(client, 0) and not await _reads(client)
         with pytest.raises(ExceptionGroup) as error:
             async with asyncio.timeout(5), asyncio.TaskGroup() as group:
                 group.create_task(_send(client, [b"{}"]))

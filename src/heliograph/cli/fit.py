@@ -51,10 +51,10 @@ def fit(
         return learn(network, measurements, starts, seed, share, advance)
 
     learned = write_results(out, 6, work, lambda result: results(result, out, network))
-    print(learned.result)
+    print(learned.fit)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
-    if learned.result.stopped:
+    if learned.fit.stopped:
         print("heliograph: warning: stopped before the end; this is the best so far", file=sys.stderr)
 
 
@@ -98,7 +98,7 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
     from heliograph.report.fit_page import fit_figures, pages
     from heliograph.report.results import Results
 
-    content = as_json(learned.result, network=learned.network, measurements=learned.measurements, rows=learned.learned)
+    content = as_json(learned.fit, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
     def write(folder: Path) -> None:
         write_fitted(content, network, learned.measurements, folder, out)

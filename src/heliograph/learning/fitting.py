@@ -163,7 +163,7 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
     """
     parameters = surface.objective.description.parameters
     start, rng = parameters.start, np.random.default_rng(seed)
-    first = surface.result(start[None])
+    first = surface.evaluations(start[None])
     if not np.isfinite(first.total[0]):
         step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
@@ -178,7 +178,7 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
         [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
     )
     for _ in range(6):
-        wrong = ~np.isfinite(surface.result(points).total)
+        wrong = ~np.isfinite(surface.evaluations(points).total)
         if not wrong.any():
             break
         points[wrong] = (points[wrong] + start) / 2
@@ -190,7 +190,7 @@ def _check_dependence(surface: Surface, points: np.ndarray, local: np.ndarray) -
     """Every free number matters somewhere."""
     if np.all(local > 0):
         return
-    seen = np.nanmax(np.diagonal(surface.result(points).information, axis1=1, axis2=2), axis=0)
+    seen = np.nanmax(np.diagonal(surface.evaluations(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
     lost = [name for name, size in zip(names, seen, strict=True) if not size > 0]
     if lost:
@@ -218,7 +218,7 @@ def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: P
     for place in _invisible(surface, x):
         moved = x.copy()
         moved[place] = np.inf if x[place] > 0 and _two_sided(surface, place) else -np.inf
-        at_limit = surface.result(moved[None])
+        at_limit = surface.evaluations(moved[None])
         if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
             x, active[place] = moved, False
     if not active.all():
@@ -233,7 +233,7 @@ def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: P
 
 def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
     """Coordinates of numbers with a limit that the data hardly see where they are."""
-    local = np.diag(surface.result(x[None]).information[0])
+    local = np.diag(surface.evaluations(x[None]).information[0])
     entries = surface.objective.description.parameters.entries
     return [
         entry.place

@@ -80,17 +80,17 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     for i, x in enumerate(points):
         z = _drawn(objective, x, u, check_seed("seed", seed) + i)
         data = Data(z[None], u[None], (len(z),))
-        ranks.append(rank_of(Surface(objective, data).result(x[None]).late[0]))
+        ranks.append(rank_of(Surface(objective, data).evaluations(x[None]).late[0]))
     return _identified(description.parameters, points, ranks)
 
 
 def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """What a recording tells, at three points around a start."""
     points = _points(start, seed)
-    late = surface.result(np.stack(points)).late
+    late = surface.evaluations(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
-        points, late, sound = [start], surface.result(start[None]).late, [0]
+        points, late, sound = [start], surface.evaluations(start[None]).late, [0]
     ranks = [rank_of(late[i]) for i in sound]
     return _identified(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 

@@ -26,7 +26,7 @@ class LossMemory(NamedTuple):
     runs_p: float
 
     @property
-    def result(self) -> bool:
+    def significant(self) -> bool:
         """Whether the likelihood ratio rejects independence at 1 %."""
         return self.likelihood_p < 0.01
 

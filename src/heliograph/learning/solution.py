@@ -75,13 +75,13 @@ class Solution:
     @cached_property
     def scores(self) -> Scores:
         """Of each step, by recording, among active coordinates."""
-        score = self.surface.result(self.x[None]).score[0][..., self.active]
+        score = self.surface.evaluations(self.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
     def rank(self) -> Rank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
-        return cut(self.surface.result(self.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
+        return cut(self.surface.evaluations(self.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
@@ -90,7 +90,7 @@ class Solution:
         result = self._reduced(observed)
         if np.linalg.eigvalsh(result)[:1].sum() > 0:
             return result
-        information = self.surface.result(self.x[None]).information[0]
+        information = self.surface.evaluations(self.x[None]).information[0]
         return self._reduced(information[np.ix_(self.active, self.active)])
 
     @property
@@ -164,7 +164,7 @@ class Solution:
         outward = -1.0 if self.x[entry.place] < 0 else 1.0
         points = np.repeat(self.x[None], 33, axis=0)
         points[:, entry.place] = reach = -outward * np.linspace(-24.0, 8.0, 33)
-        totals = self.surface.result(points).total
+        totals = self.surface.evaluations(points).total
         fallen = np.flatnonzero(~(totals > self.total - ONE_SIDED))
         last = int(fallen[0]) if len(fallen) else len(reach) - 1
         ends = reach[max(last - 1, 0)] + np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 3.0, 5.0]) * -outward

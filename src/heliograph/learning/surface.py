@@ -41,7 +41,7 @@ class Surface:
         p = self.objective.description.parameters.size
         return int(np.clip(ROOM // (r * t * m * (m + 2) * (p + 1)), 1, LANES))
 
-    def result(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
+    def evaluations(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
         """All that is known at points."""
         if not (self._last and np.array_equal(self._last[0][0], x)):
             self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
@@ -49,7 +49,7 @@ class Surface:
 
     def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
         """Likelihood, gradient and information at points."""
-        result = self.result(x)
+        result = self.evaluations(x)
         return result.total, result.gradient, result.information
 
     def climb(
@@ -75,7 +75,7 @@ class Surface:
 
     def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
         """-d2 l by central differences of the scores, among active coordinates; the information for the others."""
-        information: np.ndarray = self.result(x[None]).information[0]
+        information: np.ndarray = self.evaluations(x[None]).information[0]
         local = np.diag(information)
         width = np.where(local > 0, DIFFERENCE / np.sqrt(np.where(local > 0, local, 1.0)), 0.0)
         moving = np.flatnonzero(active & (local > 0))
@@ -83,7 +83,7 @@ class Surface:
         shifts[np.arange(len(moving)), moving] = width[moving]
         if not len(moving):
             return information
-        gradient = self.result(np.concatenate([x + shifts, x - shifts])).gradient
+        gradient = self.evaluations(np.concatenate([x + shifts, x - shifts])).gradient
         result: np.ndarray = information.copy()
         slopes = -(gradient[: len(moving)] - gradient[len(moving) :]) / (2 * width[moving][:, None])
         block = slopes[:, moving]

@@ -186,7 +186,7 @@ def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """`solve` of one A for several B, one after another: it is factored once."""
     n = a.shape[0]
     if n > UNROLL_LIMIT:
-        return partial(_each, _long_solve, a)
+        return partial(_over_matrices, _long_solve, a)
     columns, scales = factor(a)
 
     def solved(b: jax.Array) -> jax.Array:
@@ -225,7 +225,7 @@ def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
 def root(a: jax.Array) -> jax.Array:
     """R, lower, with R R' = A for a positive semidefinite A, a column of zeros where a component adds nothing."""
     if len(a) > UNROLL_LIMIT:
-        return _each(lambda a, _: long_factor(a), a, a)
+        return _over_matrices(lambda a, _: long_factor(a), a, a)
     return jnp.stack(factor(a)[0], axis=1)
 
 
@@ -268,7 +268,7 @@ def uncorrelated(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
         lower = root(a)
         scales = _reciprocals(diagonal_of(lower))
         unit = lower * scales + diagonal(jnp.where(scales == 0, 1.0, 0.0))
-        rows = _each(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
+        rows = _over_matrices(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
     else:
         rests, items = zip(*_substituted(a, b), strict=True)
         rows, scales = jnp.stack(rests), jnp.stack(items)
@@ -296,7 +296,7 @@ def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]
     return list(zip(rests, scales, strict=True))
 
 
-def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
+def _over_matrices(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
     """A function of two single matrices, for each of the further axes."""
     shape = jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
     a, b = (jnp.broadcast_to(x, (*x.shape[:2], *shape)) for x in (a, b))

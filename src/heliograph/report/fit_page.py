@@ -27,7 +27,7 @@ class Learned:
 
     network: str
     measurements: str
-    result: Fit
+    fit: Fit
     learned: int
     held_out: int
     changes: list[Change]
@@ -37,7 +37,7 @@ class Learned:
     @property
     def starts(self) -> dict[str, float]:
         """Where each number began."""
-        parameters = self.result.description.parameters
+        parameters = self.fit.description.parameters
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
 
@@ -56,9 +56,9 @@ def fit_figures(learned: Learned) -> dict[str, Figure]:
 @matplotlib.rc_context(STYLE)
 def _estimates(learned: Learned) -> Figure:
     """A line for each number, on a scale of its own: start, estimates of both forms, intervals."""
-    rows = learned.result.rows()[:MOST]
-    forms = [solution.form for solution in learned.result.solutions]
-    by_form = {form: learned.result.rows(form=form) for form in forms}
+    rows = learned.fit.rows()[:MOST]
+    forms = [solution.form for solution in learned.fit.solutions]
+    by_form = {form: learned.fit.rows(form=form) for form in forms}
     figure = Figure(figsize=(WIDTH, 0.6 + 0.62 * len(rows)), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
@@ -134,7 +134,7 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
 
 
 def _finding(learned: Learned) -> str:
-    rows = learned.result.rows()
+    rows = learned.fit.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
 
 
@@ -155,9 +155,9 @@ def _lead(learned: Learned) -> str:
 
 
 def _glance(learned: Learned) -> list[KeyFigures]:
-    outputs = [row for row in learned.result.rows() if row.identified]
+    outputs = [row for row in learned.fit.rows() if row.identified]
     keys = [
-        KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.result.rows())} free ones", BLUE),
+        KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.fit.rows())} free ones", BLUE),
         KeyFigure("rows", f"{learned.learned:,}", f"learned from; {learned.held_out:,} held out", GREEN),
     ]
     gains = [change.gain for change in learned.changes if change.gain is not None]
@@ -172,7 +172,7 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
     starts = learned.starts
     rows = [
         [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
-        for row in learned.result.table
+        for row in learned.fit.table
     ]
     caption = (
         "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). **Form**: "
@@ -197,7 +197,7 @@ def _interval(row: Row) -> str:
 
 
 def _words(learned: Learned) -> list[Points | Text]:
-    said = learned.result.sentences
+    said = learned.fit.sentences
     if said:
         return [Points([visible(line) for line in said])]
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]

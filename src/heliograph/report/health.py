@@ -85,7 +85,7 @@ def _doubts(item: Listening) -> Iterator[str]:
         )
     elif test.power < 1 - SURE * test.power_error:
         yield f"{name} is too cautious: the mean square of its innovations is {test.power:.2f} times what it claims"
-    if test.result:
+    if test.significant:
         yield (
             f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "
             "links or the plant remember what the model forgets"

@@ -18,7 +18,7 @@ from .output import (
     Estimates as Estimates,
     Output as Output,
     Refused as Refused,
-    Told as Told,
+    FilterOutput as FilterOutput,
 )
 from .in_memory_store import (
     InMemoryStore as InMemoryStore,

@@ -99,7 +99,7 @@ class _Reader(_Connection):
         self._loop, self._came = asyncio.get_running_loop(), asyncio.Event()
         self._held: deque[tuple[int, MQTTMessage]] = deque()
         self._connection = 0
-        self.client.on_message = self._heard
+        self.client.on_message = self._on_message
         self.start()
 
     async def receive(self) -> Batch:
@@ -119,7 +119,7 @@ class _Reader(_Connection):
 
         return Batch([bytes(message.payload) for _, message in batch], acknowledge)
 
-    def _heard(self, client: Client, data: object, message: MQTTMessage) -> None:
+    def _on_message(self, client: Client, data: object, message: MQTTMessage) -> None:
         """Nothing more is read while too much waits here."""
         with self.room:
             self.room.wait_for(lambda: len(self._held) < HELD or not self.open)

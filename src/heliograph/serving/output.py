@@ -18,7 +18,7 @@ class Output(NamedTuple):
     body: bytes
 
 
-class Told(BaseModel):
+class FilterOutput(BaseModel):
     """What one filter knows; null where a number is none."""
 
     mean: list[float | None]
@@ -36,7 +36,7 @@ class Estimates(BaseModel):
     kind: Literal["provisional", "final"] = Field(description="Provisional ones may change by what comes late.")
     plant: str
     time: float | str
-    estimates: dict[str, dict[str, Told]]
+    estimates: dict[str, dict[str, FilterOutput]]
 
 
 class Refused(BaseModel):

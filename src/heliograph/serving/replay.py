@@ -79,13 +79,13 @@ def through(events: Sequence[Event], link: Link, seed: int) -> list[Event]:
     result, lost = list[Event](), dict[str, bool]()
     for event in events:
         if event.node == INPUTS:
-            result.append(_heard(event, 0.0))
+            result.append(_arriving(event, 0.0))
             continue
         before = lost.get(event.node, chance.random() < loss)
         now = chance.random() < (stays if before and link.run > 1 else falls)
         lost[event.node] = now
         copies = 0 if now else 1 + (chance.random() < twice)
-        result += [_heard(event, chance.exponential(link.delay)) for _ in range(copies)]
+        result += [_arriving(event, chance.exponential(link.delay)) for _ in range(copies)]
     return _in_order(result)
 
 
@@ -104,8 +104,8 @@ def along(events: Sequence[Event], trace: Path) -> list[Event]:
         raise fail(f"trace {trace}, column {DELAY!r}", "no negative number", float(np.nanmin(delays)))
     received = [event for event in events if event.node != INPUTS]
     known = zip(received, np.resize(delays, len(received)).tolist(), strict=True)
-    results = [_heard(event, delay) for event, delay in known if not np.isnan(delay)]
-    return _in_order(results + [_heard(event, 0.0) for event in events if event.node == INPUTS])
+    results = [_arriving(event, delay) for event, delay in known if not np.isnan(delay)]
+    return _in_order(results + [_arriving(event, 0.0) for event in events if event.node == INPUTS])
 
 
 def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> Iterator[tuple[float, str]]:
@@ -121,7 +121,7 @@ def lines(events: Sequence[Event], plant: str, origin: np.datetime64 | None) -> 
         )
 
 
-def _heard(event: Event, delay: float) -> Event:
+def _arriving(event: Event, delay: float) -> Event:
     began = event.time if event.arrival is None else event.arrival
     return event._replace(arrival=began + float(delay))
 

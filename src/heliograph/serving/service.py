@@ -56,7 +56,7 @@ class Service:
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
-        self._told: int | None = None  # up to where, since the last commit
+        self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
@@ -91,7 +91,9 @@ class Service:
 
     def published(self, outputs: Sequence[Output]) -> None:
         """These were told: remembered with the next commit."""
-        self._told = max((output.number for output in outputs if output.number is not None), default=self._told)
+        self._published = max(
+            (output.number for output in outputs if output.number is not None), default=self._published
+        )
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
@@ -152,12 +154,12 @@ class Service:
                 name: StoredPlant(plant.version, plant_bytes(plant, self.fleet)) for name, plant in touched.items()
             }
         try:
-            outputs = self.store.commit(stored, entries, malformed, self._told)
+            outputs = self.store.commit(stored, entries, malformed, self._published)
         except BaseException:
             for name in touched:
                 self.fleet.end(self.plants.pop(name))
             raise
-        self._told = None
+        self._published = None
         for name, plant in touched.items():
             plant.version += 1
             self.plants.move_to_end(name)

@@ -94,7 +94,7 @@ class Watch:
         self.lock = threading.Lock()
         self.services: list[Serves] = []
         self.surprises: dict[tuple[str, str], RunningNis] = {}
-        self._own: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
+        self._tests: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._count = 0
         self.registry = CollectorRegistry()
@@ -121,7 +121,7 @@ class Watch:
                     self._test(output.plant, message["estimates"])
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        local = _newest(self._own, plant, dict)
+        local = _newest(self._tests, plant, dict)
         for node, filters in estimates.items():
             for name, message in filters.items():
                 if message.get("nis") is not None:
@@ -153,7 +153,7 @@ class Watch:
             name = next(reversed(self._points), "") if plant is None else plant
             results = [item for known, item in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
-            tests = self._own.get(name, {})
+            tests = self._tests.get(name, {})
             names = sorted(known for known, _ in self.plants())
             return {
                 "count": len(names),
@@ -164,7 +164,7 @@ class Watch:
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
                 "links": _added(results),
-                "tests": [_told(node, filter_, test) for (node, filter_), test in tests.items()],
+                "tests": [_test_row(node, filter_, test) for (node, filter_), test in tests.items()],
                 "warnings": list(self._warnings(results, tests))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
                 "all": _added(item for _, item in self.plants()),
@@ -246,7 +246,7 @@ def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int
     return results
 
 
-def _told(node: str, filter_: str, item: RunningNis) -> dict[str, object]:
+def _test_row(node: str, filter_: str, item: RunningNis) -> dict[str, object]:
     low, high = item.band()
     numbers = {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
     return {"node": node, "filter": filter_, "claim": item.claim, **numbers, "doubt": item.doubt() is not None}

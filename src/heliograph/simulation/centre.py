@@ -264,10 +264,10 @@ def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[st
 def _uncertain(channel: Channel) -> bool:
     """Whether probabilities of the channel's laws are known up to a radius only."""
     try:
-        return any(arrived(item).corner_count() > 1 for item in _each(channel))
+        return any(arrived(item).corner_count() > 1 for item in _steps_of(channel))
     except ValueError:  # too many corners to list
         return True
 
 
-def _each(channel: Channel) -> list[AbstractRandomAffine]:
+def _steps_of(channel: Channel) -> list[AbstractRandomAffine]:
     return unstack(channel) if isinstance(channel, OverTime) else [channel]

@@ -25,7 +25,7 @@ from heliograph.simulation.centre import (
     described,
     listening,
 )
-from heliograph.simulation.centre_filter import CentreFilter
+from heliograph.simulation.fusion_centre import CentreFilter
 from heliograph.simulation.linearised import LinearisedCentre
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node

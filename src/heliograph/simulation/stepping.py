@@ -26,7 +26,7 @@ from heliograph.simulation.centre import (
     Centre,
     CentreState,
 )
-from heliograph.simulation.centre_filter import CentreFilter
+from heliograph.simulation.fusion_centre import CentreFilter
 from heliograph.simulation.gathering import Fused, Reporting, centres_of, fusions_of, gathering
 from heliograph.simulation.linearised import Followed, LinearisedCentre
 from heliograph.simulation.network import FUSED, Network

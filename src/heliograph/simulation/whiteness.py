@@ -37,7 +37,7 @@ class MemoryTest:
     power_error: float
 
     @property
-    def result(self) -> bool:
+    def significant(self) -> bool:
         """Whether innovations one step apart are correlated, at 1 %."""
         return self.p_value < 0.01
 

@@ -130,7 +130,7 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
         )
         return jax.tree.map(lambda a, b: jnp.where(_column(ahead <= last, a), a, b), earlier, later)
 
-    return _told(steps, jax.lax.fori_loop(0, lag, body, newest))
+    return _estimates_from(steps, jax.lax.fori_loop(0, lag, body, newest))
 
 
 def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
@@ -148,7 +148,7 @@ def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
     return result
 
 
-def _told(steps: AbstractSmootherStep, later: PyTree) -> Estimate:
+def _estimates_from(steps: AbstractSmootherStep, later: PyTree) -> Estimate:
     result: Estimate = jax.vmap(lambda step, later: step.estimate_from(step.smoothed(later)))(steps, later)
     return result
 

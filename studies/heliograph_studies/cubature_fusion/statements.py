@@ -223,7 +223,7 @@ def better(o: Runs) -> list[Statement]:
     return [
         Statement(f"The RMSE of {name.replace('_', ' ')} is below that of the paper's bound (strong)", OURS, "",
                   f"{rmse(o, name)}; {base}",
-                  {"own": Sampled(*o.pooled(name).rmse()), "papers": Sampled(*o.pooled(METHOD).rmse())},
+                  {"local": Sampled(*o.pooled(name).rmse()), "papers": Sampled(*o.pooled(METHOD).rmse())},
                   lambda local, papers: holds(local.below(papers.value)))
         for name in BETTER
     ]  # fmt: skip

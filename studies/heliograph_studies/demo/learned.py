@@ -29,7 +29,7 @@ class Learned:
     """
 
     rows: int
-    result: Fit
+    fit: Fit
     second_half: Score
     second_half_calibrated: Score
     rest: float
@@ -91,7 +91,7 @@ def judged(network: hg.Network, recording: PlazaRecording, received: np.ndarray,
 
 def said(result: Learned) -> str:
     """What was found, in words."""
-    row = next(row for row in result.result.rows() if row.name == "gyro_rate")
+    row = next(row for row in result.fit.rows() if row.name == "gyro_rate")
     apart = not row.low <= result.rest <= row.high
     verdict = (
         "That is not what it reads at rest, so the rate at rest is wrong while driving"
@@ -130,7 +130,7 @@ def learned_summary(result: Learned) -> dict[str, Json]:
         "second_half_nees": result.second_half.nees_per_dimension,
         "gyro_rate_at_rest": result.rest,
         "gyro_rate_of_truth": result.drift,
-        "parameters": parameters(result.result),
+        "parameters": parameters(result.fit),
     }
 
 

@@ -232,7 +232,7 @@ def _learned(outcome: Outcome) -> list[Section]:
     calibrated = robot.Constants(robot.DRIVES[outcome.recording.name].gyro_rate)._asdict()
     rows = [
         [row.name.replace("_", " "), f"{calibrated[row.name]:.4g}", f"{row.estimate:.4g}", interval(row)]
-        for row in result.result.rows()
+        for row in result.fit.rows()
     ]
     caption = (
         "Each constant as it was measured with the truth (the gyro's rate: at rest), and as the likelihood of the "

@@ -44,7 +44,7 @@ class Outcome:
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Everything."""
     # First: what memory the process has had at most is of all that came before.
-    of_many = stages(f"{setting.tree_nodes} nodes in a tree, {setting.count} nodes", lambda: scale(setting))
+    of_many = stages(f"{setting.tree_nodes} nodes in a tree, {setting.crossed_nodes} nodes", lambda: scale(setting))
     cases = {name: stages(what, partial(one_case, name, setting.steps)) for name, what in CASES.items()}
     simulated = stages("simulating three rooms", lambda: measured(setting))
     of_tree, levels, root = stages("a tree of relays", lambda: tree(setting))
@@ -159,16 +159,16 @@ def scale(setting: Setting) -> dict[str, float | None]:
     grown = hg.simulation.relay_tree(plant, leaf, numbers, setting.degree, setting.many_steps)
     tree_took, tree_peak = _since(begin), peak_gb()
     begin = time.perf_counter(), time.process_time()
-    crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.count]), LOCAL, setting.many_steps)
+    crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.crossed_nodes]), LOCAL, setting.many_steps)
     pairs, (_, covariance) = crossed.joint, crossed.matrix_weights()
     took = _since(begin)
     return {
-        "nodes": setting.count,
+        "nodes": setting.crossed_nodes,
         "steps": setting.many_steps,
         "seconds": took[0],
         "processor_seconds": took[1],
         "peak_gb": peak_gb(),
-        "local": float(np.einsum("iaia->", pairs) / setting.count),
+        "local": float(np.einsum("iaia->", pairs) / setting.crossed_nodes),
         "matrix": float(np.trace(covariance)),
         "tree_nodes": setting.tree_nodes,
         "tree_degree": setting.degree,

@@ -15,14 +15,15 @@ Part = tuple[np.ndarray, float, float, float, float]  # C, variance of v, mean a
 class Setting:
     """How much is worked out, and how much is simulated.
 
-    count: nodes of which all cross-covariances are computed over many_steps, as in a tree of tree_nodes and degree;
+    crossed_nodes: nodes of which all cross-covariances are computed over many_steps, as in a tree of tree_nodes and
+    degree;
     intervals, thresholds: reports every d-th step and on event, over traffic_steps of which the second half is judged.
     """
 
     runs: int = 2000
     steps: int = 200
     measured_steps: int = 30
-    count: int = 1000
+    crossed_nodes: int = 1000
     many_steps: int = 100
     tree_nodes: int = 10_000
     degree: int = 10
@@ -35,10 +36,10 @@ class Setting:
 
     def __post_init__(self) -> None:
         check_count("runs", self.runs, 8)
-        for name in ("steps", "measured_steps", "many", "many_steps", "machine_runs", "traffic_steps"):
+        for name in ("steps", "measured_steps", "crossed_nodes", "many_steps", "machine_runs", "traffic_steps"):
             check_count(name, getattr(self, name), 1)
         check_count("degree", self.degree, 2)
-        check_count("tree_nodes", self.tree_nodes, self.count)
+        check_count("tree_nodes", self.tree_nodes, self.crossed_nodes)
         check_seed("seed", self.seed)
         if not 2 <= self.machine_nodes <= len(OUTPUTS):
             raise fail("machine_nodes", f"a number from 2 to {len(OUTPUTS)}", self.machine_nodes)

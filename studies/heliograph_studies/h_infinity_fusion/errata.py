@@ -40,7 +40,7 @@ def _growth(result: Parts) -> list[Statement]:
                 largest_slope <= constant * ATTAINED and steps_that_break_it == 0)),
         Statement("the guarantee of Theorem 1 in the example", "Section IV", "from a = 0.7",
             f"node 1, best gains: guaranteed {local:.5f}, but a disturbance exists with {worst.level:.5f} ± "
-            f"{worst.standard_error:.1g}", {"guaranteed": local, "found": Sampled(worst.level, worst.standard_error)},
+            f"{worst.standard_error:.1g}", {"guaranteed": local, "outcome": Sampled(worst.level, worst.standard_error)},
             lambda guaranteed, outcome: holds(outcome.at_most(guaranteed))),
         Statement("levels can be guaranteed where state and estimates go", "not in the paper", "",
             f"with slopes that the search did not refute there: one constant {true.constant.min():.4f} to "

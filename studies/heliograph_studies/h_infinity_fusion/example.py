@@ -107,7 +107,7 @@ def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[st
     }
 
 
-def simulate_told(setting: Setting) -> Runs:
+def simulate_known(setting: Setting) -> Runs:
     """Extended Kalman filters told of each loss, in a network whose losses are erasures; other draws."""
     nodes = {
         node: hg.Node(

@@ -41,8 +41,8 @@ def _designs(result: Parts) -> list[Statement]:
             f"K = 0, which hears nothing, has {zero[0]:.6f} at every node; the smallest levels over the horizon are "
             f"{listed(horizon)}, {min(ratio):.0f} to {max(ratio):.0f} times below the paper's (recursive: "
             f"{listed(smallest)}; with P_0 = 10 I, {result.readings.fixed_start:.5f} for all, by (19) alone)",
-            {"level_of_hearing_nothing": max(zero), "least_level": min(result.setting.levels)},
-            lambda level_of_hearing_nothing, least_level: if_met(level_of_hearing_nothing > least_level)),
+            {"level_of_receiving_nothing": max(zero), "least_level": min(result.setting.levels)},
+            lambda level_of_receiving_nothing, least_level: if_met(level_of_receiving_nothing > least_level)),
         Statement("the smallest level needs the measurements", OURS, "implied",
             f"largest gain over K = 0 {100 * (1 - min(horizon) / zero[0]):.1f} %, all of it through D: with D = 0, "
             f"{result.readings.without_feedthrough[0]:.6f} with the best gains of node 1 and "
@@ -98,7 +98,7 @@ def _figures(result: Parts) -> list[Statement]:
             f"mean fused error {local:.4f}; but {none:.4f} with K = 0: the plant forgets by itself, and the levels say "
             f"nothing about it (horizon design, guaranteed lower: {error['horizon'][0]:.4f}). Largest entries of the "
             f"gains by node: {listed(largest, 2)}",
-            {"own": Sampled(*error[RECURSIVE]), "without_measurements": Sampled(*error["zero_gain"])},
+            {"local": Sampled(*error[RECURSIVE]), "without_measurements": Sampled(*error["zero_gain"])},
             lambda local, without_measurements: if_met(local.value < without_measurements.value / 2)),
         Statement("losses as stated", "Figs 7 to 9", "arrival 0.8, 0.75, 0.7",
             f"{listed(shares)}, at most {off.max():.1f} standard errors off",

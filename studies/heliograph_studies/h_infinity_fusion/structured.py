@@ -18,7 +18,7 @@ DAMPING, ANGLE = 0.97, 0.5  # of the rotation: its period is 4 pi steps
 ROTATION = DAMPING * np.array([[np.cos(ANGLE), np.sin(ANGLE)], [-np.sin(ANGLE), np.cos(ANGLE)]])
 GROWTH = 0.05
 DISTURBANCE = np.array([[0.0], [1.0]])
-WANTED = np.eye(2)
+TARGET = np.eye(2)
 WEIGHT = 1.0
 OUTPUTS = {"1": [[1.0, 0.0]], "2": [[0.0, 1.0]], "3": [[0.7, 0.7]]}
 ARRIVAL = (0.95, 0.95, 0.9)
@@ -88,7 +88,7 @@ def system(node: str, structured: bool = True) -> hg.h_infinity.GrowthSystem:
     """What designs read; not `structured`: all of A x + phi(x) known by its growth |A| + |phi| alone."""
     shape = {"growth": GROWTH, "transition": ROTATION} if structured else {"growth": DAMPING + GROWTH}
     return hg.h_infinity.growth_system(
-        STEPS, DISTURBANCE, [[0.0]], WANTED, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
+        STEPS, DISTURBANCE, [[0.0]], TARGET, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
     )
 
 
@@ -100,7 +100,7 @@ def world(node: str) -> World:
         lambda x: jnp.asarray(matrix @ x),
         DISTURBANCE,
         np.zeros((1, 1)),
-        WANTED,
+        TARGET,
         WEIGHT * np.eye(4),
         inputs("bias"),
     )

@@ -37,7 +37,7 @@ def _critical(result: Outcome) -> list[Statement]:
             _critical_arrival),
         Statement("With one output the modified Riccati equation is solvable above 1 - prod |unstable eigenvalue|^-2",
             "Elia (2005); Schenato et al. (2007)", f"{product:.6f} in the coupled example",
-            f"certified from {coupled.upper:.6f} on", {"found": coupled.upper, "predicted": product}, _as_predicted),
+            f"certified from {coupled.upper:.6f} on", {"result": coupled.upper, "predicted": product}, _as_predicted),
     ]  # fmt: skip
 
 
@@ -199,7 +199,7 @@ def _errata(result: Outcome) -> list[Statement]:
         Statement("The steady gain of the filter that hears everything is as stable as the filter that is told",
             "taken for granted at times", "same threshold",
             f"it needs {constant.upper:.4f}, the filter that is told {scalar.upper:.4f}",
-            {"fixed_gain": constant.upper, "told": scalar.upper},
+            {"fixed_gain": constant.upper, "known": scalar.upper},
             lambda fixed_gain, known: holds(fixed_gain - known < THRESHOLD)),
         Statement("Losses that the receiver is not told have a critical probability too", "taken for granted at times",
             "a threshold", unpublished,

@@ -50,7 +50,7 @@ class Outcome:
     e1: dict[str, Score]
     e2: dict[str, Score]
     known: dict[str, Score]
-    one_shadow: dict[str, float]
+    one_fading: dict[str, float]
     curve: dict[str, list[float]]
     memory_test: dict[str, float | np.ndarray]
 

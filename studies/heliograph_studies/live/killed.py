@@ -83,13 +83,13 @@ async def killed(
             part = slice(len(lines) * kill // (kills + 1), len(lines) * (kill + 1) // (kills + 1))
             async with asyncio.TaskGroup() as group:  # if sending fails nothing more is waited for
                 group.create_task(_send(client, lines[part]))
-                await run.until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
+                await run.until(partial(_finals_read, client, count * (2 * kill + 1) // (2 * kills + 2)))
                 await asyncio.sleep(generator.uniform(0, SOON))
                 run.kill()
             run.start()
         advance("what is left")
         await _send(client, lines[len(lines) * kills // (kills + 1) :])
-        await run.until(partial(_told, client, count))
+        await run.until(partial(_finals_read, client, count))
         await run.until(partial(_idle, client))
         pictures = await asyncio.to_thread(look, f"http://127.0.0.1:{port}/")
         run.stop()
@@ -151,7 +151,7 @@ async def _reads(client: Client) -> bool:
         return False
 
 
-async def _told(client: Client, count: int) -> bool:
+async def _finals_read(client: Client, count: int) -> bool:
     """Whether so many final estimates were told."""
     try:
         info = await client.jetstream(timeout=60).stream_info(f"{TOPIC}-out", subjects_filter=f"{TOPIC}.out.final.*")

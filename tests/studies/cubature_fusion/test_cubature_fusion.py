@@ -216,7 +216,7 @@ def test_claims_follow_the_numbers(result):
 
 
 BOUND = both("actual_over_claimed", Sampled(1.02, 0.01), Sampled(1.05, 0.01))
-BELOW = both("own", Sampled(0.0, 0.1), Sampled(9.0, 0.1))
+BELOW = both("local", Sampled(0.0, 0.1), Sampled(9.0, 0.1))
 VERDICTS = [
     ("(10) is an upper bound", both("violations", 0, 1)),
     ("The filter's Ξ", {"holds": {"printed": Sampled(0.9, 0.1), "strong": Sampled(1.2, 0.1)},

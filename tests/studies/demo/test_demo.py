@@ -254,11 +254,11 @@ def test_learning_without_the_truth_beats_the_calibration_on_the_second_half(lea
     assert learned.rows == 908
     assert learned.second_half.position_rmse_m <= 0.30  # the project's own requirement, as the next
     assert learned.second_half_calibrated.position_rmse_m >= 0.33
-    assert learned.result.converged and len(learned.result.best.rows()) == 5
+    assert learned.fit.converged and len(learned.fit.best.rows()) == 5
 
 
 def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned) -> None:
-    rows = {row.name: row for row in learned.result.rows()}
+    rows = {row.name: row for row in learned.fit.rows()}
     gyro = rows["gyro_rate"]
     assert gyro.low < learned.drift < gyro.high  # the truth, which it has not seen
     assert learned.rest < gyro.low
@@ -269,11 +269,11 @@ def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned) -> None:
 
 def test_its_maximum_is_one_of_the_filters_own_likelihood(learned: Learned, recording: PlazaRecording) -> None:
     """That of the filter with the learned constants, and less with each of them moved by a standard error."""
-    network = received_by_one(PLAZA2, robot.Constants(**learned.result.values), hg.perfect(4))
+    network = received_by_one(PLAZA2, robot.Constants(**learned.fit.values), hg.perfect(4))
     likelihood = hg.log_likelihood(
         network.nodes["robot"].filters["learned"], recording.ranges[:908], recording.odometry[:908]
     )
-    best = learned.result.best
+    best = learned.fit.best
     assert likelihood == pytest.approx(best.total, rel=1e-10)
     error = np.sqrt(np.diag(best.covariance()[0]))
     moved = best.x + np.concatenate([np.diag(error), -np.diag(error)])
@@ -297,5 +297,5 @@ def test_what_is_learned_behind_the_relay_is_its_gains_variance(recording: Plaza
 def test_what_was_learned_is_written_beside_the_scores(folder: Path, learned: Learned) -> None:
     result = json.loads((folder / "summary.json").read_text())["learned"]
     assert result["second_half"] == learned.second_half.position_rmse_m
-    assert result["parameters"]["gyro_rate"]["estimate"] == learned.result.values["gyro_rate"]
+    assert result["parameters"]["gyro_rate"]["estimate"] == learned.fit.values["gyro_rate"]
     assert "What the ranges alone say" in (folder / "report.html").read_text(encoding="utf-8")
