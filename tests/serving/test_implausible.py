@@ -102,5 +102,5 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
     (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))
     result = json.loads(known.body)["estimates"]["a"]
-    assert result["lost"]["mean"] == [0.0] and result["lost"]["nis"] is None and result["lost"]["heard"] == 0
+    assert result["lost"]["mean"] == [0.0] and result["lost"]["nis"] is None and result["lost"]["received"] == 0
     assert "1e6 deviations" in result["lost"]["implausible"] and "implausible" not in result["fine"]

@@ -103,7 +103,7 @@ def test_surprise_is_that_of_the_innovation():
     sent = [{"node": "a", "sequence": k, "time": k, "values": [value]} for k, value in enumerate(z)]
     _, known = served(network, lines(sent), 2)
     mine = [item["estimates"]["a"]["linear"] for item in known if item["kind"] == "final"]
-    assert [item["heard"] for item in mine] == [1, 1, 0, 1, 1] and mine[2]["nis"] is None
+    assert [item["received"] for item in mine] == [1, 1, 0, 1, 1] and mine[2]["nis"] is None
     state = alone.init()
     for k, (value, item) in enumerate(zip(z, mine, strict=True)):
         state, said = alone.correct(alone.predict(state, [0.0], k), [np.nan if value is None else value], k)

@@ -49,7 +49,7 @@ class Scripted:
             nis = self.scale * float(np.random.default_rng(i).chisquare(2))
             covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
             message = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
-            message |= {"claim": "nominal", "nis": nis, "heard": 2}
+            message |= {"claim": "nominal", "nis": nis, "received": 2}
             body = {"id": i, "plant": self.plant, "time": i / 10, "estimates": {"<b>node": {"cubature": message}}}
             results.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
             results.append(Output(None, self.plant, "provisional", to_json(body | {"kind": "provisional"})))

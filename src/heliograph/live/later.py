@@ -44,7 +44,7 @@ class Sweep(Module):
         local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
         skip = local, {name: central[name] for name in self.network_step.filters.central}
         after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
-        return after, ({kind: result["retained"][kind] for kind in self.kinds}, result["retained_centrally"])
+        return after, ({kind: result["smoother_steps"][kind] for kind in self.kinds}, result["smoother_steps_centrally"])
 
     def start(self, history: History, slot: jax.Array) -> PyTree:
         """The filters' states after a row of the tape."""

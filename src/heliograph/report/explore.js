@@ -123,7 +123,7 @@
     let left = CURVES;
     const drawn = curves.map(part => { const kept = part.slice(0, left); left -= kept.length; return kept; }).filter(part => part.length);
     const count = drawn.reduce((sum, part) => sum + part.length, 0);
-    at("told").textContent = !rows.length ? "Nothing is chosen: tick a value in every list." :
+    at("shown").textContent = !rows.length ? "Nothing is chosen: tick a value in every list." :
       (count < there ? `${drawn.length} of ${panels.length} panels and ${count} of ${there} curves are shown; choose fewer values to see the others.` :
         `${count} curve${count === 1 ? "" : "s"} in ${drawn.length} panel${drawn.length === 1 ? "" : "s"}.`) +
       " Bars: two standard errors to both sides. Drag to move, box to zoom, point to read.";

@@ -99,7 +99,7 @@ class _Check:
             await self._soon("publish", transport.publish([now, *outputs]))
         expected, result = [output.body for output in outputs], list[bytes]()
         for _ in range(1 + int(self.patience / PAUSE)):
-            published = await self._soon("told", self.broker.published())
+            published = await self._soon("published", self.broker.published())
             result = _once(body for body in published if body != now.body)
             if len(result) >= len(expected):
                 break

@@ -31,8 +31,8 @@ class Teller:
             return results
         if outputs[judged.reason] > 0:
             why = in_words(outputs[judged.reason], outputs[judged.distance])
-            return results | {"nis": None, "heard": 0, "implausible": why}
-        return results | {"nis": outputs[judged.distance], "heard": int(outputs[judged.arrived])}
+            return results | {"nis": None, "received": 0, "implausible": why}
+        return results | {"nis": outputs[judged.distance], "received": int(outputs[judged.arrived])}
 
 
 def line(parts: dict[str, object]) -> bytes:

@@ -127,7 +127,7 @@ class Watch:
                 if message.get("nis") is not None:
                     for item in (self.surprises, local):
                         single = item.setdefault((node, name), RunningNis(message["claim"]))
-                        single.add(message["nis"], message["heard"])
+                        single.add(message["nis"], message["received"])
 
     def _keep(self, plant: str, message: Mapping[str, Any]) -> None:
         self._count += 1

@@ -176,7 +176,7 @@ def _smoothed(
     both = one_run(later.both, result)
     filtered, smoothed = recorded(both["filtered"]), recorded(both["smoothed"])
     return OfStep(
-        (filtered.sums, smoothed.sums, both["surprise"]),
+        (filtered.sums, smoothed.sums, both["nis"]),
         (filtered.ever, smoothed.ever),
         (filtered.collected, smoothed.collected),
     )

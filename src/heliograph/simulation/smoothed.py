@@ -42,11 +42,11 @@ class Smoother(Module):
 
     def both(self, result: PyTree) -> PyTree:
         """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
-        steps_ = [result["retained"][k] for k in self.kinds]
-        filtered = {name: part for name, part in result.items() if name not in ("retained", "retained_centrally")}
+        steps_ = [result["smoother_steps"][k] for k in self.kinds]
+        filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "smoother_steps_centrally")}
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         estimates = tuple(self._estimates(steps, 2) for steps in steps_)
-        fused = {name: self._estimates(steps, 0) for name, steps in result["retained_centrally"].items()}
+        fused = {name: self._estimates(steps, 0) for name, steps in result["smoother_steps_centrally"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
         length = jax.tree.leaves((estimates, fused))[0].shape[1]
@@ -61,8 +61,8 @@ class Smoother(Module):
             truth = self.smoothing.about(result["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_])}
         nis = tuple(each_run(surprised, steps) for steps in steps_)
-        centrally = {name: each_run(nis_sums, steps) for name, steps in result["retained_centrally"].items()}
-        return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": nis, "fused": centrally}}
+        centrally = {name: each_run(nis_sums, steps) for name, steps in result["smoother_steps_centrally"].items()}
+        return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
     def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
         """Estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
@@ -171,7 +171,7 @@ def found_record(network: Network, part: Part | None, result: PyTree, time: np.n
     """The record of a recording, with what was smoothed beside it."""
     if part is None:
         return trajectories_record(network, {"truth": None, **result}, time)
-    _warn_of_nis(part.network, result["surprise"])
+    _warn_of_nis(part.network, result["nis"])
     filtered = trajectories_record(network, {"truth": None, **result["filtered"]}, time)
     length = result["smoothed"]["measurements"][0].shape[0]
     smoothed = trajectories_record(part.network, {"truth": None, **result["smoothed"]}, time[-length:])
@@ -181,14 +181,14 @@ def found_record(network: Network, part: Part | None, result: PyTree, time: np.n
 class WithSmoothed(AbstractReducer[Result]):
     """What is kept of filtered estimates, the same of smoothed ones, and sums of surprise.
 
-    A block is {"filtered", "smoothed", "surprise"}; the first two are such as the reducer takes.
+    A block is {"filtered", "smoothed", "nis"}; the first two are such as the reducer takes.
     """
 
     reducer: AbstractReducer[Result]
 
     def initial(self, shapes: PyTree) -> PyTree:
         """Both carries, and no surprise."""
-        nis = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["surprise"])
+        nis = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["nis"])
         return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), nis
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
@@ -201,7 +201,7 @@ class WithSmoothed(AbstractReducer[Result]):
             values = jnp.broadcast_to(part, (len(valid), *part.shape[1:]))
             return total + jnp.sum(jnp.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0), axis=0)
 
-        nis = jax.tree.map(added, nis, batch["surprise"])
+        nis = jax.tree.map(added, nis, batch["nis"])
         return (filtered, smoothed, nis), (recorded, kept_later)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:

@@ -81,8 +81,8 @@ function charts(view) {
   const cut = names.find((name) => name === chosen);
   const [node, filter] = Object.entries(newest).flatMap(([n, fs]) => Object.keys(fs).map((f) => [n, f])).find(([n, f]) => n + "/" + f === cut);
   at("charts").replaceChildren(...view.states.map((state, i) => chart(state, points.map((point) => {
-    const told = point.estimates[node] && point.estimates[node][filter];
-    return told ? { time: point.time, mean: told.mean[i], wide: told.deviation ? 2 * told.deviation[i] : 0, claim: told.claim } : null;
+    const estimate = point.estimates[node] && point.estimates[node][filter];
+    return estimate ? { time: point.time, mean: estimate.mean[i], wide: estimate.deviation ? 2 * estimate.deviation[i] : 0, claim: estimate.claim } : null;
   }).filter((one) => one && Number.isFinite(one.mean)))));
 }
 
