@@ -90,7 +90,7 @@ CALLS = [  # what is called, and arguments with which it works
     (linear.state_moments, {"system": SYSTEM}),
     (linear.Schedule, {"gains": SCHEDULE.gains, "start": SCHEDULE.start, "claim": "exact"}),
     (linear.LinearSystem, {"steps": SYSTEM.steps, "mean": SYSTEM.mean, "covariance_": SYSTEM.covariance,
-                          "want": SYSTEM.projection}),
+                          "projection": SYSTEM.projection}),
     (linear.load_schedule, {"path": "nothing.npz"}),
     (relays.own_error_design, {"network": RELAYS, "horizon": 2}),
     (relays.given_design, {"network": RELAYS, "gains": {}}),

@@ -30,7 +30,7 @@ SAMPLES = {  # what a parameter of this name usually is
     "mean": [0.0, 0.0], "claim": "exact", "initial_mean": [0.0, 0.0], "initial_covariance": EYE,
     "sensors": {"a": SENSOR}, "rows": [[1.0, 0.0]], "noises": [0.1], "measurements": np.zeros((3, 1)),
     "data": np.zeros((30, 1)), "inputs": None, "weights": [0.5, 0.5], "levels": [1.0, 2.0], "paths": PATHS,
-    "powers": [1.0], "budget": 1.0, "wanted": 0.5, "alpha": [1.0], "kappa": [1.0], "total": 1.0,
+    "powers": [1.0], "budget": 1.0, "target_error": 0.5, "alpha": [1.0], "kappa": [1.0], "total": 1.0,
     "fates": [1, 1, 0, 1], "sequence": [0, 1, 3], "arrived": np.ones((3, 1)), "payload": b"{}",
     "path": "nothing.csv", "table": {"time": [0.0, 1.0]}, "columns": {"time": np.zeros(2)},
     "url": "mqtt://host/topic", "rule": fusion.EqualIntersection(), "rho": 0.5, "exponent": 2.0,

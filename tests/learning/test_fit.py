@@ -40,7 +40,7 @@ def recording():
 
 
 @pytest.fixture(scope="module")
-def evaluations(recording):
+def result(recording):
     return hg.fit(network, recording, INPUTS, starts=3)
 
 

@@ -18,7 +18,7 @@ def network(channel, plant_noise=0.1, sensor_noise=0.1):
     return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], sensor_noise), channel, {})})
 
 
-def evaluations(build):
+def result(build):
     return {item.name: item.domain for item in hg.learning.describe(build).parameters.every}
 
 

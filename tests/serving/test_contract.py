@@ -24,7 +24,7 @@ class Memory:
     async def send(self, bodies: Sequence[bytes]) -> None:
         self.messages += bodies
 
-    async def known(self) -> list[bytes]:
+    async def published(self) -> list[bytes]:
         return list(self.outputs)
 
     def batch(self, read: int) -> list[bytes]:

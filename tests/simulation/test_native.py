@@ -17,9 +17,9 @@ from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.world import World
 from tests.relays.relay_problems import example
 from tests.simulation.test_relay_worlds import relays
-from tests.simulation.test_shadows import PLANT as ALONE
-from tests.simulation.test_shadows import SENSOR as GAIN
-from tests.simulation.test_shadows import in_turn, link
+from tests.simulation.test_shared_fading import PLANT as ALONE
+from tests.simulation.test_shared_fading import SENSOR as GAIN
+from tests.simulation.test_shared_fading import in_turn, link
 from tests.simulation.test_simulate import INPUTS, NETWORK
 
 # Near its least value a trace changes with the square of the weight, which is known to the root of rounding over that

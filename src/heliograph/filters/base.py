@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.filters.plausibility import Judgement, judge
 from heliograph.filters.smoother_step import AbstractSmootherStep
@@ -22,7 +23,7 @@ from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
 
 __all__ = ["AbstractFilter", "Step", "corrects", "given", "in_float64", "measured", "predicts", "step_number"]
 
-Step = int | np.integer | Int[Array, ""]
+Step = TypeAliasType("Step", int | np.integer | Int[Array, ""])
 
 P = ParamSpec("P")
 R = TypeVar("R")

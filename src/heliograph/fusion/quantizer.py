@@ -5,6 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from typing_extensions import TypeAliasType
 
 from heliograph.model.estimate import Claim
 from heliograph.model.over_time import OverTime
@@ -71,7 +72,7 @@ class AbstractQuantizer(Module):
                 raise fail("quantizer", f"numbers or shape ({n},) for each parameter", f"shape {np.shape(leaf)}")
 
 
-Quantizer = AbstractQuantizer | OverTime  # an OverTime holds one quantizer per step
+Quantizer = TypeAliasType("Quantizer", AbstractQuantizer | OverTime)  # an OverTime holds one quantizer per step
 
 
 def widen(covariance: Float[Array, "n n"], error: Float[Array, "n"]) -> Float[jax.Array, "n n"]:

@@ -44,7 +44,10 @@ class Sweep(Module):
         local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
         skip = local, {name: central[name] for name in self.network_step.filters.central}
         after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
-        return after, ({kind: result["smoother_steps"][kind] for kind in self.kinds}, result["smoother_steps_centrally"])
+        return after, (
+            {kind: result["smoother_steps"][kind] for kind in self.kinds},
+            result["central_steps"],
+        )
 
     def start(self, history: History, slot: jax.Array) -> PyTree:
         """The filters' states after a row of the tape."""
@@ -53,7 +56,7 @@ class Sweep(Module):
 
     def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
-        local, central = _over_filters(lambda step, later: step.outputs(step.smoothed(later)), steps, later)
+        local, central = _over_filters(lambda step, later: step.estimate_from(step.smoothed(later)), steps, later)
         parts = [local.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for item in self.fusions:
             central |= item.step((), parts, jnp.asarray(0))[1]

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from typing import overload
 
 import numpy as np
-from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, over_time, unstack
 from heliograph.model.sensor import AbstractSensor, check_sensor
 from heliograph.numerics.check import check_count, fail, scalar
 from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.combine import Mixture, Stack
@@ -19,7 +20,7 @@ from heliograph.random_affine.in_line import in_series
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
-Channel = AbstractRandomAffine | OverTime  # an OverTime holds one channel per step
+Channel = TypeAliasType("Channel", AbstractRandomAffine | OverTime)  # an OverTime holds one channel per step
 
 
 @overload

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from heliograph.model.channel import Channel, hop
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.numerics.check import array, check_count, fail, flag, scalar
 from heliograph.numerics.traced import library
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, memories
 from heliograph.random_affine.chain import Autoregression, MarkovChain

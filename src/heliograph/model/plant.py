@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.angle import TURN, Angles, angles_named, continued, nearest, wrapped
@@ -16,7 +16,7 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
-from heliograph.numerics.types import Array
+from heliograph.numerics.types import Array, ArrayLike
 from heliograph.random_affine.noise import (
     AbstractNoise,
     Gaussian,
@@ -258,7 +258,7 @@ def _initial(mean: ArrayLike, spread: AbstractNoise | ArrayLike) -> tuple[Vector
     return center + law.mean, law.covariance, law
 
 
-AnyPlant = AbstractPlant | OverTime  # an OverTime holds one plant per step
+AnyPlant = TypeAliasType("AnyPlant", AbstractPlant | OverTime)  # an OverTime holds one plant per step
 
 
 def check_shape(name: str, called: Callable[..., object], values: tuple[object, ...], shape: tuple[int, ...]) -> None:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
+from typing_extensions import TypeAliasType
 
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -16,6 +16,7 @@ from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
 
 
@@ -123,7 +124,7 @@ def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, .
     return tuple(outputs[i] for i in angles_named("circular outputs", circular, outputs))
 
 
-AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
+AnySensor = TypeAliasType("AnySensor", AbstractSensor | OverTime)  # an OverTime holds one sensor per step
 
 
 @cached

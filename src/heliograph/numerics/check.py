@@ -9,10 +9,10 @@ from typing import Any, TypeVar, cast
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.domain import PROBABILITY, REAL, SIMPLEX, Domain, tell, tell_covariance
 from heliograph.numerics.traced import is_traced
+from heliograph.numerics.types import ArrayLike
 
 SYMMETRY_TOLERANCE = 1e-10  # of two standard deviations: covariances are computed, so rounding is allowed
 DEFINITENESS_TOLERANCE = 1e-10  # eigenvalue of the correlations, for the same reason; none depends on units

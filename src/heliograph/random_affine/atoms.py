@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.traced import library, placed, stacked
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.law import AbstractLaw, Constant
 from heliograph.random_affine.moments import Moments

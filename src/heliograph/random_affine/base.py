@@ -7,12 +7,12 @@ import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, fail, items, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import AbstractMemory
 from heliograph.random_affine.moments import Moments
 from heliograph.random_affine.monomials import monomials

@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from numpy.polynomial.hermite_e import hermegauss, hermevander
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import PROBABILITY_TOLERANCE, array, check_count, fail, probabilities, radii, scalar
 from heliograph.numerics.domain import PROBABILITY, SIMPLEX, tell
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library
+from heliograph.numerics.types import ArrayLike
 
 Rows = Float[jax.Array | np.ndarray, "modes modes"]
 Law = Float[jax.Array | np.ndarray, " modes"]

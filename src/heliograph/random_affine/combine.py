@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import fail
 from heliograph.numerics.traced import library, stacked
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
 from heliograph.random_affine.moments import Moments
 

@@ -12,13 +12,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
+from heliograph.numerics.types import ArrayLike
 
 Scalar = Float[jax.Array | np.ndarray, ""]
 Vector = Float[jax.Array | np.ndarray, " n"]

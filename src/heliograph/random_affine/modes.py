@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, check_count, fail, instance, scalar, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.traced import library, stacked
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import (
     AbstractModal,

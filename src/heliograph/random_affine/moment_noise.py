@@ -5,10 +5,10 @@ from math import ceil
 
 import jax
 import numpy as np
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, check_count, fail
 from heliograph.numerics.traced import is_traced, plain
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.monomials import Exponents, exponents
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Number, Square, Vector
 

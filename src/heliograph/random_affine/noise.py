@@ -8,13 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, covariance, fail, instance, items, probabilities, shown
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
+from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.monomials import Exponents, exponents
 
 OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance

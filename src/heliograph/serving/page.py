@@ -46,7 +46,7 @@ class Door(NamedTuple):
     token: str | None
 
 
-def door(place: str, environment: Mapping[str, str] = os.environ) -> Door:
+def door(place: str, environment: Mapping[str, str] | None = None) -> Door:
     """`PORT`, of this machine alone, or `ADDRESS:PORT`, which takes a token from HELIOGRAPH_PAGE_TOKEN.
 
     Raises:
@@ -58,7 +58,7 @@ def door(place: str, environment: Mapping[str, str] = os.environ) -> Door:
         raise fail("page", "a port, or address:port", repr(place))
     if _is_loopback(host):
         return Door(host, int(port), None)
-    token = environment.get(TOKEN, "")
+    token = (os.environ if environment is None else environment).get(TOKEN, "")
     if len(token) < 16:
         raise fail(f"page at {host}", f"a token of 16 characters at least in {TOKEN}", f"one of {len(token)}")
     return Door(host, int(port), token)

@@ -46,7 +46,7 @@ class Address:
         return context
 
 
-def address(url: str, environment: Mapping[str, str] = os.environ) -> Address:
+def address(url: str, environment: Mapping[str, str] | None = None) -> Address:
     """A broker's URL: `mqtt`, `mqtts`, `nats` or `nats+tls`, ://user:password@host:port/topic; the host must be there.
 
     User and password may also be in HELIOGRAPH_BROKER_USER and HELIOGRAPH_BROKER_PASSWORD, which come before the URL's,
@@ -56,7 +56,7 @@ def address(url: str, environment: Mapping[str, str] = os.environ) -> Address:
         ValueError: another kind of URL, no host, a topic with wildcards. It never tells the password.
     """
     text("broker", url)
-    environment = table("environment", environment, "texts")
+    environment = table("environment", os.environ if environment is None else environment, "texts")
     shape = f"{', '.join(f'{scheme}://' for scheme in PORTS)} and host:port/topic"
     try:
         parts = urlsplit(url)

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import array, check_seed, fail
+from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.draws import seed_key
 from heliograph.simulation.network import Network
 

@@ -7,14 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.codegen.engine import chosen
 from heliograph.numerics.check import check_times, fail, instance, table
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
-from heliograph.numerics.types import Float
+from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.module import Module
+from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.arguments import inputs_of, key_of
 from heliograph.simulation.by_run import trajectories
 from heliograph.simulation.lanes import BLOCK, Lanes, one_processor

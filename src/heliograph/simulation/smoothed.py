@@ -43,10 +43,10 @@ class Smoother(Module):
     def both(self, result: PyTree) -> PyTree:
         """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
         steps_ = [result["smoother_steps"][k] for k in self.kinds]
-        filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "smoother_steps_centrally")}
+        filtered = {name: part for name, part in result.items() if name not in ("smoother_steps", "central_steps")}
         surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
         estimates = tuple(self._estimates(steps, 2) for steps in steps_)
-        fused = {name: self._estimates(steps, 0) for name, steps in result["smoother_steps_centrally"].items()}
+        fused = {name: self._estimates(steps, 0) for name, steps in result["central_steps"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
         length = jax.tree.leaves((estimates, fused))[0].shape[1]
@@ -61,7 +61,7 @@ class Smoother(Module):
             truth = self.smoothing.about(result["truth"])
             smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_])}
         nis = tuple(each_run(surprised, steps) for steps in steps_)
-        centrally = {name: each_run(nis_sums, steps) for name, steps in result["smoother_steps_centrally"].items()}
+        centrally = {name: each_run(nis_sums, steps) for name, steps in result["central_steps"].items()}
         return {"filtered": filtered, "smoothed": smoothed, "nis": {"estimates": nis, "fused": centrally}}
 
     def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:

@@ -123,7 +123,7 @@ class AllFilters(Module):
 
         Gives "estimates" by kind, (filter, node, ...), "fused" by name, "uplinks" of what has quantizers, and
         "reports" with their delays by fusion, as the nodes send them; and what is retained where that is asked for,
-        "smoother_steps" by kind and "smoother_steps_centrally" by name; "judged" and "judged_centrally" if filters judge, and
+        "smoother_steps" by kind and "central_steps" by name; "judged" and "judged_centrally" if filters judge, and
         `skip` has the reasons of the same form not to use data.
         """
         local, central, sent, known, reporting = states
@@ -162,7 +162,7 @@ class AllFilters(Module):
         result: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
         if self.smooths:
             result["smoother_steps"] = tuple(single.steps for _, single in results)
-            result["smoother_steps_centrally"] = {name: single.steps for name, (_, single) in received.items()}
+            result["central_steps"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
             result["judged"] = tuple(single.judgement for _, single in results)
             result["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}

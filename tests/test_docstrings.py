@@ -1,0 +1,116 @@
+"""Docstrings and comments: a first line that stands alone, every parameter of what is public, and the field's words."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import heliograph
+
+SOURCE = Path(heliograph.__file__).parent
+FIRST = {
+    "what", "which", "where", "how", "whether", "those", "it", "its", "that", "this", "these", "there", "if",
+    "when", "who", "whom", "whose", "as", "of", "in", "with", "without", "for", "from", "to", "by", "at", "on",
+    "before", "after", "behind", "beyond", "and", "or", "but", "not", "so", "than", "then", "thus", "too",
+    "because", "while", "until", "unless", "such", "among", "above", "below", "during", "since",
+}  # no noun and no verb begins with these  # fmt: skip
+PRIVATE = re.compile(
+    r"\b(told|heard|hears|hearing|foretell\w*|foretold|mould|tape|ears|antenna\w*|shadows?|nowhere|revealed|retain\w*|"
+    r"surprise\w*|purchases?|beside|settles?|settled)\b",
+    re.IGNORECASE,
+)
+ARRAY = re.compile(r"\b(np\.ndarray|jax\.Array|ArrayLike|Array)\b")
+SHAPED = re.compile(r"(Float|Int|Bool|Shaped|Num|Real|Inexact)\[[^\[\]]*\]")
+LONG = 15  # lines of a function that needs a comment above its steps
+SHARE = 0.95  # of public array annotations that carry a shape: others take numbers of any
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+PATHS = sorted(p for p in SOURCE.rglob("*.py"))
+
+
+def definitions(path: Path) -> Iterator[Function | ast.ClassDef]:
+    """Every function and class of a file."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node
+
+
+def names_of(room: Path) -> set[str]:
+    """The public names of a room."""
+    stub = room / "__init__.pyi"
+    return set(re.findall(r"\w+ as (\w+)", stub.read_text())) if stub.exists() else set()
+
+
+def public() -> Iterator[tuple[Path, Function | ast.ClassDef]]:
+    """Public functions and classes, by the file that defines them."""
+    for path in PATHS:
+        names = names_of(SOURCE / path.relative_to(SOURCE).parts[0]) if path.parent != SOURCE else set()
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef) and node.name in names:
+                yield path, node
+
+
+def maker(node: Function | ast.ClassDef) -> Function | None:
+    """The function whose parameters a caller gives."""
+    if not isinstance(node, ast.ClassDef):
+        return node
+    return next((m for m in node.body if isinstance(m, ast.FunctionDef) and m.name == "__init__"), None)
+
+
+def parameters(node: Function | ast.ClassDef) -> list[str]:
+    """Names that a caller gives: of a function, of a class's constructor, or of the fields of a record."""
+    made = maker(node)
+    if made is None:
+        assert isinstance(node, ast.ClassDef)
+        fields = (part.target for part in node.body if isinstance(part, ast.AnnAssign))
+        return [field.id for field in fields if isinstance(field, ast.Name) and not field.id.startswith("_")]
+    every = made.args.posonlyargs + made.args.args + made.args.kwonlyargs
+    return [a.arg for a in every if a.arg not in ("self", "cls")]
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_docstrings_begin_with_a_noun_or_a_verb_and_have_no_private_word(path):
+    wrong = []
+    for node in [ast.parse(path.read_text()), *definitions(path)]:
+        text = ast.get_docstring(node) or ""
+        first = re.match(r"[\W_]*([\w']+)", text)
+        if (first and first[1].lower() in FIRST) or PRIVATE.search(text):
+            wrong.append(f"{getattr(node, 'name', 'module')}: {text.splitlines()[0]}")
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize("path", PATHS, ids=lambda path: str(path.relative_to(SOURCE)))
+def test_a_long_function_has_a_comment_above_its_steps(path):
+    lines, wrong = path.read_text().splitlines(), []
+    for node in definitions(path):
+        body = [] if isinstance(node, ast.ClassDef) else node.body[bool(ast.get_docstring(node)) :]
+        if not body:
+            continue
+        inside = lines[body[0].lineno - 1 : node.end_lineno]
+        if len(inside) > LONG and not any(line.lstrip().startswith("#") for line in inside):
+            wrong.append(node.name)
+    assert not wrong, wrong
+
+
+def test_every_parameter_of_what_is_public_is_in_its_docstring():
+    wrong = []
+    for path, node in public():
+        made = maker(node)
+        text = (ast.get_docstring(node) or "") + ((ast.get_docstring(made) or "") if made else "")
+        missing = [name for name in parameters(node) if not re.search(rf"\b{re.escape(name)}\b", text)]
+        wrong += [f"{path.relative_to(SOURCE)}: {node.name}: {', '.join(missing)}"] if missing else []
+    assert not wrong, "\n".join(wrong)
+
+
+def test_arrays_of_public_functions_carry_shapes():
+    shaped, bare = 0, []
+    for path, node in public():
+        made = maker(node)
+        for a in made.args.posonlyargs + made.args.args + made.args.kwonlyargs if made else []:
+            text = ast.unparse(a.annotation) if a.annotation else ""
+            if ARRAY.search(SHAPED.sub("", text)):
+                bare.append(f"{path.relative_to(SOURCE)}: {node.name}: {a.arg}: {text}")
+            elif ARRAY.search(text):
+                shaped += 1
+    assert shaped >= SHARE * (shaped + len(bare)), "\n".join(bare)
