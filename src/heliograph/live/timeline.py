@@ -88,7 +88,7 @@ class Timeline:
     def __getstate__(self) -> dict[str, object]:
         """All that is held, in double precision wherever it is read: what is compiled is no part of it."""
         stored = {name: value for name, value in vars(self).items() if name != "_player"}
-        return stored | {"_tape": to_numpy(self._history)}
+        return stored | {"_history": to_numpy(self._history)}
 
     def __setstate__(self, stored: dict[str, object]) -> None:
         vars(self).update(stored)
