@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliograph.simulation.statistics import BATCHES, ErrorStatistics
+from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")

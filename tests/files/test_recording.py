@@ -9,7 +9,7 @@ from heliograph.files.recording import (
     write_estimates,
 )
 from heliograph.files.table import write_table
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 NAN = np.nan
 TIME = [0.0, 0.5, 0.5, 2.0]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.correction import Signal
-from heliograph.filters.transform import PolynomialMoments
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.transform import PolynomialMoments
 from tests import machine
-from tests.filters.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
+from tests.filters.gaussian.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG
 from tests.oracles import cubature_fusion as oracle
 

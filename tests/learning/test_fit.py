@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.recordings import gathered
+from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.solution import Solution
-from heliograph.learning.surface import Surface
 from tests.oracles.learning_links import likelihood
 
 STEPS = 400

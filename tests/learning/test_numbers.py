@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize
 
 from heliograph.learning.intervals import bartlett, block_sums, cosines, white
-from heliograph.learning.maximise import maximise
+from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
 from heliograph.numerics.domain import POSITIVE, REAL

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
+from heliograph.learning.likelihood.transforms import from_line, link, slope, to_line, unlink
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.transforms import from_line, link, slope, to_line, unlink
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.second_moments import nominal_spread
+from heliograph.random_affine.moments.second_moments import nominal_spread
 from tests.filters.modal_problems import PLANT, SENSOR, bursts, variances
 
 Series, Stack, Modes, known = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Modes", "known"))

@@ -7,7 +7,7 @@ import pytest
 from scipy import special
 
 import heliograph as hg
-from heliograph.random_affine.push import push
+from heliograph.random_affine.moments.push import push
 
 STEPS = 6
 LOST = 2  # the step of which nothing arrives

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.filters.transform import Cubature, Linearization, PolynomialMoments
+from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
 from heliograph.numerics.angle import TURN, angles_named, continued, nearest, wrapped
 
 ANGLE = st.floats(-1e3, 1e3)

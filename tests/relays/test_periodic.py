@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.linear import linear_filter
+from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.channel import hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
 from tests.oracles import successive_relays as oracle

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from heliograph.serving.database import engine_at
-from heliograph.serving.identity import identity
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
+from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.store import Store
 from tests.postgres import Postgres
 from tests.serving import test_sharing
-from tests.serving.test_store import by_plant, journal, states
+from tests.serving.storage.test_store import by_plant, journal, states
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 pytestmark = pytest.mark.real("PostgreSQL")

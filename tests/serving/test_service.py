@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
-from heliograph.serving.in_memory_store import InMemoryStore
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
+from heliograph.serving.storage.in_memory_store import InMemoryStore
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
 READER = TypeAdapter(AnyOutput)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
@@ -11,13 +11,13 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
-from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
+from heliograph.simulation.results.statistics import BATCHES
+from heliograph.simulation.results.sums import Statistics, error_statistics
+from heliograph.simulation.runs.lanes import BLOCK, LANES
 from heliograph.simulation.simulate import monte_carlo
-from heliograph.simulation.statistics import BATCHES
-from heliograph.simulation.sums import Statistics, error_statistics
 from tests.relays.relay_problems import example, unusual
 
 pytestmark = pytest.mark.slow

@@ -12,8 +12,8 @@ pytest.importorskip("sqlalchemy")
 import nats
 from nats.js.errors import NoStreamResponseError
 
-from heliograph.serving.nats import Nats
-from heliograph.serving.url import address
+from heliograph.serving.brokers.nats import Nats
+from heliograph.serving.brokers.url import address
 from heliograph_studies.live.compute import Outcome
 from heliograph_studies.live.killed import TOPIC, _finals_read, _reads, _send, killed, left_alone
 from heliograph_studies.live.mower import read_drive

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.small_matrix import squared_distance
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.by_name import by_name, measurements_of
 from heliograph.simulation.network import Network
-from heliograph.simulation.reducer import AbstractReducer, OfStep
+from heliograph.simulation.results.by_name import by_name, measurements_of
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep
 
 
 class Errors(AbstractReducer[dict[str, PyTree]]):

@@ -20,7 +20,7 @@ from heliograph.cli.stopping import INTERRUPTED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
-from heliograph.simulation.compilation_cache import keep_compilations
+from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 

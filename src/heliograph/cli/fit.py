@@ -65,8 +65,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     from heliograph.files.recording import Recording, read_recording
     from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
-    from heliograph.learning.losses import learn_losses_of
-    from heliograph.learning.stretches import fates_of_measurements
+    from heliograph.learning.losses.losses import learn_losses_of
+    from heliograph.learning.losses.stretches import fates_of_measurements
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)

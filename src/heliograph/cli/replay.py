@@ -31,7 +31,7 @@ def replay(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import TINY, check_seed, fail, scalar
-    from heliograph.serving.replay import Link, along, lines, recorded, through
+    from heliograph.serving.brokers.replay import Link, along, lines, recorded, through
 
     if speed is not None:
         scalar("--speed", speed, TINY)

@@ -14,7 +14,7 @@ from heliograph.cli.app import place
 if TYPE_CHECKING:
     from heliograph.files.recording import Recording
     from heliograph.simulation.network import Network
-    from heliograph.simulation.record import Record
+    from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
 
 

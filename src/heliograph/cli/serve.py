@@ -45,11 +45,11 @@ def serve(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import fail
+    from heliograph.serving.brokers.url import address
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
     from heliograph.serving.running import ServiceSettings, run, store_of
-    from heliograph.serving.url import address
 
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))

@@ -14,8 +14,8 @@ import numpy as np
 
 from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.llvm.machine import target
 from heliograph.codegen.lowering import like
-from heliograph.codegen.machine import target
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.types import PyTree

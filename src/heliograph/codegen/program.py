@@ -6,7 +6,10 @@ from typing import Any, NamedTuple
 import jax
 from jax.extend.core import ClosedJaxpr
 
-from heliograph.codegen import (  # noqa: F401  (they fill the rules)
+from heliograph.codegen.graph import Buffer, Graph, Guard, Key, Loop, Node, Store
+from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
+from heliograph.codegen.memory import InMemory
+from heliograph.codegen.rules import (  # noqa: F401  (they fill the rules)
     arrived,
     branches,
     calls,
@@ -21,9 +24,6 @@ from heliograph.codegen import (  # noqa: F401  (they fill the rules)
     shapes,
     views,
 )
-from heliograph.codegen.graph import Buffer, Graph, Guard, Key, Loop, Node, Store
-from heliograph.codegen.lowering import Lowering, Value, keys_of, traced, type_of
-from heliograph.codegen.memory import InMemory
 from heliograph.numerics.types import PyTree
 
 

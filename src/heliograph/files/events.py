@@ -14,7 +14,7 @@ from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, looks_like_date
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 EXACT = 2.0**53  # up to here doubles hold every whole number
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES = "node", "sequence", "time", "arrival", "values"

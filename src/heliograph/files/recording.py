@@ -15,7 +15,7 @@ from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record, is_sound
+from heliograph.simulation.results.record import Record, is_sound
 
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 

@@ -11,8 +11,8 @@ import numpy as np
 from typing_extensions import TypeAliasType
 
 from heliograph.filters.plausibility import Judgement, judge
-from heliograph.filters.smoother_step import AbstractSmootherStep
-from heliograph.filters.smoother_steps import with_nis
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown

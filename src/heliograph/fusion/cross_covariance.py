@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.plan import Plan
+from heliograph.filters.linear.plan import Plan
 from heliograph.numerics.linalg import cholesky, symmetrize
 from heliograph.numerics.small_matrix import rounding
 from heliograph.numerics.types import Array, Float

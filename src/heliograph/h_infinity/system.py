@@ -10,7 +10,7 @@ from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fa
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import as_maps
-from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
+from heliograph.random_affine.moments.disturbance import DisturbedGain, disturbed_gain
 
 Varying = ArrayLike | OverTime  # the same at all steps, or one for each
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import norm
 
+from heliograph.learning.likelihood.predictive_density import Predictive
 from heliograph.learning.long_run import mean_and_error
-from heliograph.learning.predictive_density import Predictive
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float

@@ -9,11 +9,11 @@ from heliograph.learning.description import Description, describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
-from heliograph.learning.maximise import Maximum
-from heliograph.learning.objective import Form, objectives
-from heliograph.learning.recordings import gathered
+from heliograph.learning.likelihood.maximise import Maximum
+from heliograph.learning.likelihood.objective import Form, objectives
+from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.solution import Row, Solution
-from heliograph.learning.surface import StoppedError, Surface
 from heliograph.numerics.check import check_count, check_seed, fail, shown
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float

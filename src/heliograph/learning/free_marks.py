@@ -7,8 +7,8 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from heliograph.learning.likelihood.transforms import to_line
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.transforms import to_line
 from heliograph.numerics.check import array, fail, rank, shown
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
 from heliograph.numerics.types import ArrayLike

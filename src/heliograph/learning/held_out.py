@@ -7,14 +7,14 @@ from scipy.special import ndtr
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.learning.choice import Comparison, compared
-from heliograph.learning.predictive_density import predictive
+from heliograph.learning.likelihood.predictive_density import predictive
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.whiteness import MemoryTest, innovations_of, memory_of
+from heliograph.simulation.results.whiteness import MemoryTest, innovations_of, memory_of
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 

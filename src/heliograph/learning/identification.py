@@ -10,11 +10,11 @@ import numpy as np
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import quantile
-from heliograph.learning.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
 from heliograph.learning.routes import route_sentences
-from heliograph.learning.surface import Surface
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.readable import readable

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.learning.transforms import from_line, size, slope, to_line, unlink_slope
+from heliograph.learning.likelihood.transforms import from_line, size, slope, to_line, unlink_slope
 from heliograph.numerics.domain import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float

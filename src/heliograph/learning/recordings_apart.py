@@ -9,11 +9,11 @@ import numpy as np
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import Method, long_run, quantile, sandwich
-from heliograph.learning.maximise import Evaluated, maximise
-from heliograph.learning.objective import Evaluation, Form, Objective, objectives, one_recording
+from heliograph.learning.likelihood.maximise import Evaluated, maximise
+from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, objectives, one_recording
+from heliograph.learning.likelihood.surface import DIFFERENCE
+from heliograph.learning.likelihood.transforms import unlink
 from heliograph.learning.parameters import Parameters
-from heliograph.learning.surface import DIFFERENCE
-from heliograph.learning.transforms import unlink
 from heliograph.numerics.check import array, fail, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy

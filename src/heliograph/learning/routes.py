@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.learning.intervals import quantile
-from heliograph.learning.joint import joint_world
+from heliograph.learning.likelihood.joint import joint_world
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.small_matrix import congruence, contract
 from heliograph.numerics.types import Array
-from heliograph.random_affine.second_moments import second_order
+from heliograph.random_affine.moments.second_moments import second_order
 
 if TYPE_CHECKING:
     from heliograph.learning.solution import Solution

@@ -16,11 +16,11 @@ from heliograph.learning.intervals import (
     quantile,
     sandwich,
 )
-from heliograph.learning.objective import Form
+from heliograph.learning.likelihood.objective import Form
+from heliograph.learning.likelihood.surface import REACH, Surface
+from heliograph.learning.likelihood.transforms import link, unlink
 from heliograph.learning.parameters import Entry, Parameters
 from heliograph.learning.ridges import Rank, rank_of
-from heliograph.learning.surface import REACH, Surface
-from heliograph.learning.transforms import link, unlink
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Bool, Float
 

@@ -16,7 +16,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.moments.monomials import exponents
 
 SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
 

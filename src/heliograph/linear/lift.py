@@ -21,10 +21,10 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
-from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
-from heliograph.random_affine.second_moments import has_known_gain
 
 T = TypeVar("T")
 EPS = float(np.finfo(np.float64).eps)

@@ -23,9 +23,9 @@ from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.monomials import exponents, symmetric_power
+from heliograph.random_affine.moments.monomials import exponents, symmetric_power
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
 
 
 def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule) -> LinearSystem:

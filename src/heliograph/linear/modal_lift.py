@@ -9,7 +9,7 @@ from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.push import push, second_moments
+from heliograph.random_affine.moments.push import push, second_moments
 
 
 def lifted_modes(

@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.random_affine.monomials import exponents, position
+from heliograph.random_affine.moments.monomials import exponents, position
 
 EPS = float(np.finfo(np.float64).eps)
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
 from heliograph.live.history import History, NetworkStep, at_step, interval
 from heliograph.live.static import Static, cast
@@ -19,7 +19,7 @@ from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.gathering import Fused
+from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.judging import reasons
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters

@@ -11,7 +11,7 @@ from heliograph.live.timeline import Timeline
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.by_name import by_name
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.by_name import by_name
+from heliograph.simulation.results.record import Record
 
 
 @readable

@@ -14,7 +14,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 SENSOR, RECEIVER = "sensor", "receiver"
 

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.fed_back import FedBackFilter
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.linear.known_losses import spectral_radius
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered

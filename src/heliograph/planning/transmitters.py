@@ -24,7 +24,7 @@ from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 

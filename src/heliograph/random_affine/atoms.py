@@ -11,8 +11,8 @@ from heliograph.numerics.traced import library, placed, stacked
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.law import AbstractLaw, Constant
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import (
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import (
     count,
     degrees,
     refuse_if_too_large,

@@ -14,8 +14,8 @@ from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import monomials
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import monomials
 
 T = TypeVar("T")
 

@@ -18,8 +18,8 @@ from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import (
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import (
     count,
     exponents,
     multiply,

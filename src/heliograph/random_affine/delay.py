@@ -14,7 +14,7 @@ from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.moments import Moments
 
 Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain whose mode is the number of steps
 T = TypeVar("T")

@@ -8,7 +8,7 @@ from jaxtyping import Float, PyTree
 from heliograph.numerics.check import fail, scalar
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.moments import Moments
 
 
 class Erasure(AbstractRandomAffine):

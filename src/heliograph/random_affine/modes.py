@@ -27,8 +27,8 @@ from heliograph.random_affine.base import (
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
 from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.lift import Lift
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.lift import Lift
+from heliograph.random_affine.moments.moments import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row

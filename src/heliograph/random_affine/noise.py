@@ -15,7 +15,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
 from heliograph.numerics.types import ArrayLike
-from heliograph.random_affine.monomials import Exponents, exponents
+from heliograph.random_affine.moments.monomials import Exponents, exponents
 
 OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance
 

@@ -14,7 +14,7 @@ from heliograph.random_affine.atoms import known
 from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.erasure import Erasure
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 OUTCOME_LIMIT = 1024  # sets of losses that are listed
 

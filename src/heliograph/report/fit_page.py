@@ -12,7 +12,7 @@ from scipy.stats import binom
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
-from heliograph.learning.losses import Losses
+from heliograph.learning.losses.losses import Losses
 from heliograph.learning.solution import Row
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text

@@ -7,8 +7,8 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.record import Record
-from heliograph.simulation.whiteness import MemoryTest, memory_of, whitened_innovations
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 SURE = 2.58  # standard errors: one warning in a hundred is a false one

@@ -14,7 +14,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
 MOST = 8  # nodes, filters and links that are drawn; tables and summary hold all

@@ -18,9 +18,9 @@ from heliograph.numerics.check import fail, instance
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.types import Float, PyTree
 from heliograph.serving.flat import Flat, flat_like, row_of
-from heliograph.simulation.by_name import by_name
 from heliograph.simulation.judging import implausible
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.stepping import AllFilters
 
 TOGETHER = 16  # lanes of one turn of the loop: they fill the vectors of a processor

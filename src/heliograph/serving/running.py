@@ -11,18 +11,18 @@ from pathlib import Path
 from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.broker import connected
+from heliograph.serving.brokers.broker import connected
+from heliograph.serving.brokers.partition import Part
+from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.identity import identity
-from heliograph.serving.in_memory_store import InMemoryStore
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
-from heliograph.serving.partition import Part
-from heliograph.serving.pipe import Pipe
 from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
-from heliograph.serving.store_protocol import Damage, StoreProtocol
-from heliograph.serving.url import Address
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store_protocol import Damage, StoreProtocol
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing
@@ -126,7 +126,7 @@ def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Where the state is kept, with what it begins from."""
     if settings.store is None:
         return InMemoryStore()
-    from heliograph.serving.store import Store
+    from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)
     store = Store(settings.store, mine, settings.process)
@@ -157,9 +157,9 @@ def _say(what: str) -> None:
 
 async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: int) -> None:
     """One process of several: the parts that it leases."""
-    from heliograph.serving.database import engine_at
-    from heliograph.serving.leases import Leases
-    from heliograph.serving.store import Store
+    from heliograph.serving.storage.database import engine_at
+    from heliograph.serving.storage.leases import Leases
+    from heliograph.serving.storage.store import Store
 
     place, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked

@@ -15,8 +15,8 @@ from heliograph.serving.json_lines import Teller, line
 from heliograph.serving.message import Message, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
-from heliograph.serving.plant_codec import plant_bytes, plant_from
-from heliograph.serving.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
+from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
+from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
 ROWS = 200_000  # that are held in memory before plants which were not heard for long leave it for the store

@@ -6,9 +6,9 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Protocol
 
+from heliograph.serving.brokers.retry import LOG
+from heliograph.serving.brokers.transport import TakenOverError
 from heliograph.serving.loop import signals
-from heliograph.serving.retry import LOG
-from heliograph.serving.transport import TakenOverError
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 

@@ -7,7 +7,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.random_affine.delay import Delayed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 Arrival = tuple[str, int, float, np.ndarray, float]  # node, sequence, time, values, arrival
 

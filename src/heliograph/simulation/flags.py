@@ -5,8 +5,8 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.mode_observed import ModeObservedFilter
-from heliograph.filters.side_information import SideInformationFilter
+from heliograph.filters.modes.mode_observed import ModeObservedFilter
+from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine

@@ -8,9 +8,9 @@ import numpy as np
 
 from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
 from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.centres.uplinks import Drawn
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.uplinks import Drawn
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and what is found
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from heliograph.filters.fed_back import FedBackFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.schedule import Schedule
@@ -24,7 +24,7 @@ from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
-from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
+from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
 

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.fed_back import FedBackFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import first

@@ -15,13 +15,13 @@ from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.simulation.arguments import inputs_of, measurement_of
+from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.uplinks import Drawn, SentReports
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with

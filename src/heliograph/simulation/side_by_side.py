@@ -10,7 +10,7 @@ from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, Reason
-from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.module import Module
 

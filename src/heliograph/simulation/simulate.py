@@ -16,13 +16,13 @@ from heliograph.numerics.forked import check_process
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import ArrayLike
 from heliograph.simulation.arguments import inputs_of, key_of
-from heliograph.simulation.by_run import trajectories
-from heliograph.simulation.lanes import BLOCK, Lanes, one_processor
 from heliograph.simulation.medium import medium_of
-from heliograph.simulation.native_runs import natively
 from heliograph.simulation.network import Network, lowered
-from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.reducer import AbstractReducer, Result, Trajectories
+from heliograph.simulation.runs.by_run import trajectories
+from heliograph.simulation.runs.lanes import BLOCK, Lanes, one_processor
+from heliograph.simulation.runs.native_runs import natively
 from heliograph.simulation.smoothed import Smoother, WithSmoothed, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World

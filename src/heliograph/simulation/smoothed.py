@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
@@ -19,11 +19,11 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.by_run import each_run
-from heliograph.simulation.gathering import Fused
+from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
-from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
+from heliograph.simulation.runs.by_run import each_run
 from heliograph.simulation.stepping import AllFilters
 from heliograph.smoothing.consistency import nis_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing

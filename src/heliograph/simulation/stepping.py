@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plan import Plan
+from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
@@ -22,17 +22,17 @@ from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
-from heliograph.simulation.centre import (
+from heliograph.simulation.centres.centre import (
     Centre,
     CentreState,
 )
-from heliograph.simulation.fusion_centre import CentreFilter
-from heliograph.simulation.gathering import Fused, Reporting, centres_of, fusions_of, gathering
-from heliograph.simulation.linearised import Followed, LinearisedCentre
+from heliograph.simulation.centres.fusion_centre import CentreFilter
+from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
+from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
+from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Listener, Node
 from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
-from heliograph.simulation.uplinks import Drawn, uplinks_of
 from heliograph.smoothing.sweep import planned_with_past
 
 

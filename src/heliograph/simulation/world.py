@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from heliograph.codegen.arrived import arrived
+from heliograph.codegen.rules.arrived import arrived
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant

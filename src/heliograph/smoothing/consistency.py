@@ -6,7 +6,7 @@ from itertools import pairwise
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.smoother_step import AbstractSmootherStep
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 

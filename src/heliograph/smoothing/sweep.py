@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.smoother_step import AbstractSmootherStep, Moments, Point
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_count, instance
 from heliograph.numerics.float64 import compiled

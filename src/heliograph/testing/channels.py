@@ -9,7 +9,7 @@ from scipy import stats
 
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.monomials import monomials
+from heliograph.random_affine.moments.monomials import monomials
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
 

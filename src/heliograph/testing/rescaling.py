@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.centre import Centre
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.linear import LinearFilter
-from heliograph.filters.mixture import Components, MixtureFilter
-from heliograph.filters.modal import ModalFilter, ObservationModel
-from heliograph.filters.multiple_model import MultipleModelFilter
-from heliograph.filters.open_loop import OpenLoop
-from heliograph.filters.polynomial import PolynomialFilter
-from heliograph.filters.prediction import PredictionFilter
-from heliograph.filters.scheduled import LinearSystemFilter
-from heliograph.filters.sequential import SequentialFilter
-from heliograph.filters.side_information import SideInformation, SideInformationFilter
-from heliograph.filters.uncertain import UncertainModalFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.linear.centre import Centre
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.linear.open_loop import OpenLoop
+from heliograph.filters.linear.polynomial import PolynomialFilter
+from heliograph.filters.linear.scheduled import LinearSystemFilter
+from heliograph.filters.modes.mixture import Components, MixtureFilter
+from heliograph.filters.modes.modal import ModalFilter, ObservationModel
+from heliograph.filters.modes.multiple_model import MultipleModelFilter
+from heliograph.filters.modes.side_information import SideInformation, SideInformationFilter
+from heliograph.filters.modes.uncertain import UncertainModalFilter
+from heliograph.filters.wrappers.prediction import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
@@ -29,9 +29,9 @@ from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.moments.monomials import exponents
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
 
 Modes = TypeVar("Modes", SideInformation, ObservationModel)  # a channel at one step, mode by mode
 

@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.linear import LinearFilter
-from heliograph.filters.prediction import PredictionFilter
-from heliograph.filters.sequential import SequentialFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.wrappers.prediction import PredictionFilter
 from heliograph.fusion.informed import ScalarWeights
 from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
 from heliograph.model.channel import Channel
@@ -18,7 +18,7 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, second_order
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
 from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node

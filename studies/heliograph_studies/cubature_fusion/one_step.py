@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.transform import AbstractTransform
+from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.numerics.float64 import compiled, to_numpy
 from heliograph_studies.cubature_fusion.setting import OUTPUTS, Scenario, Transition, transition
 

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian import cubature_filter
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.channel import hop, perfect
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import AbstractRandomAffine, apply
-from heliograph.random_affine.second_moments import second_order
+from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run

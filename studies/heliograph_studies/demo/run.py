@@ -16,7 +16,7 @@ from heliograph.files.table import write_table
 from heliograph.numerics.check import check_seed
 from heliograph.report.progress import Advance
 from heliograph.report.results import Json, Results, write_results
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, compute, table_rows
 from heliograph_studies.demo.learned import learn, learned_line, learned_summary

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.filters.gaussian import cubature_filter
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.centred import centred
 from heliograph.model.channel import amplify_and_forward, hop, parallel
 from heliograph.numerics.check import fail

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.prediction import prediction_of
+from heliograph.filters.wrappers.prediction import prediction_of
 from heliograph_studies.h_infinity_fusion import structured
 from heliograph_studies.h_infinity_fusion.example import mean_and_error
 from heliograph_studies.h_infinity_fusion.levels import without_gain

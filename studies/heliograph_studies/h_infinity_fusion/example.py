@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.prediction import prediction_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.wrappers.prediction import prediction_of
 from heliograph.fusion.quantizer import Quantizer
 from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting
 from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer

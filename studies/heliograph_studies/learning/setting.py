@@ -6,7 +6,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.learning.intervals import Method
-from heliograph.learning.objective import Form
+from heliograph.learning.likelihood.objective import Form
 
 MEAN, VARIANCE = 0.8, 0.16
 PLANT_NOISE, SENSOR_NOISE, HOP_NOISE, DIRECT_NOISE = 0.2, 0.3, 0.3, 0.2

@@ -11,11 +11,11 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.identity import identity
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Link
-from heliograph.serving.plant_codec import plant_from
-from heliograph.serving.store import Store
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.plant_codec import plant_from
+from heliograph.serving.storage.store import Store
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, killed, left_alone
 from heliograph_studies.live.mower import PLANT, network, read_drive
 from heliograph_studies.live.server import Server

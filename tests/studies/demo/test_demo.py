@@ -9,7 +9,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.files.recording import read_recording as read_measurements
-from heliograph.learning import describe, surface
+from heliograph.learning import describe
+from heliograph.learning.likelihood import surface
 from heliograph.model.estimate import Estimate
 from heliograph_studies.demo import compute as compute_module
 from heliograph_studies.demo import robot, run
