@@ -21,37 +21,37 @@ Sent = dict[str, Any]
 
 def stained(good: list[Sent], share: float, rng: np.random.Generator) -> tuple[list[Sent], int]:
     """The messages with absurd ones in between: of the same node, with inputs or without, or inputs alone."""
-    found: list[Sent] = []
-    for one in good:
+    results: list[Sent] = []
+    for item in good:
         if rng.random() < share:
-            bad = {k: v for k, v in one.items() if k != "inputs"}
-            bad |= {"sequence": one["sequence"] + 1_000_000, "values": [float(rng.choice(VALUES))]}
+            bad = {k: v for k, v in item.items() if k != "inputs"}
+            bad |= {"sequence": item["sequence"] + 1_000_000, "values": [float(rng.choice(VALUES))]}
             kind = rng.integers(3)
             if kind == 1:
                 bad["inputs"] = [float(rng.choice(VALUES[1:]))]
             elif kind == 2:
                 bad |= {"node": "inputs", "values": [float(rng.choice(VALUES[1:]))]}
-            found.append(bad)
-        found.append(one)
-    return found, len(found) - len(good)
+            results.append(bad)
+        results.append(item)
+    return results, len(results) - len(good)
 
 
 def finals(network: Any, sent: list[Sent], batch: int) -> tuple[list[bytes], Counter[str], float]:
     """Final estimates without their numbers, refusals by reason, and seconds."""
-    from heliograph.serving import Fleet, Lanes, Nowhere, Options, Service
+    from heliograph.serving import Fleet, InMemoryStore, Lanes, Options, Service
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), Nowhere())
-    told: list[bytes] = []
+    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
+    known: list[bytes] = []
     refused: Counter[str] = Counter()
     begun = time.perf_counter()
     parts = [sent[i : i + batch] for i in range(0, len(sent), batch)]
     for outputs in (
-        *(service.take([json.dumps(one).encode() for one in part]) for part in parts),
+        *(service.take([json.dumps(item).encode() for item in part]) for part in parts),
         service.finish(True),
     ):
-        told += [one.body.partition(b",")[2] for one in outputs if one.kind == "final"]
-        refused.update(json.loads(one.body)["reason"] for one in outputs if one.kind == "refused")
-    return sorted(told), refused, time.perf_counter() - begun
+        known += [output.body.partition(b",")[2] for output in outputs if output.kind == "final"]
+        refused.update(json.loads(output.body)["reason"] for output in outputs if output.kind == "refused")
+    return sorted(known), refused, time.perf_counter() - begun
 
 
 def main(messages: int) -> None:
@@ -61,9 +61,9 @@ def main(messages: int) -> None:
     for name, network, whole in (("steps", worlds.stepping(), True), ("seconds", worlds.moving(), False)):
         good = worlds.messages(PLANTS, messages // PLANTS, SEED, whole)
         bad, count = stained(good, SHARE, np.random.default_rng(SEED))
-        wanted, _, clean = finals(network, good, BATCH)
+        expected, _, clean = finals(network, good, BATCH)
         got, refused, took = finals(network, bad, BATCH)
-        assert got == wanted, "final estimates: expected those of a service that never received absurd messages"
+        assert got == expected, "final estimates: expected those of a service that never received absurd messages"
         print(f"{name}: {len(good):,} messages and {count:,} absurd ones, {dict(refused)}; {len(got):,} final "
               f"estimates the same; {took:.1f} s, without them {clean:.1f} s", flush=True)  # fmt: skip
 

@@ -261,11 +261,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--header", type=Path, help="a copy of tinyekf.h to be timed instead of the re-statement")
     chosen = parser.parse_args().header
-    found = measure(chosen)
-    ratio = found["by hand, dense"] / found["exported"]
+    result = measure(chosen)
+    ratio = result["by hand, dense"] / result["exported"]
     title = "a re-statement of TinyEKF by hand" if chosen is None else f"TinyEKF ({chosen.name})"
-    print(f"exported: {found['exported']:.0f} ns a step, {found['operations']:.0f} operations")
-    print(f"{title}: {found['by hand, dense']:.0f} ns a step, {ratio:.2f} times ours")
+    print(f"exported: {result['exported']:.0f} ns a step, {result['operations']:.0f} operations")
+    print(f"{title}: {result['by hand, dense']:.0f} ns a step, {ratio:.2f} times ours")
 
 
 if __name__ == "__main__":

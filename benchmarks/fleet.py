@@ -22,12 +22,12 @@ from timeline import readme_network
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.message import read_message
-from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store import Store
 
-PLANTS, EACH, BATCH, SPACING, WINDOW, ROUNDS = 1000, 60, 8192, 0.5, 5.0, 3
+PLANTS, STEPS, BATCH, SPACING, WINDOW, ROUNDS = 1000, 60, 8192, 0.5, 5.0, 3
 LIMIT = 20.0  # 50,000 steps a second, on two processors
 
 
@@ -41,13 +41,13 @@ class Taken(NamedTuple):
 
 def lines(plants: int) -> list[bytes]:
     """Messages of all plants in turn, in order."""
-    z = np.random.default_rng(0).normal(5.0, 1.0, (EACH, plants, 2)).tolist()
-    found = []
-    for i in range(EACH):
+    z = np.random.default_rng(0).normal(5.0, 1.0, (STEPS, plants, 2)).tolist()
+    results = []
+    for i in range(STEPS):
         for plant in range(plants):
-            one = {"plant": f"p{plant}", "node": "cart", "sequence": i, "time": SPACING * i, "values": z[i][plant]}
-            found.append(json.dumps(one).encode())
-    return found
+            item = {"plant": f"p{plant}", "node": "cart", "sequence": i, "time": SPACING * i, "values": z[i][plant]}
+            results.append(json.dumps(item).encode())
+    return results
 
 
 def rounds(plants: int, stored: bool) -> Taken:
@@ -56,19 +56,19 @@ def rounds(plants: int, stored: bool) -> Taken:
         warnings.simplefilter("ignore")
         lanes = Lanes(readme_network())
     sent = lines(plants)
-    Service(Fleet(lanes, Options(WINDOW)), Nowhere()).take(sent[:1])  # compiled
-    found = []
+    Service(Fleet(lanes, Options(WINDOW)), InMemoryStore()).take(sent[:1])  # compiled
+    results = []
     for _ in range(ROUNDS):
         with tempfile.TemporaryDirectory(dir=Path(__file__).parent) as folder:  # on a disk, not in memory
             fleet = Fleet(lanes, Options(WINDOW))
-            service = Service(fleet, Store(f"{folder}/fleet.db", identity(fleet)) if stored else Nowhere())
+            service = Service(fleet, Store(f"{folder}/fleet.db", identity(fleet)) if stored else InMemoryStore())
             begun, worked, committed = time.perf_counter(), time.process_time(), 0.0
             for begin in range(0, len(sent), BATCH):
                 service.take(sent[begin : begin + BATCH])
                 committed += service.last.committed
-            found.append(Taken(time.process_time() - worked, time.perf_counter() - begun, committed))
+            results.append(Taken(time.process_time() - worked, time.perf_counter() - begun, committed))
             service.store.close()
-    return Taken(*map(min, zip(*found, strict=True)))
+    return Taken(*map(min, zip(*results, strict=True)))
 
 
 def half(_: int) -> float:
@@ -82,13 +82,13 @@ def least(function: Callable[[], object]) -> float:
     for _ in range(ROUNDS):
         begun = time.perf_counter()
         function()
-        taken.append((time.perf_counter() - begun) * 1e6 / (PLANTS * EACH))
+        taken.append((time.perf_counter() - begun) * 1e6 / (PLANTS * STEPS))
     return min(taken)
 
 
 def measure() -> dict[str, Any]:
     """A step in microseconds, and where its time goes."""
-    count = PLANTS * EACH
+    count = PLANTS * STEPS
     memory, stored = rounds(PLANTS, False), rounds(PLANTS, True)
     sent = lines(PLANTS)
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:

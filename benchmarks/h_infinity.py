@@ -32,13 +32,13 @@ def recursion() -> tuple[float, float]:
     """First and median solve of the steps of a recursive design."""
     from heliograph.h_infinity.solver import StepProblem
 
-    found: list[float] = []
+    results: list[float] = []
     solve = StepProblem.solve
 
     def timed(self: StepProblem, fixed: np.ndarray) -> object:
         start = time.perf_counter()
         result = solve(self, fixed)
-        found.append(1e3 * (time.perf_counter() - start))
+        results.append(1e3 * (time.perf_counter() - start))
         return result
 
     StepProblem.solve = timed
@@ -47,7 +47,7 @@ def recursion() -> tuple[float, float]:
             hg.h_infinity.recursive_design(system(), 1.8, 10 * np.eye(4))
     finally:
         StepProblem.solve = solve
-    return found[0], float(np.median([t for i, t in enumerate(found) if i % 16]))
+    return results[0], float(np.median([t for i, t in enumerate(results) if i % 16]))
 
 
 def measure() -> dict[str, Any]:

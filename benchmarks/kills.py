@@ -20,11 +20,11 @@ from typing import Any
 
 from heliograph.files.network_file import load_network
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.kept import plant_bytes, plant_from
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
+from heliograph.serving.storage.store import Store
 
 NETWORK = """
 import jax.numpy as jnp
@@ -34,23 +34,23 @@ sensor, hop = hg.LinearSensor([[1.0]], 0.1), hg.hop(hg.Discrete([0.6, 1.2], [0.5
 node = hg.Node(sensor, hop, {"cubature": hg.cubature_filter(plant, sensor, hop)})
 network = hg.Network(plant, {"a": node, "b": node})
 """
-PLANTS, EACH, WINDOW, LATEST = 5, 400, 5.0, 3.0
+PLANTS, STEPS, WINDOW, LATEST = 5, 400, 5.0, 3.0
 PART = 40  # lines that are written at once
 PAUSE = 0.01  # seconds between
 
 
 def messages(seed: int) -> list[bytes]:
     """Of each plant, a third late, some twice, in the order of their arrival."""
-    chance, found = random.Random(seed), []
+    chance, results = random.Random(seed), []
     for plant in range(PLANTS):
-        for i in range(EACH):
+        for i in range(STEPS):
             time = 0.4 * i + chance.uniform(0, 0.3)
-            one = {"plant": f"p{plant}", "node": "ab"[i % 2], "sequence": i // 2, "time": time,
+            item = {"plant": f"p{plant}", "node": "ab"[i % 2], "sequence": i // 2, "time": time,
                    "values": [chance.gauss(1, 0.5)],
                    "arrival": time + (chance.uniform(0, LATEST) if chance.random() < 1 / 3 else 0.0)}  # fmt: skip
-            one |= {"inputs": [chance.gauss(0, 0.1)]} if i % 6 == 0 else {}
-            found += [one] * (2 if chance.random() < 0.1 else 1)
-    return [json.dumps(one).encode() + b"\n" for one in sorted(found, key=lambda one: one["arrival"])]
+            item |= {"inputs": [chance.gauss(0, 0.1)]} if i % 6 == 0 else {}
+            results += [item] * (2 if chance.random() < 0.1 else 1)
+    return [json.dumps(item).encode() + b"\n" for item in sorted(results, key=lambda item: item["arrival"])]
 
 
 class Running:
@@ -60,7 +60,7 @@ class Running:
         options = "--store", str(store), "--window", str(WINDOW)
         command = [sys.executable, "-m", "heliograph", "serve", str(network), *options]
         self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-        self.told: list[dict[str, Any]] = []
+        self.known: list[dict[str, Any]] = []
         self._reader = Thread(target=self._read)
         self._reader.start()
 
@@ -68,7 +68,7 @@ class Running:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.endswith(b"\n"):  # a line that the kill cut is told again
-                self.told.append(json.loads(line))
+                self.known.append(json.loads(line))
 
     def write(self, lines: list[bytes]) -> None:
         """Send these, a part at a time, and then the end; until it no longer listens."""
@@ -98,26 +98,26 @@ def killed(count: int, seed: int, folder: Path) -> dict[str, Any]:
     chance, sent = random.Random(seed), messages(seed)
     network, store = folder / "network.py", folder / "killed.db"
     network.write_text(NETWORK)
-    told, differently = dict[int, dict[str, Any]](), 0
+    known, differently = dict[int, dict[str, Any]](), 0
     for kill in range(count + 1):
         running = Running(network, store)
         writer = Thread(target=running.write, args=(sent,))
         writer.start()
         if kill < count:
-            while not running.told and running.process.poll() is None:  # before the first answer nothing can be lost
+            while not running.known and running.process.poll() is None:  # before the first answer nothing can be lost
                 sleep(PAUSE)
             sleep(chance.uniform(0, PAUSE * len(sent) / PART))
             running.process.send_signal(signal.SIGKILL)
         writer.join()
         code = running.end()
-        for one in running.told:
-            if "id" in one:
-                differently += told.setdefault(one["id"], one) != one
-    found = compared(network, store, sent, told)
-    return {"kills": count, "messages": len(sent), "exit_code": code, "told_differently": differently, **found}
+        for item in running.known:
+            if "id" in item:
+                differently += known.setdefault(item["id"], item) != item
+    outcome = compared(network, store, sent, known)
+    return {"kills": count, "messages": len(sent), "exit_code": code, "told_differently": differently, **outcome}
 
 
-def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict[str, Any]]) -> dict[str, Any]:
+def compared(network: Path, store: Path, sent: list[bytes], known: dict[int, dict[str, Any]]) -> dict[str, Any]:
     """The store against that of a service that was never disturbed, and what was read against the journal."""
     fleet = Fleet(Lanes(load_network(str(network))), Options(WINDOW))
     mine = identity(fleet)
@@ -126,12 +126,12 @@ def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict
     names, both = [f"p{i}" for i in range(PLANTS)], []
     for place in (calm.store, Store(str(store), mine)):
         assert isinstance(place, Store)
-        plants = {name: plant_from(name, kept.body, fleet) for name, kept in place.load(names).items()}
+        plants = {name: plant_from(name, item.body, fleet) for name, item in place.load(names).items()}
         for plant in plants.values():
             plant.links = {}  # what came again was counted
-        rows = {each.number: json.loads(each.body) for each in place.entries()}
+        rows = {entry.number: json.loads(entry.body) for entry in place.entries()}
         finals = sorted(
-            (one["plant"], one["time"], one["estimates"]) for one in rows.values() if one["kind"] == "final"
+            (row["plant"], row["time"], row["estimates"]) for row in rows.values() if row["kind"] == "final"
         )
         place.close()
         both.append(({name: plant_bytes(plant, fleet) for name, plant in plants.items()}, finals))
@@ -142,17 +142,17 @@ def compared(network: Path, store: Path, sent: list[bytes], told: dict[int, dict
         "finals": len(finals),
         "finals_identical": finals == killed_finals,
         "counted_twice": len(moments) - len(set(moments)),
-        "lost": sum(number not in told for number in rows),
-        "told_and_not_kept": sum(rows.get(number) != one for number, one in told.items()),
+        "lost": sum(number not in known for number in rows),
+        "told_and_not_kept": sum(rows.get(number) != item for number, item in known.items()),
     }
 
 
-def sound(found: dict[str, Any]) -> bool:
+def sound(outcome: dict[str, Any]) -> bool:
     """Whether nothing changed."""
     clean = all(
-        found[name] == 0 for name in ("exit_code", "told_differently", "counted_twice", "lost", "told_and_not_kept")
+        outcome[name] == 0 for name in ("exit_code", "told_differently", "counted_twice", "lost", "told_and_not_kept")
     )
-    return clean and found["states_identical"] and found["finals_identical"] and found["finals"] > 0
+    return clean and outcome["states_identical"] and outcome["finals_identical"] and outcome["finals"] > 0
 
 
 if __name__ == "__main__":

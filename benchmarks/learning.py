@@ -45,7 +45,7 @@ def free() -> hg.Network:
 
 def theirs(z: np.ndarray) -> dict[str, dict[str, Any]]:
     """What each peer finds of those whose environment can be made."""
-    found: dict[str, dict[str, Any]] = {}
+    results: dict[str, dict[str, Any]] = {}
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "recording.npz"
         np.savez(file, z=z, point=POINT)
@@ -57,8 +57,8 @@ def theirs(z: np.ndarray) -> dict[str, dict[str, Any]]:
                 continue
             command = [python, FOLDER / program, file]
             said = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout
-            found[name] = json.loads(said.splitlines()[-1])
-    return found
+            results[name] = json.loads(said.splitlines()[-1])
+    return results
 
 
 def ours(z: np.ndarray) -> dict[str, Any]:
@@ -68,11 +68,11 @@ def ours(z: np.ndarray) -> dict[str, Any]:
     whole, alone = [], []
     for _ in range(1 + CALLS):
         began = time.process_time()
-        found = hg.fit(free, z, starts=1)
+        fitted = hg.fit(free, z, starts=1)
         alone.append(time.process_time() - began)
-        rows = found.rows()
+        rows = fitted.rows()
         whole.append(time.process_time() - began)
-    top, at_point = found.log_likelihood["linear"], float(hg.log_likelihood(item, z))
+    top, at_point = fitted.log_likelihood["linear"], float(hg.log_likelihood(item, z))
     estimates = [row.estimate for row in rows]
     return {
         "at_point": at_point,

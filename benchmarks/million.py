@@ -42,7 +42,7 @@ def measure(runs: int, precision: str) -> dict[str, Any]:
             estimate = time.perf_counter() - begun + left
 
     with hg.show_progress() as shown:
-        found = hg.monte_carlo(
+        record = hg.monte_carlo(
             strong(),
             STRONG.horizon,
             runs,
@@ -52,7 +52,7 @@ def measure(runs: int, precision: str) -> dict[str, Any]:
             precision="float32" if precision == "float32" else "float64",
             progress=lambda done, total: (shown(done, total), progressed(done, total))[0],
         )
-    rmse = {node: found[node][FUSED if node == "fused" else FILTER].rmse() for node in found}
+    rmse = {node: record[node][FUSED if node == "fused" else FILTER].rmse() for node in record}
     return {
         "precision": precision,
         "runs": runs,
@@ -61,7 +61,7 @@ def measure(runs: int, precision: str) -> dict[str, Any]:
         "peak memory in MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "rmse": {node: value for node, (value, _) in rmse.items()},
         "rmse standard error": {node: error for node, (_, error) in rmse.items()},
-        "nees per dimension of node 1": found["1"][FILTER].nees_per_dimension()[0],
+        "nees per dimension of node 1": record["1"][FILTER].nees_per_dimension()[0],
     }
 
 

@@ -46,14 +46,14 @@ print(json.dumps([first, 1e9 * warm / (nodes * steps * runs) if runs else None])
 """
 
 
-def one(nodes: int, runs: int, cache: str = "", erased: bool = False, source: str | None = None) -> list[float]:
+def single(nodes: int, runs: int, cache: str = "", erased: bool = False, source: str | None = None) -> list[float]:
     """Seconds of the first call, and nanoseconds per node, step and run of later ones with so many runs (0: none)."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     if source is not None:
         environment["PYTHONPATH"] = source
     command = [sys.executable, "-c", PROGRAM, str(nodes), str(runs), "erased" if erased else "whole", cache]
-    found = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True)
-    result: list[float] = json.loads(found.stdout.splitlines()[-1])
+    completed = subprocess.run(command, check=True, env=environment, stdout=subprocess.PIPE, text=True)
+    result: list[float] = json.loads(completed.stdout.splitlines()[-1])
     return result
 
 
@@ -62,9 +62,9 @@ def measure(old: str | None = None) -> dict[str, Any]:
     first, again, step = {}, {}, {}
     for nodes in NODES:
         with tempfile.TemporaryDirectory() as folder:
-            first[str(nodes)], step[str(nodes)] = one(nodes, max(20_000 * 4 // nodes, 64), folder)
-            again[str(nodes)] = one(nodes, 0, folder)[0]
-    erased = one(4, 20_000, erased=True)[1]
+            first[str(nodes)], step[str(nodes)] = single(nodes, max(20_000 * 4 // nodes, 64), folder)
+            again[str(nodes)] = single(nodes, 0, folder)[0]
+    erased = single(4, 20_000, erased=True)[1]
     values = {f"first call, {n} nodes (s)": value for n, value in first.items()}
     values |= {f"again, {n} nodes (s)": value for n, value in again.items()}
     values |= {f"{n} nodes (ns per node, step, run)": value for n, value in step.items()}
@@ -76,15 +76,15 @@ def measure(old: str | None = None) -> dict[str, Any]:
         "4 nodes (ns per node, step, run)": STEP,
         "4 nodes, erased (ns per node, step, run)": STEP_ERASED,
     }
-    found = {"unit": "see each", "values": values, "at_most": at_most, "first_call_s": first, "again_s": again}
-    found |= {"ns_per_node_step_run": step, "ns_per_node_step_run_erased": {"4": erased}}
+    results = {"unit": "see each", "values": values, "at_most": at_most, "first_call_s": first, "again_s": again}
+    results |= {"ns_per_node_step_run": step, "ns_per_node_step_run_erased": {"4": erased}}
     if old is not None:
-        measured = {str(n): one(n, 20_000 if n == 4 else 0, source=old) for n in NODES[:2]}
-        found["old_release"] = {
+        measured = {str(n): single(n, 20_000 if n == 4 else 0, source=old) for n in NODES[:2]}
+        results["old_release"] = {
             "first_call_s": {n: times[0] for n, times in measured.items()},
             "ns_per_node_step_run": {"4": measured["4"][1]},
         }
-    return found
+    return results
 
 
 def main() -> None:

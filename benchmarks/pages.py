@@ -34,11 +34,11 @@ def whole(*values: float) -> tuple[str, ...]:
 
 def readme(measured: dict[str, Any]) -> list[Place]:
     """The table beside the best peers."""
-    found = {
-        name: (each["ours"]["best"], {title: peer["best"] for title, peer in each["peers"].items()})
-        for name, each in measured["comparisons"].items()
+    results = {
+        name: (item["ours"]["best"], {title: peer["best"] for title, peer in item["peers"].items()})
+        for name, item in measured["comparisons"].items()
     }
-    kalman, cubature, modes, smoothing = (found[name] for name in ("kalman", "cubature", "modes", "smoothing"))
+    kalman, cubature, modes, smoothing = (results[name] for name in ("kalman", "cubature", "modes", "smoothing"))
     design = measured["alone"]["network_design"]["values"]["two hops, 20 sensors, 30 starts"] / 1000
     return [
         Place("with a bound on what is missing | no package has it | {} s |", (f"{design:.2f}",)),
@@ -131,10 +131,10 @@ def places(measured: dict[str, Any]) -> dict[str, list[Place]]:
 def rows(measured: dict[str, Any]) -> str:
     """The table of docs/comparisons.md: a row for each peer."""
     return "".join(
-        f"| {each['title']} | {digits(each['ours']['best'])} | {title} ({peer['how']}) "
+        f"| {item['title']} | {digits(item['ours']['best'])} | {title} ({peer['how']}) "
         f"| {digits(peer['best'])} | {digits(peer['ratio'])} |\n"
-        for each in measured["comparisons"].values()
-        for title, peer in each["peers"].items()
+        for item in measured["comparisons"].values()
+        for title, peer in item["peers"].items()
     )
 
 
@@ -145,15 +145,15 @@ def with_figures(text: str, place: Place) -> str:
         ValueError: the sentence does not stand there once.
     """
     pattern = FIGURE.join(map(re.escape, place.sentence.split("{}")))
-    found, times = re.subn(pattern, lambda _: place.sentence.format(*place.figures), text)
+    result, times = re.subn(pattern, lambda _: place.sentence.format(*place.figures), text)
     if times != 1:
         raise ValueError(f"expected once in the page, got {times} times: {place.sentence}")
-    return found
+    return result
 
 
 def written(measured: dict[str, Any]) -> dict[str, str]:
     """All pages as they should be, by their path from the root."""
-    absent = [title for each in measured["comparisons"].values() for title, p in each["peers"].items() if "absent" in p]
+    absent = [title for item in measured["comparisons"].values() for title, p in item["peers"].items() if "absent" in p]
     if absent:
         raise ValueError(f"results.json: expected every peer, got none of {', '.join(absent)}")
     pages = {}
@@ -162,7 +162,7 @@ def written(measured: dict[str, Any]) -> dict[str, str]:
         for place in here:
             text = with_figures(text, place)
         pages[page] = text
-    pages["docs/comparisons.md"] = TABLE.sub(lambda found: found[1] + rows(measured), pages["docs/comparisons.md"])
+    pages["docs/comparisons.md"] = TABLE.sub(lambda result: result[1] + rows(measured), pages["docs/comparisons.md"])
     return pages
 
 

@@ -19,7 +19,7 @@ import numpy as np
 import heliograph as hg
 from heliograph.linear.recursion import covariance_step
 from heliograph.linear.system import Steps
-from heliograph.random_affine.monomials import position
+from heliograph.random_affine.moments.monomials import position
 
 DIMENSIONS = (4, 8, 16)
 REPEATS = 7

@@ -41,7 +41,7 @@ ALONE = (
     "startup", "stream", "timeline", "nodes", "h_infinity", "quadratic", "successive_relays", "cubature_fusion",
     "links_with_memory", "fleet", "network_design",
 )  # fmt: skip
-BESIDE = ("learning",)  # like those alone, but they ask peers of their own
+WITH_PEERS = ("learning",)  # like those alone, but they ask peers of their own
 
 
 class Program(NamedTuple):
@@ -111,13 +111,13 @@ def compare(item: Comparison, rates: dict[str, Any], with_peers: bool, old: str 
     problem = item.problem()
     runs, steps = problem.arrays["z"].shape[:2]
     other = None if old is None else earlier(item.ours, Path(old))
-    asked = (item.ours, *item.peers) if other is None else (item.ours, other, *item.peers)
-    found = {program: interpreter(program, with_peers) for program in asked}
-    running = together(problem, {program: python for program, python in found.items() if isinstance(python, Path)})
+    requested = (item.ours, *item.peers) if other is None else (item.ours, other, *item.peers)
+    results = {program: interpreter(program, with_peers) for program in requested}
+    running = together(problem, {program: python for program, python in results.items() if isinstance(python, Path)})
     ours = running[item.ours].result()
     floor = {"arithmetic": problem.flops / rates["gflops"], "memory": problem.bytes / rates["gbytes"]}
     peers = {
-        peer.title: judged(peer, running[peer], running[item.ours]) if peer in running else {"absent": found[peer]}
+        peer.title: judged(peer, running[peer], running[item.ours]) if peer in running else {"absent": results[peer]}
         for peer in item.peers
     }
     result: dict[str, Any] = {
@@ -138,11 +138,11 @@ def compared(its: Running, ours: Running) -> dict[str, Any]:
 
     The latter is the median over the passes: what the machine does beside them slows both of a pair.
     """
-    found, own = its.result(), ours.result()
+    result, local = its.result(), ours.result()
     ratios = np.divide(ours.times, its.times)
     return {
-        "best": found["best"], "median": found["median"], "difference": difference(its, ours),
-        "ours over it": round(own["best"] / found["best"], 3), "in turn": round(float(np.median(ratios)), 3),
+        "best": result["best"], "median": result["median"], "difference": difference(its, ours),
+        "ours over it": round(local["best"] / result["best"], 3), "in turn": round(float(np.median(ratios)), 3),
     }  # fmt: skip
 
 
@@ -203,8 +203,8 @@ def judged(peer: Program, its: Running, ours: Running) -> dict[str, Any]:
 def alone(name: str, old: str | None) -> dict[str, Any]:
     """A benchmark without peers, in a process of its own: two of them restrict threads before anything is loaded."""
     code = f"import json, {name}; print(json.dumps({name}.measure({repr(old) if name == 'nodes' else ''})))"
-    found = subprocess.run([sys.executable, "-c", code], cwd=HERE, stdout=subprocess.PIPE, text=True, check=True)
-    measured = json.loads(found.stdout.splitlines()[-1])
+    completed = subprocess.run([sys.executable, "-c", code], cwd=HERE, stdout=subprocess.PIPE, text=True, check=True)
+    measured = json.loads(completed.stdout.splitlines()[-1])
     measured["values"] = {key: float(f"{value:.4g}") for key, value in measured["values"].items()}
     met = {key: measured["values"][key] <= most for key, most in measured["at_most"].items()}
     return {**measured, "met": met}
@@ -254,15 +254,15 @@ def main() -> None:
     for name, item in COMPARISONS.items():
         comparisons[name] = compare(item, rates, with_peers, chosen.old)
         show_comparison(comparisons[name])
-    for name in (*ALONE, *(BESIDE if with_peers else ())):
+    for name in (*ALONE, *(WITH_PEERS if with_peers else ())):
         others[name] = alone(name, chosen.old)
         show_alone(name, others[name])
-    found = {
+    results = {
         "date": datetime.now(UTC).date().isoformat(), "load": round(load, 2), "machine": rates,
         "threads": "comparisons: no program's threads are restricted; alone: quadratic and successive_relays on one",
         "comparisons": comparisons, "alone": others,
     }  # fmt: skip
-    RESULTS.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    RESULTS.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

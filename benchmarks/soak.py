@@ -53,15 +53,15 @@ class Place(NamedTuple):
     direction: np.ndarray
 
 
-def excesses(found: Any, directions: np.ndarray, reach: np.ndarray | float = 0.0) -> np.ndarray:
+def excesses(result: Any, directions: np.ndarray, reach: np.ndarray | float = 0.0) -> np.ndarray:
     """(mean e_d^2 - claimed variance) in its standard errors, (time, direction); inf where a certainty is wrong.
 
     A state that is known may be off by the rounding of its own size, `reach` (n,).
     """
-    gap = np.einsum("di,btij,dj->btd", directions, found.outer - found.covariance, directions)
-    size = np.einsum("di,btij,dj->td", directions, found.covariance, directions) / found.runs
-    used = found.count > 0
-    gap, count = gap[used], found.count[used][:, None, None]
+    gap = np.einsum("di,btij,dj->btd", directions, result.outer - result.covariance, directions)
+    size = np.einsum("di,btij,dj->td", directions, result.covariance, directions) / result.runs
+    used = result.count > 0
+    gap, count = gap[used], result.count[used][:, None, None]
     mean = gap.sum(axis=0) / count.sum()
     spread = np.sqrt(np.sum((gap - mean * count) ** 2, axis=0) * len(gap) / (len(gap) - 1)) / count.sum()
     rounding = (ROUNDING * np.sum(np.abs(directions) * reach, axis=1)) ** 2
@@ -70,9 +70,9 @@ def excesses(found: Any, directions: np.ndarray, reach: np.ndarray | float = 0.0
     return np.where(certain, off, mean / np.where(certain, 1.0, spread))
 
 
-def directions_of(found: Any, random: np.random.Generator) -> np.ndarray:
+def directions_of(result: Any, random: np.random.Generator) -> np.ndarray:
     """Unit components, and one random direction in units of each component's own deviation."""
-    deviation = np.sqrt(np.maximum(np.diagonal(found.claimed(), axis1=1, axis2=2).max(axis=0), 0.0))
+    deviation = np.sqrt(np.maximum(np.diagonal(result.claimed(), axis1=1, axis2=2).max(axis=0), 0.0))
     unit = np.where(deviation > 0, deviation, 1.0)
     return np.concatenate([np.eye(len(unit)), (random.normal(size=len(unit)) / unit)[None]])
 
@@ -87,11 +87,11 @@ def reach_of(plant: Any) -> np.ndarray:
     return np.asarray(np.max(sizes, axis=0))
 
 
-def worst_place(found: Any, random: np.random.Generator, reach: np.ndarray | float = 0.0) -> Place:
+def worst_place(result: Any, random: np.random.Generator, reach: np.ndarray | float = 0.0) -> Place:
     """The largest excess; of an exact claim also the largest lack."""
-    directions = directions_of(found, random)
-    z = excesses(found, directions, reach)
-    judged = np.abs(z) if found.claim == "exact" else z
+    directions = directions_of(result, random)
+    z = excesses(result, directions, reach)
+    judged = np.abs(z) if result.claim == "exact" else z
     step, place = np.unravel_index(int(np.nanargmax(judged)), z.shape)
     return Place(float(z[step, place]), int(step), directions[place])
 
@@ -101,16 +101,16 @@ def beyond(z: float, claim: str) -> float:
     return abs(z) if claim == "exact" else z
 
 
-def hidden(found: Any) -> bool:
+def hidden(result: Any) -> bool:
     """Whether something that is no number, or no covariance, is not among the failures."""
-    if found.failed_runs:
+    if result.failed_runs:
         return False
-    if not np.all(np.isfinite(found.outer)):
+    if not np.all(np.isfinite(result.outer)):
         return True
-    if found.claim == "none":
+    if result.claim == "none":
         return False
-    claimed = found.claimed()
-    if not (np.all(np.isfinite(claimed)) and np.all(np.isfinite(found.nees[..., :0]))):
+    claimed = result.claimed()
+    if not (np.all(np.isfinite(claimed)) and np.all(np.isfinite(result.nees[..., :0]))):
         return True
     unit = np.sqrt(np.abs(np.diagonal(claimed, axis1=1, axis2=2)))
     unit = np.where(unit > 0, unit, 1.0)
@@ -143,8 +143,8 @@ def soak(index: int) -> dict[str, Any]:
         item = network(index, SEED)
     except ValueError as error:
         return result | {"refused": str(error)}
-    found = hg.monte_carlo(item, HORIZON, RUNS, index, keep=hg.Statistics())
-    result["flagged"] = found.failures()
+    statistics = hg.monte_carlo(item, HORIZON, RUNS, index, keep=hg.Statistics())
+    result["flagged"] = statistics.failures()
 
     @cache
     def again(runs: int) -> Any:
@@ -152,18 +152,18 @@ def soak(index: int) -> dict[str, Any]:
 
     random, reach = np.random.default_rng([SEED, 2, index]), reach_of(item.plant)
     claims: Counter[str] = Counter()
-    for node, filters in found.items():
-        for name, one in filters.items():
-            claims[one.claim] += 1
-            if hidden(one):
+    for node, filters in statistics.items():
+        for name, filter_ in filters.items():
+            claims[filter_.claim] += 1
+            if hidden(filter_):
                 result["hidden"].append(f"{node}/{name}")
-            if one.claim not in ("exact", "upper") or one.failed_runs:
+            if filter_.claim not in ("exact", "upper") or filter_.failed_runs:
                 continue
-            place = worst_place(one, random, reach)
-            result["comparisons"] += one.outer.shape[1] * (one.outer.shape[2] + 1)
-            z, runs = looked_at_again(place, one.claim, again, (node, name), reach)
+            place = worst_place(filter_, random, reach)
+            result["comparisons"] += filter_.outer.shape[1] * (filter_.outer.shape[2] + 1)
+            z, runs = looked_at_again(place, filter_.claim, again, (node, name), reach)
             if runs:
-                at = {"at": f"{node}/{name}", "claim": one.claim, "step": place.step, "first": place.z}
+                at = {"at": f"{node}/{name}", "claim": filter_.claim, "step": place.step, "first": place.z}
                 result["suspects"].append(at | {"again": z, "runs": runs})
     result["claims"] = dict(claims)
     if index % SCALED == 0:
@@ -183,8 +183,8 @@ def scaling(item: hg.Network) -> str:
 def release() -> str:
     """What decides about the results: the sources' tree."""
     paths = ["src", "benchmarks/soak.py", "benchmarks/soak_networks.py"]
-    found = subprocess.run(["git", "ls-files", "-s", "--", *paths], cwd=HERE.parent, capture_output=True, text=True)
-    return str(hash_of(found.stdout))
+    completed = subprocess.run(["git", "ls-files", "-s", "--", *paths], cwd=HERE.parent, capture_output=True, text=True)
+    return str(hash_of(completed.stdout))
 
 
 def hash_of(text: str) -> str:
@@ -194,7 +194,7 @@ def hash_of(text: str) -> str:
     return sha256(text.encode()).hexdigest()[:16]
 
 
-def kept(key: dict[str, Any]) -> dict[int, dict[str, Any]]:
+def recorded(key: dict[str, Any]) -> dict[int, dict[str, Any]]:
     """What an earlier start with the same key has done; a line cut short is done again."""
     if not DONE.exists():
         return {}
@@ -273,17 +273,17 @@ def main(count: int) -> int:
     os.environ.setdefault("XLA_FLAGS", HURRY)  # read by the processes that are started below
     key = {"seed": SEED, "runs": RUNS, "structures": STRUCTURES, "release": release()}
     DONE.parent.mkdir(exist_ok=True)
-    left = sorted(set(range(count)) - set(kept(key)))
+    left = sorted(set(range(count)) - set(recorded(key)))
     done = count - len(left)
     with ProcessPoolExecutor(os.cpu_count(), multiprocessing.get_context("spawn"), compile_in_a_hurry) as pool:
         for job in as_completed([pool.submit(work, alike, key) for alike in by_structure(left)]):
             done += job.result()
             print(f"\r{done:,} of {count:,} networks", end="", file=sys.stderr)
-    rows = kept(key)
-    found = summary([rows[i] for i in sorted(rows) if i < count], key)
-    RESULTS.write_text(json.dumps(found, indent=1) + "\n")
-    wrong = {name: len(found[name]) for name in ("errors", "broken claims", "unflagged", "depend on units")}
-    print(f"\n{found['networks']:,} networks, {found['comparisons']:,} comparisons: {wrong}")
+    rows = recorded(key)
+    result = summary([rows[i] for i in sorted(rows) if i < count], key)
+    RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+    wrong = {name: len(result[name]) for name in ("errors", "broken claims", "unflagged", "depend on units")}
+    print(f"\n{result['networks']:,} networks, {result['comparisons']:,} comparisons: {wrong}")
     return int(any(wrong.values()))
 
 

@@ -73,17 +73,17 @@ def network(index: int, seed: int) -> hg.Network:
     result = {}
     for number in range(s.nodes):
         sensor = (linear_sensor if linear else nonlinear_sensor)(plant, units, values)
-        one = wired(s, units, values)
-        arrivals = [chance(values) for _ in one]
+        item = wired(s, units, values)
+        arrivals = [chance(values) for _ in item]
         arrivals[0] = arrivals[0] if s.arrives is None else s.arrives
-        channel, world = joined(s, one), lossy(s, one, arrivals)
+        channel, world = joined(s, item), lossy(s, item, arrivals)
         if s.remembers:
             other, rates = wired(s, units, values), (*values.uniform(0.05, 0.9, size=2), f"sight{number}")
             channel = hg.gilbert_elliott(channel, joined(s, other), *rates)
             world = hg.gilbert_elliott(world, lossy(s, other, arrivals), *rates)
         filters = (linear_filters if linear else nonlinear_filters)(plant, sensor, channel, s)
         if s.kind == "linear":
-            filters |= told_filters(plant, sensor, world, s.modal)
+            filters |= informed_filters(plant, sensor, world, s.modal)
         result[f"node{number}"] = hg.Node(sensor, world, filters)
     return hg.Network(plant, result, fused(result, "linear" if linear else "cubature", s.informed))
 
@@ -96,8 +96,8 @@ def chance(values: np.random.Generator) -> float:
 def variance(values: np.random.Generator, scale: Any = 1.0) -> Any:
     """Variances beside a scale, some of them zero."""
     shape = np.shape(scale)
-    found = 10.0 ** values.uniform(-3, 0.5, size=shape) * np.square(scale)
-    return np.where(values.random(shape) < SINGULAR, 0.0, found)
+    result = 10.0 ** values.uniform(-3, 0.5, size=shape) * np.square(scale)
+    return np.where(values.random(shape) < SINGULAR, 0.0, result)
 
 
 def covariance(values: np.random.Generator, scale: np.ndarray) -> np.ndarray:
@@ -149,8 +149,8 @@ def nonlinear_plant(n: int, values: np.random.Generator) -> hg.Plant:
 def linear_sensor(plant: hg.LinearPlant, units: np.ndarray, values: np.random.Generator) -> hg.LinearSensor:
     """Rows of which some repeat and some are zero, in units of each output's own."""
     deviation = np.sqrt(np.diag(np.asarray(plant.initial_covariance)))
-    own = np.where(deviation > 0, deviation, np.max(deviation, initial=0.0) + 1e-9)
-    rows = values.normal(size=(len(units), len(own))) / own
+    local = np.where(deviation > 0, deviation, np.max(deviation, initial=0.0) + 1e-9)
+    rows = values.normal(size=(len(units), len(local))) / local
     rows[values.random(len(units)) < 0.1] = 0.0
     if len(units) > 1 and values.random() < 0.2:
         rows[1] = rows[0]
@@ -179,28 +179,28 @@ def hop(law: int, unit: float, values: np.random.Generator) -> Any:
 
 def wired(s: Structure, units: np.ndarray, values: np.random.Generator) -> list[Any]:
     """Channels of one output each: a hop; two with a relay between; with losses that the receiver is not told of."""
-    each = [hop(law, unit, values) for law, unit in zip(s.laws, units, strict=True)]
+    items = [hop(law, unit, values) for law, unit in zip(s.laws, units, strict=True)]
     if s.wiring == "relays":
         more = [hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), float(variance(values, np.array(u)))) for u in units]
-        each = [hg.amplify_and_forward([a, b]) for a, b in zip(each, more, strict=True)]
+        items = [hg.amplify_and_forward([a, b]) for a, b in zip(items, more, strict=True)]
     if s.wiring == "dropouts":
-        each = [hg.dropout(one, chance(values) if s.dropped is None else s.dropped) for one in each]
+        items = [hg.dropout(item, chance(values) if s.dropped is None else s.dropped) for item in items]
     if s.wiring == "direct link":
-        each += [hg.hop(1.0, float(variance(values, np.array(u)))) for u in units]
-    return each
+        items += [hg.hop(1.0, float(variance(values, np.array(u)))) for u in units]
+    return items
 
 
-def joined(s: Structure, each: list[Any]) -> Any:
+def joined(s: Structure, items: list[Any]) -> Any:
     """One channel of all outputs; where there are direct links, they are the second half."""
-    whole = hg.parallel(each[: len(s.laws)])
-    return whole if s.wiring != "direct link" else hg.with_direct_link(whole, hg.parallel(each[len(s.laws) :]))
+    whole = hg.parallel(items[: len(s.laws)])
+    return whole if s.wiring != "direct link" else hg.with_direct_link(whole, hg.parallel(items[len(s.laws) :]))
 
 
-def lossy(s: Structure, each: list[Any], arrivals: list[float]) -> Any:
+def lossy(s: Structure, items: list[Any], arrivals: list[float]) -> Any:
     """The channel with the losses that the receiver is told of."""
     if s.loses == "each":
-        return joined(s, [hg.erasure(one, chance) for one, chance in zip(each, arrivals, strict=True)])
-    return hg.erasure(joined(s, each), arrivals[0]) if s.loses == "whole" else joined(s, each)
+        return joined(s, [hg.erasure(item, chance) for item, chance in zip(items, arrivals, strict=True)])
+    return hg.erasure(joined(s, items), arrivals[0]) if s.loses == "whole" else joined(s, items)
 
 
 def linear_filters(plant: Any, sensor: Any, channel: Any, s: Structure) -> dict[str, Any]:
@@ -221,9 +221,9 @@ def linear_filters(plant: Any, sensor: Any, channel: Any, s: Structure) -> dict[
     return filters
 
 
-def told_filters(plant: Any, sensor: Any, world: Any, modal: bool) -> dict[str, Any]:
+def informed_filters(plant: Any, sensor: Any, world: Any, modal: bool) -> dict[str, Any]:
     """The filters that are told what arrived; those with a Gaussian for each mode where asked for."""
-    filters: dict[str, Any] = {"told": hg.filters.told_filter(plant, sensor, world)}
+    filters: dict[str, Any] = {"told": hg.filters.side_information_filter(plant, sensor, world)}
     if modal:
         filters["imm"] = hg.filters.imm_filter(plant, sensor, world)
         filters["gpb1"] = hg.filters.gpb1_filter(plant, sensor, world)

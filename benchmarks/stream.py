@@ -44,8 +44,8 @@ def measure() -> dict[str, Any]:
         begun = time.perf_counter_ns()
         stream.push(z, u)
         times.append(time.perf_counter_ns() - begun)
-    found = np.array(times[WARM:]) / 1e3
-    values = {"one sample, least": float(found.min()), "one sample, median": float(np.median(found))}
+    result = np.array(times[WARM:]) / 1e3
+    values = {"one sample, least": float(result.min()), "one sample, median": float(np.median(result))}
     return {"unit": "us", "values": values, "at_most": dict.fromkeys(values, 15)}
 
 

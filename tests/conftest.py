@@ -43,8 +43,8 @@ def pytest_configure(config):
 
 def understood(flags: str) -> bool:
     """Whether this release of the compiler knows these flags: one that does not ends the process that asks."""
-    asked = [sys.executable, "-c", "import jax; jax.devices()"]
-    return subprocess.run(asked, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True).returncode == 0
+    requested = [sys.executable, "-c", "import jax; jax.devices()"]
+    return subprocess.run(requested, env=os.environ | {"XLA_FLAGS": flags}, capture_output=True).returncode == 0
 
 
 def pytest_unconfigure(config):

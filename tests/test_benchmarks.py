@@ -21,8 +21,8 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 @pytest.fixture
 def results() -> dict[str, Any]:
-    found: dict[str, Any] = json.loads((FOLDER / "results.json").read_text())
-    return found
+    collected: dict[str, Any] = json.loads((FOLDER / "results.json").read_text())
+    return collected
 
 
 def test_results_tell_where_and_when(results: dict[str, Any]) -> None:
@@ -37,29 +37,29 @@ def test_results_hold_no_path(results: dict[str, Any]) -> None:
 
 def test_every_benchmark_is_in_the_results(bench: ModuleType, results: dict[str, Any]) -> None:
     assert set(results["comparisons"]) == set(bench.COMPARISONS)
-    assert set(bench.ALONE) <= set(results["alone"]) <= {*bench.ALONE, *bench.BESIDE}
+    assert set(bench.ALONE) <= set(results["alone"]) <= {*bench.ALONE, *bench.WITH_PEERS}
     by_number = {"first_call_s", "again_s", "ns_per_node_step_run", "ns_per_node_step_run_erased", "old_release"}
-    for name, found in results["alone"].items():
+    for name, result in results["alone"].items():
         expected = {"unit", "values", "at_most", "met"} | (by_number if name == "nodes" else set())
-        assert set(found) | {"old_release"} == expected | {"old_release"}
+        assert set(result) | {"old_release"} == expected | {"old_release"}
     for name, item in bench.COMPARISONS.items():
-        found = results["comparisons"][name]
-        assert set(found) - {"old_release"} == {"title", "unit", "runs", "steps", "floor", "distance", "ours", "peers"}
-        assert set(found["ours"]) == {"best", "median", "how", "runs", "versions"}
-        assert {title: peer.get("target") for title, peer in found["peers"].items()} == {
+        result = results["comparisons"][name]
+        assert set(result) - {"old_release"} == {"title", "unit", "runs", "steps", "floor", "distance", "ours", "peers"}
+        assert set(result["ours"]) == {"best", "median", "how", "runs", "versions"}
+        assert {title: peer.get("target") for title, peer in result["peers"].items()} == {
             peer.title: peer.target for peer in item.peers
         }
 
 
 def test_ratios_and_verdicts_follow_from_the_times(bench: ModuleType, results: dict[str, Any]) -> None:
-    for found in results["comparisons"].values():
-        for peer in found["peers"].values():
+    for result in results["comparisons"].values():
+        for peer in result["peers"].values():
             # Times and ratio are written with two decimals; the smallest time here is tens of nanoseconds.
-            assert peer["ratio"] == pytest.approx(peer["best"] / found["ours"]["best"], abs=0.01, rel=1e-3)
+            assert peer["ratio"] == pytest.approx(peer["best"] / result["ours"]["best"], abs=0.01, rel=1e-3)
             assert peer["met"] == (None if peer["target"] is None else peer["ratio"] >= peer["target"])
             assert peer["difference"] is None or peer["difference"] <= bench.AGREEMENT
-    for found in results["alone"].values():
-        assert found["met"] == {key: found["values"][key] <= most for key, most in found["at_most"].items()}
+    for result in results["alone"].values():
+        assert result["met"] == {key: result["values"][key] <= most for key, most in result["at_most"].items()}
 
 
 def test_only_a_peer_that_computes_something_else_is_not_compared(bench: ModuleType, results: dict[str, Any]) -> None:

@@ -26,22 +26,22 @@ def test_three_rooms_with_quantized_links(tmp_path):
     fused = {"house": hg.Fusion("own", hg.CovarianceIntersection(), eight_bits)}
     network = hg.Network(house, rooms, fused)
 
-    found = hg.monte_carlo(network, 40, runs=96, key=1, keep=hg.Statistics()).with_units(
+    result = hg.monte_carlo(network, 40, runs=96, key=1, keep=hg.Statistics()).with_units(
         dict.fromkeys(house.states, "K")
     )
-    table = found.to_pandas()
+    table = result.to_pandas()
     whole = table.loc["fused", "house"]
     alone = [table.loc[room, "own"] for room in house.states]
     assert whole["rmse"] < min(room["rmse"] for room in alone)
     assert whole["claim"] == "upper" and whole["nees high"] < 1.0  # it promises no more than it keeps
     assert all(room["nees low"] < 1.0 < room["nees high"] for room in alone)  # exact
-    for room, own in zip(house.states, alone, strict=True):  # each knows its own room best, and the fused all of them
-        assert own[f"rmse of {room}"] < min(o[f"rmse of {room}"] for o in alone if o is not own)
+    for room, item in zip(house.states, alone, strict=True):  # each knows its own room best, and the fused all of them
+        assert item[f"rmse of {room}"] < min(o[f"rmse of {room}"] for o in alone if o is not item)
         assert whole[f"rmse of {room}"] < whole[f"claimed of {room}"]
-    symbols = found["fused"]["house"].uplink.symbols_per_value()
-    assert 1.0 <= symbols < 1.5 and not found.failures()
-    found.save(tmp_path / "house.nc")
-    assert hg.simulation.StatisticsByName.open(tmp_path / "house.nc") == found
+    symbols = result["fused"]["house"].uplink.symbols_per_value()
+    assert 1.0 <= symbols < 1.5 and not result.failures()
+    result.save(tmp_path / "house.nc")
+    assert hg.simulation.StatisticsByName.open(tmp_path / "house.nc") == result
 
 
 def test_a_skewed_sensor_with_a_bias():
@@ -59,15 +59,15 @@ def test_a_skewed_sensor_with_a_bias():
         "quadratic": hg.polynomial_filter(both, gauge, hg.perfect(), horizon=15),
     }
     network = hg.Network(both, {"tank": hg.Node(gauge, hg.perfect(), filters)})
-    found = hg.monte_carlo(network, 15, runs=512, key=2, keep=hg.Statistics())
-    table = found.to_pandas().loc["tank"]
+    statistics = hg.monte_carlo(network, 15, runs=512, key=2, keep=hg.Statistics())
+    table = statistics.to_pandas().loc["tank"]
     assert (table["claim"] == "exact").all()
     assert ((table["nees low"] < 1.02) & (table["nees high"] > 0.98)).all()
     better, linear = table.loc["quadratic"], table.loc["textbook"]
     assert better["rmse"] < linear["rmse"] - 4 * (better["rmse error"] + linear["rmse error"]) / 2
     assert better["rmse of level"] < 0.97 * linear["rmse of level"] and np.isfinite(better["rmse of leak"])
-    for one in (better, linear):
-        assert one["rmse"] == pytest.approx(np.hypot(one["claimed of level"], one["claimed of leak"]), rel=0.05)
+    for item in (better, linear):
+        assert item["rmse"] == pytest.approx(np.hypot(item["claimed of level"], item["claimed of leak"]), rel=0.05)
 
 
 def test_a_drone_with_range_bearing_stations_over_a_lossy_relay():
@@ -105,8 +105,8 @@ def test_a_drone_with_range_bearing_stations_over_a_lossy_relay():
     jumps = np.abs(np.diff(np.arctan2(away[..., 1], away[..., 0]), axis=1)) > np.pi
     assert np.mean(jumps.any(axis=1)) > 0.9  # nearly every flight goes behind the station
     assert abs(np.mean(np.isnan(record.measurements["tablet"][..., 1])) - 0.2) < 0.03  # 7 standard errors
-    found = hg.simulation.error_statistics(record, "tablet", "aware")
-    nees, low, high = found.nees_per_dimension()
+    result = hg.simulation.error_statistics(record, "tablet", "aware")
+    nees, low, high = result.nees_per_dimension()
     assert low - 0.05 < 1 < high + 0.05, (nees, low, high)  # the measurement is curved: claims are nominal
     error = record.rmse("tablet", "aware")
     assert error["east"] < 2.0 and error["north"] < 2.0  # m, at 60 m and more

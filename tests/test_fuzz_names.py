@@ -38,7 +38,7 @@ SAMPLES = {  # what a parameter of this name usually is
     "maps": [HOP], "relays": ("r",), "joint": np.eye(4), "count": 1, "states": 1,
 }  # fmt: skip
 PROTOCOLS = ("Transport", "Broker")
-BESIDE = {  # what is no function of its arguments alone: it talks to a broker or reads the standard input
+WITH_PEERS = {  # what is no function of its arguments alone: it talks to a broker or reads the standard input
     "connected", "keep_running", "serve_until", "check_transport", "Pipe", "keep_compilations", "show_progress",
 }  # fmt: skip
 TRACED = {"gaussian_innovation", "mixed_innovation"}  # stand inside a filter that has checked what it was given
@@ -49,7 +49,7 @@ WITH_ARGUMENTS = {getattr(call, "__name__", "") for call, _ in test_fuzz.CALLS +
 def tried(place, name):
     """Whether a public name is something to call that is not called elsewhere."""
     item = getattr(import_module(place), name)
-    if not callable(item) or inspect.isabstract(item) or name in BESIDE | TRACED | RESULTS | WITH_ARGUMENTS:
+    if not callable(item) or inspect.isabstract(item) or name in WITH_PEERS | TRACED | RESULTS | WITH_ARGUMENTS:
         return False
     if place == "heliograph.testing" or (inspect.isclass(item) and issubclass(item, BaseModel)):
         return False

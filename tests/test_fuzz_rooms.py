@@ -31,7 +31,7 @@ def ready(arguments):
 NOISE = np.random.default_rng(0).normal(size=5000)
 CHAIN = [[0.9, 0.1], [0.2, 0.8]]
 BURST = hg.gilbert_elliott(HOP, hg.hop(0.5, 0.1), 0.1, 0.2)
-ONE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
+BELOW_ONE = dict(zip(("plant", "sensor", "channel"), (*SCALAR, HOP), strict=True))
 NETWORK = hg.Network(PLANT, {"a": NODE, "b": NODE}, {"all": hg.Fusion("f", fusion.MatrixWeights())})
 RECORD = Later(lambda: hg.monte_carlo(hg.Network(PLANT, {"a": NODE}), 3, 2, 0))
 GROWTH = h_infinity.growth_system(
@@ -42,7 +42,7 @@ UNKNOWN = h_infinity.growth_system(3, [[0.2], [0.1]], [[0.3]], EYE, HOP, 0.5, 0.
 DESIGN = Later(lambda: h_infinity.recursive_design(GROWTH, 5.0))
 SLOT = {"r": {"sensor": HOP}, "receiver": {"r": HOP}}
 PERIODIC = model.RelayNetwork(*SCALAR, ("r",), [SLOT])
-OWN = Later(lambda: relays.periodic_own_error_design(PERIODIC))
+LOCAL = Later(lambda: relays.periodic_own_error_design(PERIODIC))
 CLOCKS = {"motion": [[0.0, 1.0], [0.0, 0.0]], "dt": 0.5, "clocks": {"b": model.Clock(0.5, 2e-3)}}
 MOVING, SEEN = model.with_clocks(
     PLANT, {"a": SENSOR, "b": SENSOR}, **{k: CLOCKS[k] for k in ("clocks", "motion", "dt")}
@@ -71,8 +71,8 @@ CALLS = [  # what is called, and arguments with which it works
     (random_affine.recorded_noise, {"samples": NOISE, "order": 2}),
     (linear.critical_arrival, {"plant": PLANT, "sensor": SENSOR, "gain": None}),
     (relays.periodic_own_error_design, {"network": PERIODIC}),
-    (relays.periodic_given_design, {"network": PERIODIC, "gains": OWN.part("gains")}),
-    (relays.periodic_behind_relays, {"network": PERIODIC, "gains": OWN.part("gains")}),
+    (relays.periodic_given_design, {"network": PERIODIC, "gains": LOCAL.part("gains")}),
+    (relays.periodic_behind_relays, {"network": PERIODIC, "gains": LOCAL.part("gains")}),
     (h_infinity.growth_system, {"steps": 3, "disturbance": [[0.2], [0.1]], "feedthrough": [[0.3]], "wanted": EYE,
                                 "channel": HOP, "growth": 0.1, "output_growth": 0.1, "transition": EYE,
                                 "output": [[1.0, 0.5]], "initial_weight": 1.0}),
@@ -89,19 +89,19 @@ CALLS = [  # what is called, and arguments with which it works
                              "name": "f", "seed": 0}),
     (filters.h_infinity_filter, {"plant": PLANT, "sensor": SENSOR, "system": GROWTH, "design": DESIGN,
                                  "initial_mean": [0.0, 0.0]}),
-    (filters.as_current_filter, ONE),
+    (filters.as_current_filter, BELOW_ONE),
     (filters.late_filter, {"filter": KALMAN, "delay": 2}),
     (filters.part_filter, {"filter": KALMAN, "states": 1}),
     (filters.clock_filter, {**PAIR, "clocks": ["b"], "transform": filters.PolynomialMoments(2)}),
-    *((f, {**ONE, "channel": BURST}) for f in (filters.told_filter, filters.imm_filter, filters.gpb1_filter,
+    *((f, {**BELOW_ONE, "channel": BURST}) for f in (filters.side_information_filter, filters.imm_filter, filters.gpb1_filter,
                                                filters.gpb2_filter, filters.mode_known_filter,
                                                filters.mode_late_filter, filters.memoryless_filter)),
-    (filters.particle_filter, {**ONE, "particles": 10, "seed": 0, "nodes": 3}),
+    (filters.particle_filter, {**BELOW_ONE, "particles": 10, "seed": 0, "nodes": 3}),
     (filters.true_error, {"filter": KALMAN, "plant": PLANT, "sensor": SENSOR, "channel": hg.perfect(), "horizon": 3,
                           "inputs": None}),
     (smoothing.FixedLag, {"lag": 2}),
     (smoothing.FixedPoint, {"step": 1}),
-    (smoothing.retained_steps, {"filter": KALMAN, "measurements": np.zeros((3, 1)), "inputs": None, "first_step": 0}),
+    (smoothing.smoother_steps, {"filter": KALMAN, "measurements": np.zeros((3, 1)), "inputs": None, "first_step": 0}),
     *((rule, {"with_mean": False}) for rule in (fusion.MatrixWeights, fusion.DiagonalWeights, fusion.ScalarWeights)),
     (simulation.cross_covariances, {"network": NETWORK, "filter": "f", "horizon": 3, "inputs": None}),
     (simulation.fused_covariances, {"network": NETWORK, "horizon": 3, "inputs": None}),

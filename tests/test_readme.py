@@ -38,11 +38,11 @@ def recipe(target: str) -> str:
 def installed_by_demo() -> set[str]:
     """The extras that `make demo` installs, with those that they name."""
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    found = set(re.search(r"'\.\[(.*?)\]'", recipe(r"\.venv/\.demo"))[1].split(","))
-    for each in tuple(found):
-        for text in extras[each]:
-            found |= set(re.findall(r"heliograph\[(.*)\]", text))
-    return found
+    result = set(re.search(r"'\.\[(.*?)\]'", recipe(r"\.venv/\.demo"))[1].split(","))
+    for item in tuple(result):
+        for text in extras[item]:
+            result |= set(re.findall(r"heliograph\[(.*)\]", text))
+    return result
 
 
 @pytest.fixture
@@ -75,22 +75,22 @@ def test_all_of_it_runs_in_order(after_make_demo):
     assert commands == len(re.findall(r"^(?:make|heliograph|python) ", README, re.MULTILINE)) - len(TESTS_ITSELF)
     for made in re.findall(r"(?:writes|--out) (?:\S+ )?(out/\S+|\S+\.parquet)", README):
         assert (after_make_demo / made.rstrip(".,`")).exists(), made
-    found = json.loads((after_make_demo / "out" / "demo" / "summary.json").read_text())
+    summary = json.loads((after_make_demo / "out" / "demo" / "summary.json").read_text())
     for filter_, title in DRIVEN.items():
         error, claimed, nees = (
-            found[name][filter_] for name in ("position_rmse_m", "claimed_rmse_m", "nees_per_dimension")
+            summary[name][filter_] for name in ("position_rmse_m", "claimed_rmse_m", "nees_per_dimension")
         )
         row = f"| {title} | {error:.2f} m | {claimed:.2f} m | {shown(nees)} |"
         assert row.replace("*", "") in README.replace("*", ""), f"README lacks: {row}"
-    check_what_else_is_said_of_the_drive(found)
+    check_what_else_is_said_of_the_drive(summary)
 
 
-def check_what_else_is_said_of_the_drive(found: dict) -> None:
+def check_what_else_is_said_of_the_drive(result: dict) -> None:
     """The README's row beside peers, the start page and the page on learning, by the same summary."""
-    aware, mean = (f"{found['position_rmse_m'][name]:.2f} m" for name in ("relay_aware", "mean_gain"))
-    row = beside_peers()["a sensor behind relays with random gains: error on the recorded drive"]
+    aware, mean = (f"{result['position_rmse_m'][name]:.2f} m" for name in ("relay_aware", "mean_gain"))
+    row = against_peers()["a sensor behind relays with random gains: error on the recorded drive"]
     assert row[:2] == [f"{mean}: the mean gain, in any package", aware]
-    claimed, learned = found["claimed_rmse_m"]["mean_gain"], found["learned"]
+    claimed, learned = result["claimed_rmse_m"]["mean_gain"], result["learned"]
     gyro = learned["parameters"]["gyro_rate"]
     said = {
         "index.md": [f"is off by {aware};", f"by {mean}, and believes that it is {claimed:.2f} m."],
@@ -112,7 +112,7 @@ def shown(number: float) -> str:
     return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
 
 
-def beside_peers() -> dict[str, list[str]]:
+def against_peers() -> dict[str, list[str]]:
     """The rows of the table beside the best peers, by what they are of: others, ours, and the command."""
     section = README.split("## Beside the best peers")[1].split("\n## ")[0]
     rows = [row.strip("| ").split(" | ") for row in section.splitlines() if row.startswith("| ")][1:]
@@ -121,7 +121,7 @@ def beside_peers() -> dict[str, list[str]]:
 
 def test_every_row_beside_peers_names_a_command_that_there_is():
     """Times are in test_docs.py, errors in the test above and those of quadratic bias, late data and live."""
-    rows = beside_peers()
+    rows = against_peers()
     assert len(rows) == 10
     for others, ours, command in rows.values():
         assert others and ours

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from heliograph.simulation.statistics import BATCHES, ErrorStatistics
+from heliograph.simulation.results.statistics import BATCHES, ErrorStatistics
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="a source distribution has no benchmarks")
@@ -36,12 +36,12 @@ def statistics(ratio: float, claim: str = "exact", runs: int = 5000, seed: int =
     return ErrorStatistics(deal.sum(axis=0), pairs, claimed, np.zeros((BATCHES, 3)), claim)
 
 
-@pytest.mark.parametrize(("ratio", "claim", "found"), [(1.3, "exact", True), (1.3, "upper", True), (0.7, "exact", True),
+@pytest.mark.parametrize(("ratio", "claim", "result"), [(1.3, "exact", True), (1.3, "upper", True), (0.7, "exact", True),
                                                         (0.7, "upper", False), (1.0, "exact", False)])  # fmt: skip
-def test_a_broken_claim_stands_out(soak: ModuleType, ratio: float, claim: str, found: bool) -> None:
+def test_a_broken_claim_stands_out(soak: ModuleType, ratio: float, claim: str, result: bool) -> None:
     place = soak.worst_place(statistics(ratio, claim), np.random.default_rng(1))
     z = abs(place.z) if claim == "exact" else place.z
-    assert (z > soak.SUSPECT) == found
+    assert (z > soak.SUSPECT) == result
 
 
 def test_a_certainty_that_is_wrong_is_hopelessly_far(soak: ModuleType) -> None:
@@ -66,24 +66,26 @@ def test_chance_is_looked_at_again_and_what_is_broken_stays_broken(soak: ModuleT
     """Ten suspects of a true claim end at the first look; a variance 1.3 times the claimed one goes through both."""
     for ratio, ends in ((1.0, soak.AGAIN[0]), (1.3, soak.AGAIN[1])):
         for seed in range(10):
-            found = {"a": {"b": statistics(ratio, runs=5000, seed=seed)}}
+            results = {"a": {"b": statistics(ratio, runs=5000, seed=seed)}}
             place = soak.Place(5.0, 1, np.array([0.0, 1.0]))
-            z, runs = soak.looked_at_again(place, "exact", lambda _, found=found: found, ("a", "b"), np.zeros(2))
+            z, runs = soak.looked_at_again(place, "exact", lambda _, result=results: result, ("a", "b"), np.zeros(2))
             assert runs == ends and (abs(z) > soak.SUSPECT) == (ends == soak.AGAIN[1])
     assert soak.looked_at_again(soak.Place(-5.0, 1, np.ones(2)), "upper", {}.get, ("a", "b"), np.zeros(2)) == (-5.0, 0)
 
 
 def test_what_is_no_number_and_not_told_is_hidden(soak: ModuleType) -> None:
-    one = statistics(1.0)
-    assert not soak.hidden(one)
-    broken = np.array(one.pairs)
+    item = statistics(1.0)
+    assert not soak.hidden(item)
+    broken = np.array(item.pairs)
     broken[0, 1, 0] = np.nan
-    silent = ErrorStatistics(one.count, broken, one.claimed_pairs, one.nees, "exact")
-    told = ErrorStatistics(one.count, broken, one.claimed_pairs, one.nees, "exact", failed=np.ones(3), failed_runs=1)
-    assert soak.hidden(silent) and not soak.hidden(told)
-    indefinite = np.array(one.claimed_pairs)
+    silent = ErrorStatistics(item.count, broken, item.claimed_pairs, item.nees, "exact")
+    known = ErrorStatistics(
+        item.count, broken, item.claimed_pairs, item.nees, "exact", failed=np.ones(3), failed_runs=1
+    )
+    assert soak.hidden(silent) and not soak.hidden(known)
+    indefinite = np.array(item.claimed_pairs)
     indefinite[..., 2] = -1e-15
-    assert soak.hidden(ErrorStatistics(one.count, one.pairs, indefinite, one.nees, "exact"))
+    assert soak.hidden(ErrorStatistics(item.count, item.pairs, indefinite, item.nees, "exact"))
 
 
 def test_the_summary_counts_what_is_wrong(soak: ModuleType) -> None:
@@ -99,15 +101,15 @@ def test_the_summary_counts_what_is_wrong(soak: ModuleType) -> None:
     suspect = {"at": "a/b", "claim": "upper", "step": 0, "first": 5.0}
     rows = [row, row | {"index": 1, "suspects": [suspect | {"again": 8.0}, suspect | {"again": -8.0}]},
             row | {"index": 2, "hidden": ["a/c"], "scaling": "a/b: off"}]  # fmt: skip
-    found = soak.summary(rows, {"seed": 1})
-    assert [s["again"] for s in found["broken claims"]] == [8.0]
-    assert found["unflagged"] == [{"index": 2, "at": ["a/c"]}] and len(found["depend on units"]) == 1
-    assert found["limit in standard errors"] == pytest.approx(5.1, abs=0.2)
+    result = soak.summary(rows, {"seed": 1})
+    assert [s["again"] for s in result["broken claims"]] == [8.0]
+    assert result["unflagged"] == [{"index": 2, "at": ["a/c"]}] and len(result["depend on units"]) == 1
+    assert result["limit in standard errors"] == pytest.approx(5.1, abs=0.2)
 
 
 def test_the_last_soak_tried_all_and_found_every_promise_kept(soak: ModuleType) -> None:
     """What benchmarks/soak.json says, which docs/theory.md tells."""
-    found = json.loads(soak.RESULTS.read_text())
-    assert (found["networks"], found["seed"], found["runs"]) == (soak.COUNT, soak.SEED, soak.RUNS)
-    assert found["rescaled"] >= 200 and set(found["estimates by claim"]) == {"exact", "upper", "nominal"}
-    assert [found[name] for name in ("errors", "broken claims", "unflagged", "depend on units")] == [[], [], [], []]
+    content = json.loads(soak.RESULTS.read_text())
+    assert (content["networks"], content["seed"], content["runs"]) == (soak.COUNT, soak.SEED, soak.RUNS)
+    assert content["rescaled"] >= 200 and set(content["estimates by claim"]) == {"exact", "upper", "nominal"}
+    assert [content[name] for name in ("errors", "broken claims", "unflagged", "depend on units")] == [[], [], [], []]

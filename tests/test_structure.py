@@ -26,11 +26,11 @@ ORDER = [
         "filters.retained_linear",
         "filters.retained_moments",
         "filters.retaining",
-        "filters.transform",
-        "filters.scalars",
-        "filters.precise",
-        "filters.correction",
-        "filters.update",
+        "filters.gaussian.transform",
+        "filters.gaussian.scalars",
+        "filters.gaussian.precise",
+        "filters.gaussian.correction",
+        "filters.gaussian.update",
     ],
     ["linear", "relays", "h_infinity"],
     ["filters"],
@@ -60,15 +60,15 @@ def rank(module: str) -> int | None:
 
 
 def imports(path: Path) -> set[str]:
-    found = set()
+    result = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("heliograph."):
             module = node.module.removeprefix("heliograph.")
-            found |= {
+            result |= {
                 f"{module}.{alias.name}" if rank(f"{module}.{alias.name}") is not None else module
                 for alias in node.names
             }
-    return found
+    return result
 
 
 FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
@@ -76,10 +76,10 @@ FILES = [p for p in SOURCE.rglob("*.py") if p != SOURCE / "__init__.py"]
 
 @pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
 def test_imports_flow_with_the_data(path):
-    own = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")
-    assert rank(own) is not None, f"{own}: give it a place in ORDER"
+    local = str(path.relative_to(SOURCE).with_suffix("")).replace("/", ".").removesuffix(".__init__")
+    assert rank(local) is not None, f"{local}: give it a place in ORDER"
     for other in imports(path):
-        assert rank(other) <= rank(own), f"{own} imports {other}, which comes later"
+        assert rank(other) <= rank(local), f"{local} imports {other}, which comes later"
 
 
 def _raises(function) -> bool:

@@ -8,7 +8,7 @@ import pytest
 import heliograph as hg
 from heliograph.model import silent
 from heliograph.numerics.check import covariance
-from heliograph.simulation.record import is_sound
+from heliograph.simulation.results.record import is_sound
 from tests.follow import last
 
 CART = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)
@@ -25,8 +25,8 @@ FILTERS = {
 def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_draw():
     plant = hg.Plant(lambda x, u: x, np.diag([1, 1e-14]), np.zeros(2), np.diag([1e6, 1e-9]))
     open_loop = hg.filters.open_loop_filter(plant)
-    found = open_loop.estimate(open_loop.predict(open_loop.init())).covariance
-    np.testing.assert_allclose(np.diag(found), [1e6 + 1, 1e-9 + 1e-14], rtol=1e-13)
+    result = open_loop.estimate(open_loop.predict(open_loop.init())).covariance
+    np.testing.assert_allclose(np.diag(result), [1e6 + 1, 1e-9 + 1e-14], rtol=1e-13)
     with jax.enable_x64(True):
         drawn = np.asarray(jax.vmap(plant.sample_initial)(jax.random.split(jax.random.key(0), 4000)))
     np.testing.assert_allclose(drawn.var(axis=0), [1e6, 1e-9], rtol=0.1)  # 4.5 standard errors
@@ -35,12 +35,12 @@ def test_a_spread_far_below_the_others_is_neither_dropped_by_a_filter_nor_by_a_d
 def test_an_exact_filter_of_states_in_very_different_units_has_the_scalar_filters_numbers():
     plant = hg.LinearPlant(np.eye(2), np.diag([0.1, 1e-17]), np.zeros(2), np.diag([1e2, 1e-16]))
     sensor = hg.LinearSensor(np.eye(2), np.diag([1.0, 1e-16]))
-    found = last(hg.cubature_filter(plant, sensor, hg.perfect(2)), [[1.0, 1e-8]])
+    estimate = last(hg.cubature_filter(plant, sensor, hg.perfect(2)), [[1.0, 1e-8]])
     prior = np.array([100.1, 1.1e-16])
     noise, z = np.array([1.0, 1e-16]), np.array([1.0, 1e-8])
     expected = prior / (1 + prior / noise)
-    np.testing.assert_allclose(np.diag(found.covariance), expected, rtol=1e-12)  # roundings of a prior 100 times it
-    np.testing.assert_allclose(found.mean, prior / (prior + noise) * z, rtol=1e-13)
+    np.testing.assert_allclose(np.diag(estimate.covariance), expected, rtol=1e-12)  # roundings of a prior 100 times it
+    np.testing.assert_allclose(estimate.mean, prior / (prior + noise) * z, rtol=1e-13)
 
 
 RULES = [
@@ -54,9 +54,9 @@ RULES = [
 @pytest.mark.parametrize("rule", RULES, ids=lambda r: type(r).__name__)
 def test_fusion_in_very_different_units(rule):
     p = np.diag([1e6, 1e-9])
-    found = hg.fusion.fuse(rule, [hg.model.Estimate(np.array([1.0, 1e-6]), p, "upper")] * 2)
-    np.testing.assert_allclose(np.diag(found.covariance), [1e6, 1e-9], rtol=1e-7)
-    np.testing.assert_allclose(found.mean, [1.0, 1e-6], rtol=1e-7)
+    result = hg.fusion.fuse(rule, [hg.model.Estimate(np.array([1.0, 1e-6]), p, "upper")] * 2)
+    np.testing.assert_allclose(np.diag(result.covariance), [1e6, 1e-9], rtol=1e-7)
+    np.testing.assert_allclose(result.mean, [1.0, 1e-6], rtol=1e-7)
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda r: type(r).__name__)
@@ -70,10 +70,10 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
             rule, [hg.model.Estimate(means[0], np.diag([p, 1.0]), "upper"), hg.model.Estimate(means[1], other, "upper")]
         )
 
-    found, near = fused(0.0), fused(1e-7)
-    np.testing.assert_array_equal(np.asarray(found.covariance)[0], 0.0)
-    np.testing.assert_allclose(found.mean, near.mean, atol=3e-4)  # weights move with the root of p
-    np.testing.assert_allclose(found.covariance, near.covariance, atol=3e-4)
+    result, near = fused(0.0), fused(1e-7)
+    np.testing.assert_array_equal(np.asarray(result.covariance)[0], 0.0)
+    np.testing.assert_allclose(result.mean, near.mean, atol=3e-4)  # weights move with the root of p
+    np.testing.assert_allclose(result.covariance, near.covariance, atol=3e-4)
     nothing = hg.fusion.fuse(rule, [hg.model.Estimate(means[0], np.zeros((2, 2)), "upper")] * 2)
     np.testing.assert_array_equal(nothing.covariance, 0.0)
     np.testing.assert_allclose(nothing.mean, means[0], rtol=1e-12)
@@ -81,25 +81,29 @@ def test_what_one_estimate_knows_exactly_the_fused_one_knows(rule):
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_silent_component_is_as_if_it_were_not_there(name):
-    heard = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])
+    received = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), hg.perfect()), [[1.0], [1.0]])
     pair = hg.LinearSensor([[1.0], [1.0]], 0.1)
-    found = last(FILTERS[name](CART, pair, hg.parallel([hg.perfect(), silent()])), [[1.0, 0.0]] * 2)
-    np.testing.assert_allclose([found.mean[0], found.covariance[0, 0]], [heard.mean[0], heard.covariance[0, 0]])
+    estimate = last(FILTERS[name](CART, pair, hg.parallel([hg.perfect(), silent()])), [[1.0, 0.0]] * 2)
+    np.testing.assert_allclose(
+        [estimate.mean[0], estimate.covariance[0, 0]], [received.mean[0], received.covariance[0, 0]]
+    )
 
 
 @pytest.mark.parametrize("channel", [silent(), hg.dropout(hg.perfect(), 0.0)], ids=["silent", "never arrives"])
 @pytest.mark.parametrize("name", FILTERS)
 def test_behind_a_silent_channel_a_filter_predicts(name, channel):
-    found = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), channel), [[0.0], [0.0]])
-    np.testing.assert_allclose([found.mean[0], found.covariance[0, 0]], [0.0, 0.81**2 + 0.1 * (1 + 0.81)], atol=1e-12)
+    estimate = last(FILTERS[name](CART, hg.LinearSensor([[1.0]], 0.1), channel), [[0.0], [0.0]])
+    np.testing.assert_allclose(
+        [estimate.mean[0], estimate.covariance[0, 0]], [0.0, 0.81**2 + 0.1 * (1 + 0.81)], atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_noise_free_hops_and_a_position_known_exactly(name):
     twice = hg.LinearSensor([[1.0], [1.0]], 0.0)
-    found = last(FILTERS[name](CART, twice, hg.perfect(2)), [[1.0, 1.0], [0.5, 0.5]])
-    assert found.mean[0] == pytest.approx(0.5, abs=1e-14) and 0 <= found.covariance[0, 0] < 1e-14
-    assert is_sound(found)
+    estimate = last(FILTERS[name](CART, twice, hg.perfect(2)), [[1.0, 1.0], [0.5, 0.5]])
+    assert estimate.mean[0] == pytest.approx(0.5, abs=1e-14) and 0 <= estimate.covariance[0, 0] < 1e-14
+    assert is_sound(estimate)
     plant = hg.LinearPlant(np.eye(2), np.diag([0.0, 0.1]), [3.0, 0.0], np.diag([0.0, 1.0]))
     known = last(FILTERS[name](plant, hg.LinearSensor(np.eye(2), np.diag([0.0, 0.1])), hg.perfect(2)), [[3.0, 1.0]])
     np.testing.assert_allclose(known.mean, [3.0, 1.1 / 1.2], rtol=1e-13)
@@ -113,9 +117,9 @@ UNCERTAIN = hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5], 0.1), noise=0.1)
 def test_the_bound_of_a_zero_mean_error_where_nothing_can_be_learned(c, p):
     plant = hg.LinearPlant(np.eye(2), 0.0, [3.0, 0.0], p)
     item = hg.cubature_filter(plant, hg.LinearSensor([[c, 0.0]], 0.1), UNCERTAIN, hg.filters.ZeroMean())
-    found = last(item, [[1.0], [1.0]])
-    np.testing.assert_allclose(found.covariance, p * np.eye(2), atol=1e-11)
-    np.testing.assert_allclose(found.mean, [3.0, 0.0], atol=1e-11)
+    estimate = last(item, [[1.0], [1.0]])
+    np.testing.assert_allclose(estimate.covariance, p * np.eye(2), atol=1e-11)
+    np.testing.assert_allclose(estimate.mean, [3.0, 0.0], atol=1e-11)
 
 
 def test_a_zero_mean_bound_skips_missing_components_as_the_filter_built_without_them():
@@ -124,10 +128,10 @@ def test_a_zero_mean_bound_skips_missing_components_as_the_filter_built_without_
     channel = hg.parallel([UNCERTAIN] * 4)
     full = hg.cubature_filter(plant, hg.LinearSensor(np.eye(4), 0.1), channel, rule)
     z = np.array([0.7, np.nan, np.nan, np.nan])
-    one = hg.cubature_filter(plant, hg.LinearSensor(np.eye(4)[:1], 0.1), UNCERTAIN, rule)
-    found, expected = last(full, [z, z]), last(one, [z[:1], z[:1]])
-    np.testing.assert_allclose(found.covariance, expected.covariance, rtol=1e-9)
-    np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-9)
+    item = hg.cubature_filter(plant, hg.LinearSensor(np.eye(4)[:1], 0.1), UNCERTAIN, rule)
+    result, expected = last(full, [z, z]), last(item, [z[:1], z[:1]])
+    np.testing.assert_allclose(result.covariance, expected.covariance, rtol=1e-9)
+    np.testing.assert_allclose(result.mean, expected.mean, rtol=1e-9)
 
 
 def test_an_indefinite_matrix_is_one_in_any_units():
@@ -152,10 +156,10 @@ def test_statistics_of_a_state_known_exactly_are_numbers():
     plant = hg.LinearPlant(np.eye(2), np.diag([0.0, 0.1]), [3.0, 0.0], np.diag([0.0, 1.0]))
     sensor = hg.LinearSensor(np.eye(2), np.diag([0.0, 0.1]))
     nodes = {"node": hg.Node(sensor, hg.perfect(2), {"kalman": hg.kalman_filter(plant, sensor)})}
-    found = hg.monte_carlo(hg.Network(plant, nodes), 5, 200, 0, keep=hg.Statistics())["node"]["kalman"]
-    mean, low, high = found.nees_per_dimension(0.999)
+    result = hg.monte_carlo(hg.Network(plant, nodes), 5, 200, 0, keep=hg.Statistics())["node"]["kalman"]
+    mean, low, high = result.nees_per_dimension(0.999)
     assert low <= 1.0 <= high and np.isfinite(mean)
-    assert abs(found.worst_direction().z) < 4
+    assert abs(result.worst_direction().z) < 4
 
 
 def test_a_known_state_that_is_not_where_it_is_said_to_be_is_infinitely_far():

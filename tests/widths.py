@@ -20,15 +20,15 @@ INSIDE = """[...document.querySelectorAll('body *')].filter(part => part.scrollW
 def wrong(browser: Browser, page: str) -> list[str]:
     """What is wrong with a page, a file or what a server on this machine tells."""
     served = page.startswith("http://127.0.0.1:")
-    own = ("file:", "data:", page) if served else ("file:", "data:")
-    found = []
+    local = ("file:", "data:", page) if served else ("file:", "data:")
+    results = []
     for width in WIDTHS:
         seen = browser.open(page if served else Path(page).resolve().as_uri(), width)
         inside = browser.call("Runtime.evaluate", expression=INSIDE, returnByValue=True)["result"]["value"]
-        found += [f"at {width}: {told}" for told in [*inside, *seen.errors]]
-        found += [f"at {width}: the page is {seen.width} wide"] if seen.width > width else []
-        found += [f"fetches {address}" for address in seen.requests if not address.startswith(own)]
-    return found
+        results += [f"at {width}: {item}" for item in [*inside, *seen.errors]]
+        results += [f"at {width}: the page is {seen.width} wide"] if seen.width > width else []
+        results += [f"fetches {address}" for address in seen.requests if not address.startswith(local)]
+    return results
 
 
 class Widths:
@@ -56,8 +56,8 @@ class Widths:
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(f"{page}\n")
         self.process.stdin.flush()
-        found = json.loads(self.process.stdout.readline())
-        assert not found, found
+        content = json.loads(self.process.stdout.readline())
+        assert not content, content
 
     def close(self) -> None:
         """End the browser."""

@@ -22,7 +22,7 @@ def new_filter(p: Arrays) -> CubatureKalmanFilter:
     return ckf
 
 
-def told_run(p: Arrays, run: int) -> np.ndarray:
+def informed_run(p: Arrays, run: int) -> np.ndarray:
     ckf, c = new_filter(p), p["C"]
     fixed = p["gain"] ** 2 * p["R"] + p["noise"]
     means = np.empty((p["z"].shape[1], 5))
@@ -37,7 +37,7 @@ def told_run(p: Arrays, run: int) -> np.ndarray:
 
 
 def prepare(p: Arrays) -> Contender:
-    return Contender(lambda: [told_run(p, i) for i in range(RUNS)], np.array, f"a loop over {RUNS} runs")
+    return Contender(lambda: [informed_run(p, i) for i in range(RUNS)], np.array, f"a loop over {RUNS} runs")
 
 
 if __name__ == "__main__":

@@ -27,8 +27,8 @@ def python_of(peer: str) -> Path:
     """
     folder = FOLDER / peer
     python, mark = folder / "bin" / "python", folder / "requirements.txt"
-    wanted = "\n".join(REQUIREMENTS[peer])
-    if mark.is_file() and mark.read_text() == wanted:
+    expected = "\n".join(REQUIREMENTS[peer])
+    if mark.is_file() and mark.read_text() == expected:
         return python
     print(f"making an environment for {peer} ...", file=sys.stderr)
     try:
@@ -37,7 +37,7 @@ def python_of(peer: str) -> Path:
     except (OSError, subprocess.SubprocessError) as error:
         print(error, file=sys.stderr)
         raise RuntimeError(f"no environment for {peer}: venv or pip failed") from error
-    mark.write_text(wanted)
+    mark.write_text(expected)
     return python
 
 

@@ -19,7 +19,7 @@ if __name__ == "__main__":
     seconds = float("inf")
     for _ in range(3):
         began = time.process_time()
-        found = fit_noise([[0.95]], [[1.0]], z, [0.0], [[1.0]], Q0=[[q]], R0=[[r]])
+        result = fit_noise([[0.95]], [[1.0]], z, [0.0], [[1.0]], Q0=[[q]], R0=[[r]])
         seconds = min(seconds, time.process_time() - began)
-    answer = {"found": [float(found.Q[0, 0]), float(found.R[0, 0])], "top": found.log_likelihood, "cpu_s": seconds}
+    answer = {"found": [float(result.Q[0, 0]), float(result.R[0, 0])], "top": result.log_likelihood, "cpu_s": seconds}
     print(json.dumps(answer))

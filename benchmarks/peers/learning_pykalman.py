@@ -20,5 +20,5 @@ if __name__ == "__main__":
     began = time.process_time()
     item.em(z, n_iter=ITERATIONS, em_vars=["transition_covariance", "observation_covariance"])
     seconds = time.process_time() - began
-    found = [float(item.transition_covariance[0, 0]), float(item.observation_covariance[0, 0])]
-    print(json.dumps({"found": found, "top": float(item.loglikelihood(z)), "cpu_s": seconds}))
+    result = [float(item.transition_covariance[0, 0]), float(item.observation_covariance[0, 0])]
+    print(json.dumps({"found": result, "top": float(item.loglikelihood(z)), "cpu_s": seconds}))

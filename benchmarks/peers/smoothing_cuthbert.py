@@ -20,10 +20,10 @@ def prepare(p: Arrays, parallel: bool = False, runs: int = RUNS) -> Contender:
     def move(_: Any) -> tuple[Any, Any, Any]:
         return jax.numpy.asarray(p["A"]), jax.numpy.asarray(zero), jax.numpy.asarray(root["Q"])
 
-    def hear(i: Any) -> tuple[Any, Any, Any, Any]:
+    def receive(i: Any) -> tuple[Any, Any, Any, Any]:
         return i[0][:, None] * p["C"], jax.numpy.asarray(none), jax.numpy.asarray(root["R"]), i[1]
 
-    forward = kalman.build_filter(p["mean"], root["covariance"], move, hear)
+    forward = kalman.build_filter(p["mean"], root["covariance"], move, receive)
     backward = kalman.build_smoother(move)
 
     def one_run(gains: Any, z: Any) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ def prepare(p: Arrays) -> Contender:
     def step(state: Any, item: Any) -> tuple[Any, Any]:
         gain, z = item
         sensor = hg.LinearSensor(gain[:, None] * p["C"], p["R"])
-        return hg.extended_filter(plant, sensor, hg.perfect(2)).step_retained(state, z)
+        return hg.extended_filter(plant, sensor, hg.perfect(2)).step_with_smoother(state, z)
 
     def one_run(gains: Any, z: Any) -> tuple[Any, Any]:
         _, steps = jax.lax.scan(step, start, (gains, z))

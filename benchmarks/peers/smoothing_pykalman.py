@@ -13,8 +13,8 @@ def prepare(p: Arrays) -> Contender:
     mean, covariance = p["A"] @ p["mean"], p["A"] @ p["covariance"] @ p["A"].T + p["Q"]  # of its first state
 
     def one_run(gains: Any, z: Any) -> Any:
-        heard = gains[:, :, None] * p["C"]
-        return KalmanFilter(p["A"], heard, p["Q"], p["R"], None, None, mean, covariance).smooth(z)[0]
+        received = gains[:, :, None] * p["C"]
+        return KalmanFilter(p["A"], received, p["Q"], p["R"], None, None, mean, covariance).smooth(z)[0]
 
     def work() -> list[Any]:
         return [one_run(*item) for item in zip(p["gains"][:RUNS], p["z"][:RUNS], strict=True)]

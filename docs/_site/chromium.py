@@ -19,7 +19,7 @@ NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 
 def program() -> str | None:
     """The browser's program, if there is one."""
-    return next((found for name in NAMES if (found := shutil.which(name))), None)
+    return next((result for name in NAMES if (result := shutil.which(name))), None)
 
 
 class Seen(NamedTuple):
@@ -72,11 +72,11 @@ class Browser:
         message = {"id": number, "method": method, "params": parameters}
         os.write(self.to, json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode() + b"\0")
         while True:
-            found = self._next()
-            if found.get("id") == number:
-                assert "error" not in found, found["error"]
-                return found["result"]
-            self.events.append(found)
+            result = self._next()
+            if result.get("id") == number:
+                assert "error" not in result, result["error"]
+                return result["result"]
+            self.events.append(result)
 
     def _next(self) -> dict[str, Any]:
         while b"\0" not in self.buffer:
@@ -95,26 +95,26 @@ class Browser:
         self.call("Page.navigate", url=address)
         while not any(event["method"] == "Page.loadEventFired" for event in self.events):
             self.events.append(self._next())
-        settled = "new Promise(done => setTimeout(() => done(document.documentElement.scrollWidth), 100))"
-        found = self.call("Runtime.evaluate", expression=settled, awaitPromise=True)["result"]["value"]
-        return Seen(self._requests(), self._errors(), found)
+        converged = "new Promise(done => setTimeout(() => done(document.documentElement.scrollWidth), 100))"
+        result = self.call("Runtime.evaluate", expression=converged, awaitPromise=True)["result"]["value"]
+        return Seen(self._requests(), self._errors(), result)
 
     def _requests(self) -> list[str]:
         return [e["params"]["request"]["url"] for e in self.events if e["method"] == "Network.requestWillBeSent"]
 
     def _errors(self) -> list[str]:
-        found = []
+        results = []
         for event in self.events:
             what = event.get("params", {})
             if event["method"] == "Runtime.exceptionThrown":
-                found.append(what["exceptionDetails"]["text"])
+                results.append(what["exceptionDetails"]["text"])
             elif event["method"] == "Log.entryAdded" and what["entry"]["level"] == "error":
-                found.append(f"{what['entry']['text']} {what['entry'].get('url', '')}")
+                results.append(f"{what['entry']['text']} {what['entry'].get('url', '')}")
             elif event["method"] == "Runtime.consoleAPICalled" and what["type"] == "error":
-                found.append(str(what["args"]))
+                results.append(str(what["args"]))
             elif event["method"] == "Network.loadingFailed" and not what.get("canceled"):
-                found.append(what["errorText"])
-        return found
+                results.append(what["errorText"])
+        return results
 
     def picture(self, path: Path) -> None:
         """The whole page as a PNG."""

@@ -25,9 +25,11 @@ def rooms() -> Iterator[tuple[str, str, list[str]]]:
     folder = Path(heliograph.__file__).parent
     modules = [name for name in heliograph.__all__ if inspect.ismodule(getattr(heliograph, name))]
     ordered = sorted(modules, key=lambda name: listed(folder / "__init__.pyi").index(name))
-    own = sorted({stub.parent.name for stub in folder.glob("*/__init__.pyi")} - set(ordered))  # imported by their names
+    local = sorted(
+        {stub.parent.name for stub in folder.glob("*/__init__.pyi")} - set(ordered)
+    )  # imported by their names
     yield "heliograph", summary(heliograph), [n for n in listed(folder / "__init__.pyi") if n not in modules]
-    for name in [*ordered, *own]:
+    for name in [*ordered, *local]:
         names = listed(folder / name / "__init__.pyi")
         if names:
             yield f"heliograph.{name}", summary(import_module(f"heliograph.{name}")), names
@@ -47,12 +49,12 @@ def summary(module: object) -> str:
 def write_pages(folder: Path) -> None:
     """Write the pages and their index; a page that has not changed keeps its time, so that it is not read again."""
     folder.mkdir(parents=True, exist_ok=True)
-    wanted = {"index.rst": index()}
+    expected = {"index.rst": index()}
     for room, what, names in rooms():
-        wanted[f"{short(room)}.rst"] = page(room, what, names)
-    for path in set(folder.glob("*.rst")) - {folder / name for name in wanted}:
+        expected[f"{short(room)}.rst"] = page(room, what, names)
+    for path in set(folder.glob("*.rst")) - {folder / name for name in expected}:
         path.unlink()
-    for name, text in wanted.items():
+    for name, text in expected.items():
         path = folder / name
         if not path.exists() or path.read_text() != text:
             path.write_text(text)
@@ -116,28 +118,28 @@ PLACES = {name: f"{room}.{name}" for room, _, names in rooms() for name in names
 def escaped(text: str) -> str:
     """Plain text as reStructuredText: `names` become links where they are public, code where they are not."""
     parts = re.split(r"`([^`]+)`", text)
-    found = ""
+    result = ""
     for place, part in enumerate(parts):
         if place % 2 == 0:
-            found += SPECIAL.sub(r"\\\1", part)
+            result += SPECIAL.sub(r"\\\1", part)
             continue
         name = part.removesuffix("()").rsplit(".", 1)[-1]
         known = PLACES.get(name) if re.fullmatch(r"[\w.]+(\(\))?", part) else None
         role = f":py:obj:`{part} <{known}>`" if known else f"``{part}``"
-        before = "\\ " if found[-1:] and not found[-1].isspace() and found[-1] not in OPENING else ""
+        before = "\\ " if result[-1:] and not result[-1].isspace() and result[-1] not in OPENING else ""
         after = "\\ " if parts[place + 1][:1].strip(CLOSING) else ""
-        found += before + role + after
-    return found
+        result += before + role + after
+    return result
 
 
 def restructured(lines: list[str]) -> list[str]:
     """A docstring as reStructuredText: paragraphs, indented formulas as they stand, fields for Raises and Source."""
-    found: list[str] = []
+    results: list[str] = []
     for block in re.split(r"\n\s*\n", inspect.cleandoc("\n".join(lines))):
         for part in re.split(r"^(?=(?:Raises|Source):)", block, flags=re.MULTILINE):
             if part.strip():
-                found += [*_part(part.strip("\n")), ""]
-    return found
+                results += [*_part(part.strip("\n")), ""]
+    return results
 
 
 def _part(text: str) -> list[str]:
@@ -164,9 +166,9 @@ def _field(name: str, text: str) -> str:
 def signature(item: object) -> tuple[str, str] | None:
     """Arguments and result in the source's own words."""
     if inspect.isclass(item):
-        own = item.__dict__.get("__init__")
+        local = item.__dict__.get("__init__")
         written = next((c.__init__ for c in item.__mro__ if _written(c.__dict__.get("__init__"))), None)
-        function = written if _written(own) or not getattr(item, "__dataclass_fields__", None) else None
+        function = written if _written(local) or not getattr(item, "__dataclass_fields__", None) else None
         return _of_fields(item) if function is None else (_of_function(function)[0], "")
     return _of_function(inspect.unwrap(item))
 
@@ -189,8 +191,8 @@ def _of_function(function: object) -> tuple[str, str]:
 def _of_fields(item: type) -> tuple[str, str]:
     """The arguments of a class whose `__init__` is made of its fields."""
     written: dict[str, str] = {}
-    for each in reversed([c for c in item.__mro__ if c.__module__.startswith("heliograph")]):
-        body = ast.parse(textwrap.dedent(inspect.getsource(each))).body[0].body
+    for single in reversed([c for c in item.__mro__ if c.__module__.startswith("heliograph")]):
+        body = ast.parse(textwrap.dedent(inspect.getsource(single))).body[0].body
         written |= {n.target.id: ast.unparse(n.annotation) for n in body if isinstance(n, ast.AnnAssign)}
     try:
         known = inspect.signature(item).parameters

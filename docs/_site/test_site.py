@@ -35,12 +35,12 @@ class Links(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
-        found = dict(attributes)
-        self.places |= {name for key in ("id", "name") if (name := found.get(key))}
-        if tag == "a" and found.get("href"):
-            self.leads.add(found["href"])
-        if tag in LOADED and found.get(LOADED[tag]) and found.get("rel") not in NOT_LOADED:
-            self.loads.add(found[LOADED[tag]])
+        result = dict(attributes)
+        self.places |= {name for key in ("id", "name") if (name := result.get(key))}
+        if tag == "a" and result.get("href"):
+            self.leads.add(result["href"])
+        if tag in LOADED and result.get(LOADED[tag]) and result.get("rel") not in NOT_LOADED:
+            self.loads.add(result[LOADED[tag]])
 
 
 @cache
@@ -67,9 +67,11 @@ def test_the_reference_has_every_public_name():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_somewhere(page):
-    found = links(page)
-    assert not [address for address in found.loads if outside(address)]
-    for address in {a for a in found.leads | found.loads if not outside(a) and not a.startswith(("mailto:", "data:"))}:
+    result = links(page)
+    assert not [address for address in result.loads if outside(address)]
+    for address in {
+        a for a in result.leads | result.loads if not outside(a) and not a.startswith(("mailto:", "data:"))
+    }:
         where, place = urldefrag(unquote(address))
         target = ((SITE / page).parent / where.partition("?")[0]).resolve() if where else SITE / page
         assert target.exists(), address
@@ -79,17 +81,17 @@ def test_links_lead_somewhere(page):
 
 @pytest.mark.parametrize("page", QUESTIONS)
 def test_an_answer_is_two_clicks_from_the_start(page):
-    one = {urldefrag(a)[0] for a in links("index.html").leads if not outside(a)} & set(PAGES)
-    two = {urldefrag(a)[0] for first in one if "/" not in first for a in links(first).leads}
-    assert page in one | two
+    item = {urldefrag(a)[0] for a in links("index.html").leads if not outside(a)} & set(PAGES)
+    two = {urldefrag(a)[0] for first in item if "/" not in first for a in links(first).leads}
+    assert page in item | two
 
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
     if program() is None:
         pytest.skip("no Chromium here")
-    with Browser() as found:
-        yield found
+    with Browser() as outcome:
+        yield outcome
 
 
 @pytest.mark.parametrize("width", [1200, 420])

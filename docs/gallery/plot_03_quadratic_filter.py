@@ -29,12 +29,12 @@ print(f"largest skewness of the model: {worth.skewness:.2f} (0: squares would br
 names = {1: "linear", 2: "quadratic", 3: "cubic"}
 filters = {name: hg.polynomial_filter(plant, sensor, link, horizon=30, degree=degree) for degree, name in names.items()}
 network = hg.Network(plant, {"node": hg.Node(sensor, link, filters)})
-found = hg.monte_carlo(network, horizon=30, runs=2048, key=0, keep=hg.Statistics())["node"]
+result = hg.monte_carlo(network, horizon=30, runs=2048, key=0, keep=hg.Statistics())["node"]
 
 fig, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
 for place, (degree, name) in enumerate(names.items()):
     claimed = worth.covariance[degree][10:, 0, 0].mean()
-    has = found[name].actual()[10:, 0, 0].mean()
+    has = result[name].actual()[10:, 0, 0].mean()
     ax.bar(place - 0.2, claimed, 0.4, color="C0", label="claimed before any data" if place == 0 else None)
     ax.bar(place + 0.2, has, 0.4, color="C1", label="2,048 simulated runs" if place == 0 else None)
 ax.set(xticks=range(3), xticklabels=names.values(), ylabel="error variance")

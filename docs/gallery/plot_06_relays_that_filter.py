@@ -27,16 +27,16 @@ even = {"a": {"sensor": link(), "b": link(0.0)}, "receiver": {"b": link()}}
 relays = hg.model.RelayNetwork(plant, sensor, ["a", "b"], [odd, even])
 
 horizon = 25
-own = hg.relays.own_error_design(relays, horizon)
+local = hg.relays.own_error_design(relays, horizon)
 tuned = hg.relays.receiver_error_design(relays, horizon)
 
 fig, axes = plt.subplots(1, 2, figsize=(8, 3.4), layout="constrained")
 for ax, place in zip(axes, ("receiver", "a"), strict=True):
-    for name, design in {"each for itself": own, "all for the receiver": tuned}.items():
+    for name, design in {"each for itself": local, "all for the receiver": tuned}.items():
         traces = np.trace(design.covariance[place], axis1=1, axis2=2)
         ax.semilogy(np.arange(len(traces)), traces, label=name)
     ax.set(title=f"error of {'the receiver' if place == 'receiver' else 'relay a'}", xlabel="step")
 axes[0].set_ylabel("trace of the error covariance")
 axes[0].legend()
-mean = [np.trace(d.covariance["receiver"], axis1=1, axis2=2)[1:].mean() for d in (own, tuned)]
+mean = [np.trace(d.covariance["receiver"], axis1=1, axis2=2)[1:].mean() for d in (local, tuned)]
 print(f"mean trace at the receiver: {mean[0]:.4f} each for itself, {mean[1]:.4f} all for the receiver")

@@ -24,16 +24,16 @@ rule = hg.fusion.EqualIntersection()
 fused = {f"{levels}": hg.Fusion("own", rule, hg.fusion.UniformQuantizer(levels, amplitude=4.0)) for levels in counts}
 fused["not quantized"] = hg.Fusion("own", rule)
 network = hg.Network(rooms, nodes, fused)
-found = hg.monte_carlo(network, horizon=25, runs=512, key=0, keep=hg.Statistics())["fused"]
+result = hg.monte_carlo(network, horizon=25, runs=512, key=0, keep=hg.Statistics())["fused"]
 
-has = [found[str(n)].rmse()[0] for n in counts]
-claims = [np.sqrt(np.trace(found[str(n)].claimed(), axis1=1, axis2=2).mean()) for n in counts]
+has = [result[str(n)].rmse()[0] for n in counts]
+claims = [np.sqrt(np.trace(result[str(n)].claimed(), axis1=1, axis2=2).mean()) for n in counts]
 fig, ax = plt.subplots(figsize=(6, 3.4), layout="constrained")
 ax.semilogx(counts, claims, "s--", label="claimed (upper bound)")
 ax.semilogx(counts, has, "o-", label="RMS error over 512 runs")
-ax.axhline(found["not quantized"].rmse()[0], color="k", lw=1, ls=":", label="not quantized: RMS error")
+ax.axhline(result["not quantized"].rmse()[0], color="k", lw=1, ls=":", label="not quantized: RMS error")
 ax.set(xlabel="levels of the quantizer", ylabel="fused error", ylim=(0, None))
 ax.set_xticks(counts, [str(n) for n in counts], minor=False)
 ax.minorticks_off()
 ax.legend()
-print({name: statistics.claim for name, statistics in found.items()})
+print({name: statistics.claim for name, statistics in result.items()})

@@ -23,12 +23,12 @@ arrivals = np.arange(25) + random.exponential(1.0, 25)
 order = np.argsort(arrivals)
 
 timeline = hg.Timeline(network, window=8)
-verdicts, told = [], []
+verdicts, known = [], []
 for k in order:
     verdict = timeline.push("radio", sequence=k, time=k, values=[values[k]], arrival=arrivals[k])
     verdicts.append(verdict)
     mean = timeline.estimates()["radio"]["kalman"].mean[0]
-    told.append((arrivals[k], mean))
+    known.append((arrivals[k], mean))
 again = timeline.push("radio", sequence=24, time=24, values=[values[24]], arrival=arrivals.max() + 1)
 print({v: verdicts.count(v) for v in set(verdicts)}, "; a copy of the last one:", again)
 
@@ -37,6 +37,6 @@ for k in range(25):
     ax.plot([k, arrivals[k]], [values[k]] * 2, color="0.75", lw=1)
 ax.plot(np.arange(25), values, "k.", label="measured")
 ax.plot(arrivals, values, "C1>", ms=4, label="arrived")
-ax.plot(*np.transpose(told), "C0", label="estimate of the latest moment")
+ax.plot(*np.transpose(known), "C0", label="estimate of the latest moment")
 ax.set(xlabel="time (steps)", ylabel="position")
 _ = ax.legend()

@@ -20,7 +20,7 @@ item = hg.linear_filter(plant, sensor, link)
 # All of it can be had before any data: the gap is an outage of ten steps.
 z = np.zeros((60, 1))
 z[25:35] = np.nan
-_, steps = hg.smoothing.retained_steps(item, z)
+_, steps = hg.smoothing.smoother_steps(item, z)
 waits = {"no wait (filter)": 0, "a lag of 3 steps": 3, "a lag of 10 steps": 10}
 fig, ax = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
 for name, lag in waits.items():

@@ -19,10 +19,10 @@ critical = hg.linear.critical_arrival(plant, sensor)
 arrivals = np.linspace(0.25, 1.0, 16)
 bounds = []
 for arrival in arrivals:
-    heard = hg.erasure(hg.perfect(), arrival)
-    node = hg.Node(sensor, heard, {"told": hg.kalman_filter(plant, sensor)})
-    found = hg.simulation.certify_boundedness(hg.Network(plant, {"node": node}))
-    bounds.append(np.trace(found.bound) if found.verdict == "certified" else np.nan)
+    received = hg.erasure(hg.perfect(), arrival)
+    node = hg.Node(sensor, received, {"told": hg.kalman_filter(plant, sensor)})
+    result = hg.simulation.certify_boundedness(hg.Network(plant, {"node": node}))
+    bounds.append(np.trace(result.bound) if result.verdict == "certified" else np.nan)
 
 fig, ax = plt.subplots(figsize=(6.5, 3.6), layout="constrained")
 ax.axvspan(0.2, critical.lower, color="C3", alpha=0.2, label="every filter diverges")

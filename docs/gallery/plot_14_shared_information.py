@@ -28,14 +28,14 @@ horizon = 30
 
 # What each knows after 30 steps, exactly, before any data. One room alone:
 traces = {}
-own = {}
+local = {}
 for name, node in nodes.items():
     error = hg.filters.true_error(node.filters["own"], rooms, node.sensor, link, horizon)
-    own[name] = hg.model.Estimate(np.zeros(2), error.claimed[-1], "exact")
+    local[name] = hg.model.Estimate(np.zeros(2), error.claimed[-1], "exact")
     traces[f"{name}\nalone"] = np.trace(error.true[-1])
 
 # Intersection knows these two covariances and nothing else; the others know how they are correlated.
-intersection = hg.fusion.fuse(hg.CovarianceIntersection(), list(own.values()))
+intersection = hg.fusion.fuse(hg.CovarianceIntersection(), list(local.values()))
 traces["covariance\nintersection"] = np.trace(intersection.covariance)
 for name, covariance in hg.simulation.fused_covariances(network, horizon).items():
     traces[name] = np.trace(covariance[-1])

@@ -37,8 +37,8 @@ def unknown():
 
 steps = 1600
 pushes = np.where(np.arange(steps) // 30 % 2, 0.4, -0.4)[:, None]
-heard = hg.monte_carlo(network(TRUTH), steps, runs=1, key=0, inputs=pushes).measurements["cart"][0]
-fits = {n: hg.fit(unknown, heard[:n], pushes[:n], starts=1) for n in (400, steps)}
+received = hg.monte_carlo(network(TRUTH), steps, runs=1, key=0, inputs=pushes).measurements["cart"][0]
+fits = {n: hg.fit(unknown, received[:n], pushes[:n], starts=1) for n in (400, steps)}
 print(fits[steps])
 
 # %%
@@ -48,14 +48,14 @@ print(fits[steps])
 world = network(TRUTH)
 cart = world.nodes["cart"]
 learned = {"first guesses": unknown(), "learned": fits[steps].network, "true numbers": world}
-filters = {name: each.nodes["cart"].filters["aware"] for name, each in learned.items()}
+filters = {name: item.nodes["cart"].filters["aware"] for name, item in learned.items()}
 fresh = hg.Network(world.plant, {"cart": hg.Node(cart.sensor, cart.channel, filters)})
 record = hg.monte_carlo(fresh, 100, runs=64, key=1, inputs=pushes[:100])
 
 fig, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), width_ratios=[2, 3], layout="constrained")
 left.axvline(1.0, color="k", lw=1)
-for place, (n, found) in enumerate(fits.items()):
-    for height, row in enumerate(found.rows()):
+for place, (n, result) in enumerate(fits.items()):
+    for height, row in enumerate(result.rows()):
         at, truth = height + 0.2 * (1 - 2 * place), TRUTH[row.name]
         left.plot([row.low / truth, row.high / truth], [at, at], f"C{place}", lw=6, alpha=0.3)
         left.plot(row.estimate / truth, at, f"C{place}o", label=f"{n} steps" if not height else None)

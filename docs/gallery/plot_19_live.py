@@ -16,7 +16,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import heliograph as hg
-from heliograph.serving import Fleet, Lanes, Link, Nowhere, Options, Service, lines, recorded, through
+from heliograph.serving import Fleet, InMemoryStore, Lanes, Link, Options, Service, lines, recorded, through
 
 turn = 0.15 * np.array([[0.0, 1.0], [-1.0, 0.0]])  # an oscillation of some forty steps
 plant = hg.LinearPlant(np.eye(2) + turn, np.diag([0.01, 0.4]), [0.0, 3.0], 0.1 * np.eye(2), states=["x", "v"])
@@ -30,36 +30,36 @@ file = Path(tempfile.mkdtemp()) / "recording.csv"
 rows = np.column_stack([np.arange(60.0), recording.measurements["radio"][0]])
 np.savetxt(file, rows, delimiter=",", header="time,place", comments="")
 sent, origin = recorded(file, network)
-heard = through(sent, Link(loss=0.1, delay=2.0, duplicates=0.1), seed=0)
-service = Service(Fleet(Lanes(network), Options(window=5.0)), Nowhere())
-told = []  # what comes out, with the moment at which it does
-for arrival, message in lines(heard, plant="", origin=origin):
-    told += [(arrival, json.loads(output.body)) for output in service.take([message.encode()])]
-told += [(heard[-1].arrival, json.loads(output.body)) for output in service.finish(ended=True)]
+received = through(sent, Link(loss=0.1, delay=2.0, duplicates=0.1), seed=0)
+service = Service(Fleet(Lanes(network), Options(window=5.0)), InMemoryStore())
+known = []  # what comes out, with the moment at which it does
+for arrival, message in lines(received, plant="", origin=origin):
+    known += [(arrival, json.loads(output.body)) for output in service.take([message.encode()])]
+known += [(received[-1].arrival, json.loads(output.body)) for output in service.finish(ended=True)]
 
 
 first = {}  # what was told of a step while it was the newest
 final = {}
-for _, one in told:
-    if one["kind"] != "refused":
-        known = one["estimates"]["radio"]["aware"]
+for _, message in known:
+    if message["kind"] != "refused":
+        known = message["estimates"]["radio"]["aware"]
         estimate = known["mean"][0], np.sqrt(known["covariance"][0][0])
-        (first if one["kind"] == "provisional" else final).setdefault(one["time"], estimate)
+        (first if message["kind"] == "provisional" else final).setdefault(message["time"], estimate)
 
 fig, (top, bottom) = plt.subplots(2, 1, figsize=(9, 5.2), sharex=True, height_ratios=[3, 2], layout="constrained")
-for name, found, color, shift in (("provisional, as first told", first, "C1", -0.15), ("final", final, "C0", 0.15)):
-    times = np.array(list(found))
-    mean, deviation = np.transpose(list(found.values()))
+for name, result, color, shift in (("provisional, as first told", first, "C1", -0.15), ("final", final, "C0", 0.15)):
+    times = np.array(list(result))
+    mean, deviation = np.transpose(list(result.values()))
     error = mean - truth[times.astype(int)]
     top.errorbar(times + shift, error, 2 * deviation, fmt=".", color=color, elinewidth=2, alpha=0.8, label=name)
-    print(f"{name}: RMS error {np.sqrt(np.mean(error**2)):.3f}, {len(found)} steps")
+    print(f"{name}: RMS error {np.sqrt(np.mean(error**2)):.3f}, {len(result)} steps")
 top.axhline(0.0, color="k", lw=1)
 top.set(ylabel="position, estimate - truth", title="Errors, with two claimed deviations")
 top.legend(fontsize=8, ncols=2)
 
-refused = {(one["sequence"], at): one["reason"] for at, one in told if one["kind"] == "refused"}
+refused = {(item["sequence"], at): item["reason"] for at, item in known if item["kind"] == "refused"}
 colors = {"used": "C0", "late": "C3", "duplicate": "0.6"}
-for place, event in enumerate(heard):
+for place, event in enumerate(received):
     verdict = refused.get((event.sequence, event.arrival), "used")
     bottom.plot([event.time, event.arrival], [place % 7] * 2, colors[verdict], lw=2)
     bottom.plot(event.arrival, place % 7, ">", color=colors[verdict], ms=4)
@@ -73,4 +73,4 @@ bottom.legend(fontsize=8, ncols=3, loc="upper center")
 # filter that has heard everything that came within the window, in the order of time. A copy changes nothing, and what
 # comes later than the window is refused. Each of them is told, with the reason.
 
-print(json.dumps(next(one for _, one in told if one.get("reason") == "late"), indent=1))
+print(json.dumps(next(item for _, item in known if item.get("reason") == "late"), indent=1))

@@ -48,21 +48,21 @@ from .model.fading import (
     gilbert_elliott as gilbert_elliott,
     markov_fading as markov_fading,
 )
-from .filters.gaussian import (
+from .filters.gaussian.gaussian import (
     cubature_filter as cubature_filter,
     extended_filter as extended_filter,
     mean_gain_filter as mean_gain_filter,
 )
-from .filters.kalman import (
+from .filters.gaussian.kalman import (
     kalman_filter as kalman_filter,
 )
-from .filters.linear import (
+from .filters.linear.linear import (
     linear_filter as linear_filter,
 )
-from .filters.polynomial import (
+from .filters.linear.polynomial import (
     polynomial_filter as polynomial_filter,
 )
-from .filters.mixture import (
+from .filters.modes.mixture import (
     mixture_filter as mixture_filter,
 )
 from .fusion.rules import (
@@ -87,10 +87,10 @@ from .simulation.transmission import (
 from .simulation.likelihood import (
     log_likelihood as log_likelihood,
 )
-from .simulation.record import (
+from .simulation.results.record import (
     Record as Record,
 )
-from .simulation.sums import (
+from .simulation.results.sums import (
     Statistics as Statistics,
 )
 from .learning.free_marks import (

@@ -58,8 +58,8 @@ class Statement(NamedTuple):
 
     def entry(self) -> dict[str, Json]:
         """As it stands in a summary, which calls a statement a claim."""
-        evidence = {name: found._asdict() if isinstance(found, Sampled) else found
-                    for name, found in self.evidence.items()}  # fmt: skip
+        evidence = {name: item._asdict() if isinstance(item, Sampled) else item
+                    for name, item in self.evidence.items()}  # fmt: skip
         return {"claim": self.text, "source": self.source, "paper": self.paper, "ours": self.ours,
                 "verdict": self.verdict, "evidence": evidence}  # fmt: skip
 

@@ -23,7 +23,7 @@ DOT = """(() => {  // where the first dot of the second panel is
     const {x, y} = view.model.renderers.at(-1).data_source.data;
     return [plot.x + view.frame.x_scale.compute(x[0]), plot.y + view.frame.y_scale.compute(y[0])];
 })()"""
-TOLD = """new Promise(next => setTimeout(next, 300)).then(() => {
+TEXTS = """new Promise(next => setTimeout(next, 300)).then(() => {
     const text = [], walk = node => {
         if (node.nodeType === 3) text.push(node.data);
         if (node.tagName === "IMG" && !node.closest?.(".static")) text.push("AN IMAGE");
@@ -47,11 +47,11 @@ def check(browser: Browser, page: Path, node: str) -> None:
     assert ask(TITLES) == ["node: near", f"node: {node}"]
     assert ask(ROWS) == 6  # three gains, two nodes, the first noise
     ask("document.getElementById('panels').children[1].scrollIntoView()")
-    before = ask(TOLD)
+    before = ask(TEXTS)
     x, y = ask(DOT)
     browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
-    told = ask(TOLD)
-    assert told.count(node) == before.count(node) + 1 and "AN IMAGE" not in told, told  # the dot says it, as text
+    known = ask(TEXTS)
+    assert known.count(node) == before.count(node) + 1 and "AN IMAGE" not in known, known  # the dot says it, as text
     ask(CHOOSE % ("panel", "noise"))
     assert ask(DRAWN % 2) == 2
     assert ask(TITLES) == ["noise: 0.1", "noise: 0.2"] and ask(ROWS) == 12

@@ -33,25 +33,29 @@ def scores(finished):
 @pytest.fixture(scope="module")
 def hostile(campaign, scores):
     """The page of two nodes, one of which has markup for a name, and of a number that is none."""
-    there = [score for one in scores for score in (one, replace(one, node=HOSTILE, nees_per_dimension=float("nan")))]
+    there = [
+        score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
+    ]
     return explore.explore_page(campaign, there)
 
 
 @pytest.fixture(scope="module")
 def explored(campaign, scores):
     """The page of two nodes and of four steps of two states."""
-    found = [
+    results = [
         Detail(s.setting, node, s.filter, s.claim, state, step, 1.0 / (step + 1), 0.1, 1.0, 1.0, 0.1, 100)
         for s in scores for node in ("near", HOSTILE) for state in ("x", "y") for step in range(5)
     ]  # fmt: skip
-    there = [score for one in scores for score in (one, replace(one, node=HOSTILE, nees_per_dimension=float("nan")))]
-    return explore.explore_page(campaign, there, lambda settings, steps: [d for d in found if d.setting in settings])
+    there = [
+        score for single in scores for score in (single, replace(single, node=HOSTILE, nees_per_dimension=float("nan")))
+    ]
+    return explore.explore_page(campaign, there, lambda settings, steps: [d for d in results if d.setting in settings])
 
 
 def data(html):
     """The tables of a page: of all steps together, and step by step where they were looked at."""
-    (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)
-    return json.loads(found)
+    (result,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', html, re.DOTALL)
+    return json.loads(result)
 
 
 def test_the_page_holds_the_scores(finished, scores, tmp_path, capsys):
@@ -78,8 +82,10 @@ def test_nothing_is_fetched_and_every_text_is_escaped(hostile):
     tags = re.findall(r"<(?!/)[a-z][^>]*>", re.sub(r"<script.*?</script>", "", hostile, flags=re.DOTALL))
     addresses = re.findall(r'\b(?:src|href)="([^"]*)', "".join(tags))
     assert addresses and all(address.startswith("data:image/svg+xml;base64,") for address in addresses)
-    own = re.sub(r"<script>.*?</script>", "", hostile, count=1, flags=re.DOTALL)  # without Bokeh, which names addresses
-    assert "http" not in own and not re.search(r"<script[^>]+src|@import|url\(", own)
+    local = re.sub(
+        r"<script>.*?</script>", "", hostile, count=1, flags=re.DOTALL
+    )  # without Bokeh, which names addresses
+    assert "http" not in local and not re.search(r"<script[^>]+src|@import|url\(", local)
 
 
 def test_the_fixed_pictures_and_the_table_are_there_for_print(hostile):
@@ -97,10 +103,10 @@ def test_a_big_campaign_says_what_is_shown(campaign, scores, monkeypatch):
 def test_a_campaign_without_numbers_is_drawn_by_setting(campaign):
     named = replace(campaign, settings=[{"kind": ["a", 1]}, {"kind": ["b"]}])
     alike = replace(campaign, settings=[{"kind": "a"}])
-    one = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
-    (table,) = data(explore.explore_page(named, [*one, replace(one[0], setting=1)]))
+    item = [Score(0, "near", "f", "none", 1.0, 0.1, 2.0, 0.1, 3, 3)]
+    (table,) = data(explore.explore_page(named, [*item, replace(item[0], setting=1)]))
     assert table["x"] == "kind" and table["columns"]["kind"] == ['["a", 1]', '["b"]']
-    assert data(explore.explore_page(alike, one))[0]["x"] == "setting"
+    assert data(explore.explore_page(alike, item))[0]["x"] == "setting"
 
 
 def test_single_states_add_up_to_the_scores(tmp_path):
@@ -110,27 +116,31 @@ def test_single_states_add_up_to_the_scores(tmp_path):
         "LinearSensor([[1.0]]", "LinearSensor([[1.0, 0.0]]"))  # fmt: skip
     run_campaign(plan, tmp_path / "out", workers=0)
     scores, results = read_summary(tmp_path / "out" / SUMMARY), open_results(tmp_path / "out")
-    found = details(tmp_path / "out" / STORE, plan, [0, 1], [1, 3, 6])
+    result = details(tmp_path / "out" / STORE, plan, [0, 1], [1, 3, 6])
     for score in scores:
-        whole = [one for one in found if one.setting == score.setting and not one.step]
-        assert sum(one.rmse**2 for one in whole) == pytest.approx(score.rmse**2, rel=1e-12)
-        assert np.mean([one.nees_per_dimension for one in whole]) > 0 and {one.finite_runs for one in whole} == {100}
+        whole = [item for item in result if item.setting == score.setting and not item.step]
+        assert sum(item.rmse**2 for item in whole) == pytest.approx(score.rmse**2, rel=1e-12)
+        assert np.mean([item.nees_per_dimension for item in whole]) > 0 and {item.finite_runs for item in whole} == {
+            100
+        }
     error, variance = results.error[1, :, 2, 0, 0, 1].values, results.variance[1, :, 2, 0, 0, 1].values
-    (one,) = [d for d in found if (d.setting, d.step, d.state) == (1, 3, results.state.values[1])]
-    assert one.rmse == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
-    assert one.claimed == pytest.approx(np.sqrt(np.mean(variance)), rel=1e-12)
-    assert one.nees_per_dimension == pytest.approx(np.mean(error**2 / variance), rel=1e-12)
+    (item,) = [d for d in result if (d.setting, d.step, d.state) == (1, 3, results.state.values[1])]
+    assert item.rmse == pytest.approx(np.sqrt(np.mean(error**2)), rel=1e-12)
+    assert item.claimed == pytest.approx(np.sqrt(np.mean(variance)), rel=1e-12)
+    assert item.nees_per_dimension == pytest.approx(np.mean(error**2 / variance), rel=1e-12)
     spread = np.std(error**2 / variance, ddof=1) / 10
-    assert one.nees_error == pytest.approx(spread, rel=1e-9)  # from sums of squares
-    assert one.rmse_error == pytest.approx(np.std(error**2, ddof=1) / 10 / (2 * one.rmse), rel=1e-9)
+    assert item.nees_error == pytest.approx(spread, rel=1e-9)  # from sums of squares
+    assert item.rmse_error == pytest.approx(np.std(error**2, ddof=1) / 10 / (2 * item.rmse), rel=1e-9)
 
 
 @pytest.mark.parametrize("place", ["nowhere", "empty"])
 def test_a_folder_without_results_is_one_line(place, tmp_path, capsys):
     (tmp_path / "empty").mkdir()
     assert cli.main(["explore", str(tmp_path / place), "--out", str(tmp_path / "out")]) == cli.BAD_INPUT
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1 and "expected results.zarr and summary.csv" in told and "got no results.zarr" in told
+    known = capsys.readouterr().err
+    assert (
+        known.count("\n") == 1 and "expected results.zarr and summary.csv" in known and "got no results.zarr" in known
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -140,5 +150,5 @@ def test_a_browser_draws_what_is_chosen(explored, tmp_path):
     page.write_text(explored)
     # A process of its own: this one has threads, and the browser is given its pipes by a fork.
     script = [sys.executable, str(Path(__file__).with_name("browse.py")), str(page), HOSTILE]
-    told = subprocess.run(script, capture_output=True, text=True, timeout=120)
-    assert told.returncode == 0, told.stderr
+    completed = subprocess.run(script, capture_output=True, text=True, timeout=120)
+    assert completed.returncode == 0, completed.stderr

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.campaign.keep import Errors
+from heliograph.campaign.reducer import Errors
 from heliograph.campaign.run import run_campaign
 from heliograph.campaign.summary import _score, open_results, read_summary
 from tests.campaign.example import CAMPAIGN, CHUNKS, NETWORK, chunk_files, contents, write
@@ -41,11 +41,11 @@ def test_the_table_agrees_with_the_statistics_of_monte_carlo(tmp_path, finished)
     campaign, scores = write(tmp_path), read_summary(finished / "summary.csv")
     assert [score.setting for score in scores] == list(range(6))
     network = campaign.function()(**campaign.settings[3])
-    found = hg.monte_carlo(network, 4, 100, campaign.key(3), hg.Statistics())["near"]["trusting"]
-    assert scores[3].rmse == pytest.approx(found.rmse()[0], rel=1e-12)
-    assert scores[3].nees_per_dimension == pytest.approx(found.nees_per_dimension()[0], rel=1e-12)
+    result = hg.monte_carlo(network, 4, 100, campaign.key(3), hg.Statistics())["near"]["trusting"]
+    assert scores[3].rmse == pytest.approx(result.rmse()[0], rel=1e-12)
+    assert scores[3].nees_per_dimension == pytest.approx(result.nees_per_dimension()[0], rel=1e-12)
     # One from the scatter of 100 runs, the other of 50 batches of 2: both estimate the same, each to some 10 %.
-    assert scores[3].rmse_error == pytest.approx(found.rmse()[1], rel=0.4)
+    assert scores[3].rmse_error == pytest.approx(result.rmse()[1], rel=0.4)
     assert (scores[3].runs, scores[3].finite_runs, scores[3].claim) == (100, 100, "nominal")
 
 
@@ -75,10 +75,10 @@ def test_different_nodes_and_filters_and_the_world(tmp_path):
     assert list(results.kind.values) == ["", "two"] and list(results.noise.values) == ["", "[[0.2]]"]
     np.testing.assert_array_equal(np.isfinite(results.measurement).all(("run", "time", "received")), [[1, 0], [1, 1]])
     network = campaign.function()(**campaign.settings[1])
-    kept = hg.monte_carlo(network, 4, 64, campaign.key(1), Errors(world=True))
-    assert np.array_equal(results.truth[1, :64], kept["truth"])  # the very same program
-    assert np.array_equal(results.measurement[1, :64, :, 1], kept["measurements"]["far"])
-    assert np.array_equal(results.error[1, :64, :, 1, 1], kept["estimates"]["far"]["other"]["error"])
+    recorded = hg.monte_carlo(network, 4, 64, campaign.key(1), Errors(world=True))
+    assert np.array_equal(results.truth[1, :64], recorded["truth"])  # the very same program
+    assert np.array_equal(results.measurement[1, :64, :, 1], recorded["measurements"]["far"])
+    assert np.array_equal(results.error[1, :64, :, 1, 1], recorded["estimates"]["far"]["other"]["error"])
     scores = read_summary(tmp_path / "out" / "summary.csv")
     assert [(s.setting, s.node, s.filter, s.claim) for s in scores] == [
         (0, "near", "trusting", "nominal"),

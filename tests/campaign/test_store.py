@@ -122,11 +122,11 @@ READING = NETWORK.replace("    plant = hg", "    if gain == 0.7:\n        input(
 @pytest.fixture
 def out_of_time_where_it_hangs(tmp_path, monkeypatch):
     """The time of a job is over as soon as it hangs, and not before; gives what a job may take, as it was asked for."""
-    asked = []
+    requested = []
 
     class Hanging(Timer):
         def run(self):
-            asked.append(self.interval)
+            requested.append(self.interval)
             while not self.finished.wait(0.01):
                 if (tmp_path / "hangs").exists():
                     (tmp_path / "hangs").unlink()
@@ -135,7 +135,7 @@ def out_of_time_where_it_hangs(tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(engines, "Timer", Hanging)
-    return asked
+    return requested
 
 
 @pytest.mark.slow

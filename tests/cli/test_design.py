@@ -24,7 +24,7 @@ def place(x=1.0, y=0.0):
 
 network = place()
 """
-ASKED = """
+REQUESTED = """
 network = "yard.py"
 budget = 2.0
 path_loss_exponent = 2.0
@@ -41,7 +41,7 @@ points = 2
 def folder(tmp_path_factory):
     here = tmp_path_factory.mktemp("yard")
     (here / "yard.py").write_text(NETWORK)
-    (here / "design.toml").write_text(ASKED)
+    (here / "design.toml").write_text(REQUESTED)
     assert cli.main(["design", str(here / "design.toml"), "--out", str(here / "out")]) == 0
     return here
 

@@ -38,12 +38,12 @@ def folder(tmp_path_factory):
 
 
 def test_the_numbers_are_found_with_their_intervals(folder):
-    found = json.loads((folder / "out" / "fitted.json").read_text())
-    rows = {row["name"]: row for row in found["table"]}
+    content = json.loads((folder / "out" / "fitted.json").read_text())
+    rows = {row["name"]: row for row in content["table"]}
     for name, truth in {"plant noise": 0.2, "hop noise": 0.5}.items():
         assert rows[name]["low"] < truth < rows[name]["high"]
-        assert found["values"][name] == rows[name]["estimate"]
-    assert found["rows"] == 450 and found["converged"] and not found["stopped"]
+        assert content["values"][name] == rows[name]["estimate"]
+    assert content["rows"] == 450 and content["converged"] and not content["stopped"]
 
 
 def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tmp_path):
@@ -57,19 +57,19 @@ def test_the_fitted_network_runs_where_the_folders_are_moved_together(folder, tm
 def test_the_filter_is_better_on_rows_it_has_not_seen(folder):
     """By the difference of the log-likelihoods of both filters over the last 150 rows, computed another way."""
     summary = json.loads((folder / "out" / "summary.json").read_text())
-    (one,) = summary["filters"]
+    (item,) = summary["filters"]
     assert summary["held_out_rows"] == 150
-    assert one["gain"] > 2 * one["gain_error"]
-    assert abs(one["size_after"] - 1) < abs(one["size_before"] - 1)
+    assert item["gain"] > 2 * item["gain_error"]
+    assert abs(item["size_after"] - 1) < abs(item["size_before"] - 1)
     before = hg.files.load_network(str(folder / "cart.py"))
     after = hg.files.load_network(str(folder / "out" / "fitted_network.py"))
     z = hg.files.read_recording(folder / "data.csv", before).measurements["a"]
     whole, early = (
         [hg.log_likelihood(n.nodes["a"].filters["aware"], part) for n in (before, after)] for part in (z, z[:450])
     )
-    heard = np.count_nonzero(~np.isnan(z[450:]))
-    gain = (whole[1] - early[1] - whole[0] + early[0]) / heard
-    assert one["gain"] == pytest.approx(gain, rel=1e-9)
+    received = np.count_nonzero(~np.isnan(z[450:]))
+    gain = (whole[1] - early[1] - whole[0] + early[0]) / received
+    assert item["gain"] == pytest.approx(gain, rel=1e-9)
 
 
 def test_the_page_says_what_was_learned(folder, fits):
@@ -130,6 +130,6 @@ def test_an_interrupted_search_keeps_the_best_so_far(folder, tmp_path, monkeypat
     out = tmp_path / "out"
     command = ["fit", str(folder / "cart.py"), "--measurements", str(folder / "data.csv"), "--out", str(out)]
     assert main([*command, "--starts", "2"]) == 0  # the command itself was not interrupted
-    found = json.loads((out / "fitted.json").read_text())
-    assert found["stopped"] and "best so far" in found["sentences"][0]
-    assert np.isfinite(list(found["values"].values())).all()
+    content = json.loads((out / "fitted.json").read_text())
+    assert content["stopped"] and "best so far" in content["sentences"][0]
+    assert np.isfinite(list(content["values"].values())).all()

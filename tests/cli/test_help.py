@@ -50,8 +50,8 @@ def test_bash_completes_a_word(capsys):
     assert cli.main(["completion", "bash"]) == 0
     script = capsys.readouterr().out
     name = re.search(r"complete .*-F (\w+) ", script)[1]
-    asked = "COMP_WORDS=(heliograph rep); COMP_CWORD=1; COMP_LINE='heliograph rep'; COMP_POINT=14"
-    ask = f"{asked}; {name}; echo ${{COMPREPLY[@]}}"
+    requested = "COMP_WORDS=(heliograph rep); COMP_CWORD=1; COMP_LINE='heliograph rep'; COMP_POINT=14"
+    ask = f"{requested}; {name}; echo ${{COMPREPLY[@]}}"
     done = subprocess.run(["bash", "-c", f"{script}\n{ask}"], capture_output=True, text=True)
     assert "reproduce" in done.stdout.split()
 
@@ -83,9 +83,9 @@ def test_results_are_not_put_one_folder_deeper_than_said(monkeypatch, out, expec
 def test_a_hint_is_a_remedy(folder, text):
     """Whatever it says to do is done here, and the table then is one."""
     (folder / "data.csv").write_text(text)
-    with pytest.raises(ValueError) as told:
+    with pytest.raises(ValueError) as raised:
         read_table("data.csv")
-    remedy = re.search(r": (pandas.*) rewrites it$", str(told.value))[1]
+    remedy = re.search(r": (pandas.*) rewrites it$", str(raised.value))[1]
     exec(remedy, {"pandas": pandas})
     np.testing.assert_array_equal(read_table("data.csv")["pos"], [1.5])
     np.testing.assert_array_equal(read_table("data.csv")["time"], [0.5])

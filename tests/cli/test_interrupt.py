@@ -49,7 +49,7 @@ def in_a_callback():
     raise AssertionError("it went on")
 
 
-def told_as_something_else():
+def raised_as_something_else():
     try:
         signal.raise_signal(signal.SIGINT)
     except KeyboardInterrupt:
@@ -63,7 +63,7 @@ def kept_quiet():
         return
 
 
-@pytest.mark.parametrize("interrupt", [in_a_callback, told_as_something_else, kept_quiet])
+@pytest.mark.parametrize("interrupt", [in_a_callback, raised_as_something_else, kept_quiet])
 def test_an_interrupt_ends_with_130_whoever_swallows_it(folder, monkeypatch, capsys, interrupt):
     stub_study(monkeypatch, lambda *_: interrupt())
     inherited = signal.signal(signal.SIGINT, signal.default_int_handler)

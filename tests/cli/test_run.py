@@ -27,11 +27,11 @@ def test_run_writes_what_the_library_computes(folder, capsys):
         for k in range(4):
             estimate = stream.push(recording.measurements["remote"][k], recording.inputs[k])
             row = {key: table[f"{name}.{key}"][k] for key in ("p", "v", "p.sd", "v.sd", "cov.p.v", "valid")}
-            found = [row["p"], row["v"], row["p.sd"] ** 2, row["v.sd"] ** 2, row["cov.p.v"]]
+            results = [row["p"], row["v"], row["p.sd"] ** 2, row["v.sd"] ** 2, row["cov.p.v"]]
             bound = estimate.covariance
             expected = [*estimate.mean, bound[0, 0], bound[1, 1], bound[0, 1]]
             # compiled apart, and the variance went through a root and back: rounding only
-            np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(results, expected, rtol=1e-12, atol=1e-12)
             assert row["valid"] == 1
 
 
@@ -41,8 +41,8 @@ def test_run_writes_what_later_rows_say_too(folder, capsys):
         folder / "page" / "report.html"
     ).read_text()
     net, table = load_network("net.py"), read_table("out.csv")
-    found = h.run(net, *read_recording("data.csv", net), smooth=h.smoothing.FixedLag(1)).smoothed
-    for name, estimate in found.estimates["remote"].items():
+    result = h.run(net, *read_recording("data.csv", net), smooth=h.smoothing.FixedLag(1)).smoothed
+    for name, estimate in result.estimates["remote"].items():
         np.testing.assert_allclose(table[f"{name}.smoothed.p"], estimate.mean[:, 0], rtol=1e-12)
         assert table[f"{name}.smoothed.v.sd"][1] < table[f"{name}.v.sd"][1]
     assert cli.main([*run_arguments(), "--smooth", "soon"]) == 2

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 import llvmlite.binding as llvm
 import numpy as np
 
-from heliograph.codegen.vector_math import functions
+from heliograph.codegen.vectors.elementary import functions
 
 WIDTH = 8
 

@@ -35,14 +35,14 @@ FILTERS = {
 def over_recording(item):
     """A function of one recording: all estimates, and the state after it."""
 
-    def one(z):
+    def single(z):
         def body(state, row):
             state, estimate = item.step(state, row[0], np.zeros(0), row[1])
             return state, (estimate.mean, estimate.covariance)
 
         return jax.lax.scan(body, jax.tree.map(jnp.asarray, item.init()), (z, jnp.arange(len(z))))[1]
 
-    return one
+    return single
 
 
 def measurements(item, runs, steps):
@@ -54,10 +54,10 @@ def measurements(item, runs, steps):
 def test_every_filter_gives_what_xla_gives(name):
     """To 1e-12 of the claimed deviation; what did not arrive among the data."""
     item = FILTERS[name]()
-    one, z = over_recording(item), measurements(item, 5, 30)
-    mean, covariance = compile(one, z[0])(z)
+    single, z = over_recording(item), measurements(item, 5, 30)
+    mean, covariance = compile(single, z[0])(z)
     with jax.enable_x64(True):
-        expected = [np.asarray(x) for x in jax.jit(jax.vmap(one))(z)]
+        expected = [np.asarray(x) for x in jax.jit(jax.vmap(single))(z)]
     deviation = np.sqrt(np.diagonal(expected[1], axis1=-2, axis2=-1))
     assert np.max(np.abs(mean - expected[0]) / deviation) < 1e-12
     assert np.max(np.abs(covariance - expected[1]) / deviation[..., None] / deviation[..., None, :]) < 1e-12
@@ -67,13 +67,13 @@ def test_every_filter_gives_what_xla_gives(name):
 def test_bits_depend_on_no_width_and_no_neighbour(name):
     """Of one run alone, of 13 in blocks of 8, 4 and 16, by one core and by several."""
     item = FILTERS[name]()
-    one, z = over_recording(item), measurements(item, 13, 20)
-    program = lower(one, z[0])
+    single, z = over_recording(item), measurements(item, 13, 20)
+    program = lower(single, z[0])
     whole = Compiled(program, [True], 8)(z, cores=3)
     for width in (4, 16):
-        for a, b in zip(whole, Compiled(lower(one, z[0]), [True], width)(z, cores=1), strict=True):
+        for a, b in zip(whole, Compiled(lower(single, z[0]), [True], width)(z, cores=1), strict=True):
             np.testing.assert_array_equal(a, b)
-    alone = Alone(lower(one, z[0]))
+    alone = Alone(lower(single, z[0]))
     for run in (0, 12):
         alone.inputs[0][...] = z[run]
         alone()
@@ -105,15 +105,15 @@ def test_what_all_runs_share_is_computed_once_and_gives_the_same_bits():
     """A filter whose covariances depend on no data: computed beside the runs, or within them."""
     item = FILTERS["linear"]()
 
-    def one(z, noise):
+    def single(z, noise):
         sensor = hg.LinearSensor([[1.0, 0.5]], noise)
         return over_recording(hg.linear_filter(PLANT, sensor, hg.perfect()))(z)
 
     z = RANDOM.normal(size=(9, 40, item.received))
     noise = np.full((1, 1), 0.3)
-    shared = compile(one, z[0], noise, shared=(1,))
+    shared = compile(single, z[0], noise, shared=(1,))
     assert shared.once is not None
-    for a, b in zip(shared(z, noise), compile(one, z[0], noise)(z, np.repeat(noise[None], 9, 0)), strict=True):
+    for a, b in zip(shared(z, noise), compile(single, z[0], noise)(z, np.repeat(noise[None], 9, 0)), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -151,10 +151,10 @@ def test_arithmetic_on_whole_recordings_is_a_loop_over_their_rows():
         )
 
     x, y = RANDOM.normal(size=(6, 90, 3)), RANDOM.normal(size=(6, 90))
-    found = compile(function, x[0], y[0])(x, y)
+    result = compile(function, x[0], y[0])(x, y)
     with jax.enable_x64(True):
         expected = jax.vmap(function)(x, y)
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(result, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-13)
 
 
@@ -181,10 +181,10 @@ def test_numbers_of_the_data_choose_rows_of_tables_and_recordings():
 )
 def test_special_numbers_are_what_jax_makes_of_them(function):
     x = np.concatenate([RANDOM.normal(size=20), [0.0, -0.0, np.nan, np.inf, -np.inf, 1e300, 1e-300, 0.5, -2.5]])
-    found = compile(function, x[0])(x)
+    result = compile(function, x[0])(x)
     with jax.enable_x64(True):
         expected = jax.vmap(function)(x)
-    for a, b in zip(found, expected, strict=True):
+    for a, b in zip(result, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-14)
 
 

@@ -27,15 +27,15 @@ ZONES = st.integers(-23 * 60, 23 * 60).map(lambda minutes: timezone(timedelta(mi
 def test_a_date_is_the_instant_that_python_says(moment, zone, space):
     aware = moment.replace(tzinfo=zone)
     text = aware.isoformat(sep=" " if space else "T")
-    (found,) = dates([text], "time")
+    (result,) = dates([text], "time")
     expected = np.datetime64(aware.astimezone(UTC).replace(tzinfo=None), "ns")
-    assert found == expected and dates([aware], "time")[0] == expected
-    assert dates(in_iso(np.array([found])), "time")[0] == found
+    assert result == expected and dates([aware], "time")[0] == expected
+    assert dates(in_iso(np.array([result])), "time")[0] == result
 
 
 def test_what_else_is_a_date_and_what_is_none():
-    found = dates(["2026-11-21T23:25:00.123456789Z", "2026-11-21 23:25:00.5UTC", "2026-11-22T01:25+02"], "time")
-    assert [str(t) for t in found] == [
+    result = dates(["2026-11-21T23:25:00.123456789Z", "2026-11-21 23:25:00.5UTC", "2026-11-22T01:25+02"], "time")
+    assert [str(t) for t in result] == [
         "2026-11-21T23:25:00.123456789",
         "2026-11-21T23:25:00.500000000",
         "2026-11-21T23:25:00.000000000",
@@ -106,8 +106,8 @@ class OfPolars:
 
 
 def test_other_frames_are_tables():
-    found = columns_of(OfPolars(time=np.array(["2026-11-21T23:25"], dtype="datetime64[us]"), pos=[3]))
-    assert found["time"].dtype == "datetime64[ns]" and found["pos"].dtype == np.float64
+    result = columns_of(OfPolars(time=np.array(["2026-11-21T23:25"], dtype="datetime64[us]"), pos=[3]))
+    assert result["time"].dtype == "datetime64[ns]" and result["pos"].dtype == np.float64
 
 
 @pytest.mark.parametrize(
@@ -127,9 +127,9 @@ def test_other_frames_are_tables():
     ],
 )
 def test_tables_that_are_none(table, words):
-    with pytest.raises(ValueError) as told:
+    with pytest.raises(ValueError) as raised:
         hg.files.read_recording(table, NETWORK)
-    assert words in str(told.value) and "\n" not in str(told.value)
+    assert words in str(raised.value) and "\n" not in str(raised.value)
 
 
 def test_times_of_a_run_may_be_dates_that_do_not_go_backwards():
@@ -148,19 +148,19 @@ def test_a_recording_comes_back_bit_for_bit(values, ending, tmp_path):
     time, z = np.arange(len(values)) / 3, np.array(values)
     recording = hg.files.Recording({"a": z[:, None]}, time[:, None], time)
     hg.files.write_recording(recording, NETWORK, tmp_path / f"recording{ending}")
-    found = hg.files.read_recording(tmp_path / f"recording{ending}", NETWORK)
+    result = hg.files.read_recording(tmp_path / f"recording{ending}", NETWORK)
     assert (
-        found == recording
-        and np.signbit(found.measurements["a"])[~np.isnan(z)].tolist() == np.signbit(z[~np.isnan(z), None]).tolist()
+        result == recording
+        and np.signbit(result.measurements["a"])[~np.isnan(z)].tolist() == np.signbit(z[~np.isnan(z), None]).tolist()
     )
 
 
 def test_a_column_of_dates_in_a_table_is_dates(tmp_path):
     (tmp_path / "t.csv").write_text("when,x\n2026-11-21,1\n,2\n")
-    found = read_table(tmp_path / "t.csv")
-    assert np.isnat(found["when"][1]) and found["x"].tolist() == [1, 2]
-    write_table(found, tmp_path / "u.parquet")
-    np.testing.assert_array_equal(read_table(tmp_path / "u.parquet")["when"], found["when"])
+    result = read_table(tmp_path / "t.csv")
+    assert np.isnat(result["when"][1]) and result["x"].tolist() == [1, 2]
+    write_table(result, tmp_path / "u.parquet")
+    np.testing.assert_array_equal(read_table(tmp_path / "u.parquet")["when"], result["when"])
 
 
 @settings(max_examples=100, derandomize=True)

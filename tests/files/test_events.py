@@ -49,7 +49,7 @@ def written(path, header, rows):
     return path
 
 
-def heard(row):
+def received(row):
     """The cells of its node."""
     return row[6:] if row[0] == "inputs" else row[4:6]
 
@@ -59,8 +59,8 @@ def dated(seconds):
     return f"2026-11-21T10:00:{seconds:06.3f}+01:00"
 
 
-def same(one, other):
-    for a, b in zip(one, other, strict=True):
+def same(item, other):
+    for a, b in zip(item, other, strict=True):
         assert a[:3] == b[:3] and a.arrival == b.arrival
         np.testing.assert_array_equal(a.values, b.values)
 
@@ -70,10 +70,10 @@ def test_every_way_to_write_events_is_read_alike(tmp_path, network):
     assert none is None and plain[1].node == "cart"
     np.testing.assert_array_equal(plain[1].values, [1.0, np.nan])
     rows = [(n, s, dated(t), dated(a), *rest) for n, s, t, a, *rest in ROWS]
-    found, origin = read_events(written(tmp_path / "b.csv", HEADER, rows), network)
-    same(plain, found)
+    result, origin = read_events(written(tmp_path / "b.csv", HEADER, rows), network)
+    same(plain, result)
     assert origin == np.datetime64("2026-11-21T09:00:00")
-    rows = [(*row[:4], " ".join(cell or "nan" for cell in heard(row))) for row in ROWS]
+    rows = [(*row[:4], " ".join(cell or "nan" for cell in received(row))) for row in ROWS]
     same(plain, read_events(written(tmp_path / "c.csv", [*HEADER[:4], "values"], rows), network)[0])
     columns = dict(zip(HEADER, zip(*ROWS, strict=True), strict=True))
     numbers = {name: [float(x) if x else None for x in columns[name]] for name in HEADER[4:]}
@@ -138,20 +138,20 @@ def test_columns_that_nobody_knows_or_that_lack_are_named(tmp_path, network):
 
 def test_playing_gives_final_and_lagged_estimates(network):
     """Final ones are those of the rows in order; of each moment then what was heard a lag later."""
-    events = [Event(*row[:3], [float(cell or "nan") for cell in heard(row)], row[3]) for row in ROWS]
-    found = play(network, events, 5.0, 1.0)
-    assert {name: {v: n for v, n in each.items() if n} for name, each in found.counts.items()} == {
+    events = [Event(*row[:3], [float(cell or "nan") for cell in received(row)], row[3]) for row in ROWS]
+    result = play(network, events, 5.0, 1.0)
+    assert {name: {v: n for v, n in count.items() if n} for name, count in result.counts.items()} == {
         "cart": {"used": 4, "duplicate": 1, "late": 1}, "inputs": {"used": 1},
     }  # fmt: skip
-    assert found.final.time.tolist() == [1.5, 2.0, 3.0, 9.0] and found.lagged.time.tolist() == [1.5, 3.0, 9.0]
+    assert result.final.time.tolist() == [1.5, 2.0, 3.0, 9.0] and result.lagged.time.tolist() == [1.5, 3.0, 9.0]
     rows = [events[i].values for i in (1, 3, 2, 5)]
     u = [[0.1, dt] for dt in (1.5, 0.5, 1.0, 6.0)]
     whole = hg.run(network, {"cart": rows}, u)
-    np.testing.assert_allclose(found.final.estimates["cart"]["f"].mean, whole.estimates["cart"]["f"].mean, rtol=1e-12)
+    np.testing.assert_allclose(result.final.estimates["cart"]["f"].mean, whole.estimates["cart"]["f"].mean, rtol=1e-12)
     within = hg.run(
         network, {"cart": rows[:3]}, u[:3], smooth=hg.smoothing.FixedLag(1)
     )  # at 2.5 nothing else was there
-    late = found.lagged.estimates["cart"]["f"]
+    late = result.lagged.estimates["cart"]["f"]
     np.testing.assert_allclose(late.mean[1], within.estimates["cart"]["f"].mean[2], rtol=1e-12)
     alone = hg.run(network, {"cart": rows[:1]}, u[:1])
     np.testing.assert_allclose(late.mean[0], alone.estimates["cart"]["f"].mean[0], rtol=1e-12)
@@ -162,8 +162,8 @@ def test_the_command_takes_events(tmp_path, capsys):
     data, out = written(tmp_path / "events.csv", HEADER, ROWS), tmp_path / "est.csv"
     command = ["run", str(tmp_path / "net.py"), "--measurements", str(data), "--out", str(out)]
     assert main([*command, "--window", "5", "--lag", "1"]) == 0
-    told = capsys.readouterr().out
-    assert "4 rows of cart/f" in told and "cart: 4 used, 1 duplicate, 1 late" in told and "inputs: 1 used" in told
+    known = capsys.readouterr().out
+    assert "4 rows of cart/f" in known and "cart: 4 used, 1 duplicate, 1 late" in known and "inputs: 1 used" in known
     assert len(out.read_text().splitlines()) == 5 and len((tmp_path / "est.lagged.csv").read_text().splitlines()) == 4
     assert main([*command, "--window", "1", "--lag", "2"]) == 2
     assert "lag: expected a number from 0 to the window, 1, got 2" in capsys.readouterr().err

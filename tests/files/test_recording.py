@@ -9,7 +9,7 @@ from heliograph.files.recording import (
     write_estimates,
 )
 from heliograph.files.table import write_table
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 NAN = np.nan
 TIME = [0.0, 0.5, 0.5, 2.0]
@@ -116,8 +116,8 @@ def test_a_measurement_named_like_an_input_needs_its_node():
 )
 def test_what_is_refused(change, fragments):
     data = {**columns(pos=[1, 2, 3, 4], push=[0, 0, 0, 0]), **change}
-    kept = {name: np.array(values) for name, values in data.items() if values is not None}
-    refused(kept, network({"a": ("pos",)}, inputs=("push",)), "data.csv", *fragments)
+    stored = {name: np.array(values) for name, values in data.items() if values is not None}
+    refused(stored, network({"a": ("pos",)}, inputs=("push",)), "data.csv", *fragments)
 
 
 def test_an_input_may_not_be_called_time():
@@ -157,22 +157,22 @@ def record_of(*filters: str, nodes=("a",), states=("p", "v")) -> Record:
 
 
 def test_columns_of_estimates():
-    found = estimate_columns(record_of("aware"))
-    assert list(found) == ["time", "p", "p.sd", "v", "v.sd", "cov.p.v", "valid"]
-    np.testing.assert_array_equal(found["v"], [2, 4, 6])
-    np.testing.assert_array_equal(found["p.sd"], [2, 1, NAN])
-    np.testing.assert_array_equal(found["v.sd"], [3, 1, 1])
-    np.testing.assert_array_equal(found["cov.p.v"], [1, 2, 0])
-    np.testing.assert_array_equal(found["valid"], [True, False, False])
+    result = estimate_columns(record_of("aware"))
+    assert list(result) == ["time", "p", "p.sd", "v", "v.sd", "cov.p.v", "valid"]
+    np.testing.assert_array_equal(result["v"], [2, 4, 6])
+    np.testing.assert_array_equal(result["p.sd"], [2, 1, NAN])
+    np.testing.assert_array_equal(result["v.sd"], [3, 1, 1])
+    np.testing.assert_array_equal(result["cov.p.v"], [1, 2, 0])
+    np.testing.assert_array_equal(result["valid"], [True, False, False])
 
 
 def test_no_columns_for_a_covariance_that_is_not_claimed():
     record = record_of("silent")
     means = record.estimates["a"]["silent"].mean
     record.estimates["a"]["silent"] = h.model.Estimate(means, np.full((3, 2, 2), np.nan), "none")
-    found = estimate_columns(record)
-    assert list(found) == ["time", "p", "v", "valid"]
-    np.testing.assert_array_equal(found["valid"], np.isfinite(means).all(axis=1))
+    result = estimate_columns(record)
+    assert list(result) == ["time", "p", "v", "valid"]
+    np.testing.assert_array_equal(result["valid"], np.isfinite(means).all(axis=1))
 
 
 def test_prefixes_of_nodes_and_filters():

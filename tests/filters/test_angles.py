@@ -70,20 +70,20 @@ def network(side: float, angles: bool = True) -> hg.Network:
 def alone(side: float, name: str) -> hg.Network:
     """The first node with one of the other filters: a program each is cheaper than one of all."""
     plant, sensor = robot(side), station()
-    own = {name: filters(plant, sensor)[name]}
-    return hg.Network(plant, {"a": hg.Node(sensor, hg.erasure(MODES, 0.8), own)})
+    local = {name: filters(plant, sensor)[name]}
+    return hg.Network(plant, {"a": hg.Node(sensor, hg.erasure(MODES, 0.8), local)})
 
 
 def recording() -> dict[str, np.ndarray]:
     """What two nodes heard of a robot in the east, in NumPy."""
     rng = np.random.default_rng(5)
-    x, heard = np.array([30.5, -12.5, np.pi / 2 + 0.03]), []
+    x, received = np.array([30.5, -12.5, np.pi / 2 + 0.03]), []
     for distance, turn in U:
         moved = np.array([distance * np.cos(x[2]), distance * np.sin(x[2]), turn])
         x = x + moved + rng.normal(0, [0.05, 0.05, 0.01])
         y = np.array([np.hypot(x[0], x[1]), np.arctan2(x[1], x[0])]) + rng.normal(0, [0.6, 0.03], (2, 2))
-        heard.append(np.where(rng.random((2, 1)) < 0.8, y, np.nan))
-    z = np.moveaxis(np.array(heard), 0, 1)
+        received.append(np.where(rng.random((2, 1)) < 0.8, y, np.nan))
+    z = np.moveaxis(np.array(received), 0, 1)
     return {"a": z[0], "b": z[1]}
 
 
@@ -101,27 +101,27 @@ def test_half_a_turn_further_everything_is_turned(east_and_west):
     bearings = east_and_west[1].measurements["a"][:, 1]
     assert np.nanmax(bearings) > 3 and np.nanmin(bearings) < -3  # it crosses
     pairs = {}
-    for node, found in east_and_west[0].estimates.items():
-        pairs |= {f"{node}/{name}": (one, east_and_west[1].estimates[node][name]) for name, one in found.items()}
+    for node, estimate in east_and_west[0].estimates.items():
+        pairs |= {f"{node}/{name}": (item, east_and_west[1].estimates[node][name]) for name, item in estimate.items()}
     for name in filters(robot(1.0), station()):
-        heard = [(side, {"a": r.measurements["a"]}) for side, r in zip((1.0, -1.0), east_and_west, strict=True)]
-        pairs[name] = [hg.run(alone(side, name), z, U).estimates["a"][name] for side, z in heard]
+        received = [(side, {"a": r.measurements["a"]}) for side, r in zip((1.0, -1.0), east_and_west, strict=True)]
+        pairs[name] = [hg.run(alone(side, name), z, U).estimates["a"][name] for side, z in received]
     del pairs["particle"]
-    for name, (one, other) in pairs.items():
-        mean = wrapped(np.asarray(other.mean) - np.asarray(one.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
+    for name, (item, other) in pairs.items():
+        mean = wrapped(np.asarray(other.mean) - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
         np.testing.assert_allclose(mean, 0.0, atol=1e-8, err_msg=name)
-        turned = TURNED @ np.asarray(one.covariance) @ TURNED
+        turned = TURNED @ np.asarray(item.covariance) @ TURNED
         np.testing.assert_allclose(other.covariance, turned, rtol=1e-7, atol=1e-9, err_msg=name)
 
 
 @pytest.mark.slow
 def test_what_is_smoothed_is_turned_too(east_and_west):
     """Sweeps never wrap, so that the cut is nowhere; what they tell is between -pi and pi. To rounding of 30 steps."""
-    found = [record.smoothed for record in east_and_west]
-    for node, each in found[0].estimates.items():
-        for name, one in each.items():
-            other = np.asarray(found[1].estimates[node][name].mean)
-            turned = wrapped(other - np.asarray(one.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
+    results = [record.smoothed for record in east_and_west]
+    for node, estimate in results[0].estimates.items():
+        for name, item in estimate.items():
+            other = np.asarray(results[1].estimates[node][name].mean)
+            turned = wrapped(other - np.asarray(item.mean) @ TURNED - [0.0, 0.0, np.pi], (2,))
             np.testing.assert_allclose(turned, 0.0, atol=1e-7, err_msg=f"{node}/{name}")
             assert np.all(np.abs(other[:, 2]) <= np.pi)
 
@@ -132,28 +132,32 @@ def test_numbers_on_a_line_give_the_same_where_nothing_crosses_and_are_lost_wher
     worst = []
     for side, record in ((1.0, east), (-1.0, west)):
         plain = hg.run(network(side, angles=False), record.measurements, U)
-        each = [(one, record.estimates[node][f]) for node, own in plain.estimates.items() for f, one in own.items()]
-        worst.append(max(np.abs(np.asarray(one.mean) - other.mean)[:, :2].max() for one, other in each))
+        items = [
+            (item, record.estimates[node][f])
+            for node, estimate in plain.estimates.items()
+            for f, item in estimate.items()
+        ]
+        worst.append(max(np.abs(np.asarray(item.mean) - other.mean)[:, :2].max() for item, other in items))
     assert worst[0] < 1e-9 and worst[1] > 3  # metres
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("side", [1.0, -1.0], ids=["without the cut", "across the cut"])
 def test_filters_are_consistent_across_the_cut_as_elsewhere(side):
-    found = hg.monte_carlo(network(side), STEPS, 2000, 0, keep=hg.Statistics(), inputs=U)
-    assert not found.failures()
-    for node, each in found.items():
-        for name, statistics in each.items():
+    outcome = hg.monte_carlo(network(side), STEPS, 2000, 0, keep=hg.Statistics(), inputs=U)
+    assert not outcome.failures()
+    for node, item in outcome.items():
+        for name, statistics in item.items():
             nees, low, high = statistics.nees_per_dimension(0.999)  # six intervals: one in 160 such tests errs
             assert high <= 1 if name == "equal" else low <= 1 <= high, (node, name, nees)
-    assert found["fused"]["central"].rmse()[0] < found["fused"]["equal"].rmse()[0] < 0.75
+    assert outcome["fused"]["central"].rmse()[0] < outcome["fused"]["equal"].rmse()[0] < 0.75
 
 
 def turning(angles: bool) -> tuple[hg.LinearPlant, hg.LinearSensor]:
     """A heading and its rate, heard by a compass."""
-    names, one = ["heading", "rate"], ["heading"] if angles else []
+    names, item = ["heading", "rate"], ["heading"] if angles else []
     start = ([3.0, 0.3], np.diag([0.2, 0.01]))
-    plant = hg.LinearPlant([[1.0, 1.0], [0.0, 1.0]], np.diag([1e-3, 1e-4]), *start, states=names, circular=one)
+    plant = hg.LinearPlant([[1.0, 1.0], [0.0, 1.0]], np.diag([1e-3, 1e-4]), *start, states=names, circular=item)
     noise = hg.random_affine.FiniteSupport([[-0.3], [0.1]], [0.25, 0.75])
     return plant, hg.LinearSensor([[1.0, 0.0]], noise, ["compass"], ["compass"] if angles else [])
 
@@ -200,8 +204,8 @@ def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
     mean = np.array([[3.1, 1.0], [-3.1, 2.0]])
     two = [hg.model.Estimate(m, np.eye(2), "nominal") for m in mean]
     for rule in (hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.WeightedFusion([0.5, 0.5])):
-        found = hg.fusion.fuse(rule, two, angles=[0])
-        assert abs(abs(found.mean[0]) - np.pi) < 1e-9 and found.mean[1] == pytest.approx(1.5)
+        result = hg.fusion.fuse(rule, two, angles=[0])
+        assert abs(abs(result.mean[0]) - np.pi) < 1e-9 and result.mean[1] == pytest.approx(1.5)
         assert hg.fusion.fuse(rule, two).mean[0] == pytest.approx(0.0)  # numbers on a line
     with pytest.raises(ValueError, match="angles: expected places"):
         hg.fusion.fuse(hg.fusion.EqualIntersection(), two, angles=[2])
@@ -210,7 +214,7 @@ def test_fused_estimates_are_between_two_on_either_side_of_the_cut():
 REFUSED = {
     "linear": lambda p, s: hg.linear_filter(p, s, hg.perfect()),
     "polynomial": lambda p, s: hg.polynomial_filter(p, s, hg.perfect(), 2, 5),
-    "told": lambda p, s: hg.filters.told_filter(p, s, hg.perfect()),
+    "told": lambda p, s: hg.filters.side_information_filter(p, s, hg.perfect()),
     "mode known": lambda p, s: hg.filters.mode_known_filter(p, s, hg.perfect()),
     "boundedness": lambda p, s: hg.simulation.certify_boundedness(
         hg.Network(p, {"a": hg.Node(s, hg.erasure(hg.perfect(), 0.5), {"f": hg.kalman_filter(p, s)})})
@@ -256,8 +260,8 @@ def test_simulated_errors_are_around_the_circle():
     """Truth and signals are told between -pi and pi, and x - xhat is the error, whoever subtracts."""
     plant, sensor = turning(True)
     channel = hg.parallel([hg.hop(1.0, 0.5)])
-    own = {"f": hg.extended_filter(plant, sensor, channel)}
-    record = hg.monte_carlo(hg.Network(plant, {"a": hg.Node(sensor, channel, own)}), STEPS, 32, 1)
+    local = {"f": hg.extended_filter(plant, sensor, channel)}
+    record = hg.monte_carlo(hg.Network(plant, {"a": hg.Node(sensor, channel, local)}), STEPS, 32, 1)
     assert np.all(np.abs(record.truth[..., 0]) <= np.pi) and np.ptp(record.truth[..., 0]) > 6  # they go around
     errors = record.errors("a", "f")
     assert np.max(np.abs(errors[..., 0])) <= np.pi

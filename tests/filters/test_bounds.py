@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters.correction import Signal
-from heliograph.filters.transform import PolynomialMoments
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.transform import PolynomialMoments
 from tests import machine
-from tests.filters.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
+from tests.filters.gaussian.test_gaussian import ROUNDING, SETTINGS, STEPS, agree, follow, follow_oracle
 from tests.machine import STRONG
 from tests.oracles import cubature_fusion as oracle
 
@@ -143,15 +143,15 @@ class Case(NamedTuple):
 @cache
 def random_cases(usable):
     """25 of them; e, e_y and yhat are correlated in any way, so E[e yhat'] is not zero."""
-    rng, found = np.random.default_rng(0), []
-    while len(found) < 25:
+    rng, results = np.random.default_rng(0), []
+    while len(results) < 25:
         s = random_setting(rng)
         if not usable(s):
             continue
         a = rng.normal(size=(9, 9))
         channel = machine.channel(s)
-        found.append(Case(channel, corners(channel), a @ a.T, 10 ** rng.uniform(-2, 0, 2)))
-    return found
+        results.append(Case(channel, corners(channel), a @ a.T, 10 ** rng.uniform(-2, 0, 2)))
+    return results
 
 
 def corners(channel):
@@ -178,14 +178,14 @@ def check_by_enumeration(build, usable=anything):
             assert np.linalg.eigvalsh(bound - actual)[0] >= -1e-9 * np.trace(bound)
 
 
-def actual_covariance(joint, gain, own, nominal):
+def actual_covariance(joint, gain, local, nominal):
     """E of e - K(G y + n - M yhat) = e - K M e_y - K (G - M) y - K n, over the law of (G, n) with these moments."""
-    shift = own.mean_gain - nominal
+    shift = local.mean_gain - nominal
     lift = np.hstack([np.eye(5), -gain @ (nominal + shift), -gain @ shift])  # on (e, e_y, yhat)
     yy = joint[5:7, 5:7] + joint[7:, 7:] + joint[5:7, 7:] + joint[7:, 5:7]
     w = np.zeros((3, 3))
     w[:2, :2], w[2, 2] = yy, 1.0
-    spread = np.einsum("ijab,ab->ij", own.spread.center, w)
+    spread = np.einsum("ijab,ab->ij", local.spread.center, w)
     return lift @ joint @ lift.T + gain @ spread @ gain.T
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.filters import mode_known_filter, mode_late_filter, told_filter
+from heliograph.filters import mode_known_filter, mode_late_filter, side_information_filter
 from heliograph.model import with_flag
 
 PLANT, SENSOR = hg.LinearPlant([[0.9]], 0.1, [0.5], 1.0), hg.LinearSensor([[1.0]], 0.1)
@@ -25,11 +25,11 @@ def test_modes_of_any_kinds_are_those_of_the_filter_that_takes_flags(name):
     """Two programs of one recursion: 1e-12 of numbers of order one."""
     link = MIXED[name]
     known = hg.Stream(mode_known_filter(PLANT, SENSOR, link))
-    told = hg.Stream(told_filter(PLANT, SENSOR, link, np.eye(len(link.maps))))
+    published = hg.Stream(side_information_filter(PLANT, SENSOR, link, np.eye(len(link.maps))))
     for z, flag in SENT:
         if np.isnan(flag):
             break  # there one skips z, the other weighs the modes
-        ours, theirs = known.push([z, flag]), told.push([z, flag])
+        ours, theirs = known.push([z, flag]), published.push([z, flag])
         np.testing.assert_allclose(ours.mean, theirs.mean, rtol=0, atol=1e-12)
         np.testing.assert_allclose(ours.covariance, theirs.covariance, rtol=0, atol=1e-12)
 
@@ -53,7 +53,7 @@ WRONG = {
     "now for late": (with_flag(LINK), mode_late_filter(PLANT, SENSOR, LINK), BEFORE, "one of this step"),
     "a class": (with_flag(LINK, EYE), mode_known_filter(PLANT, SENSOR, LINK), THIS, "Modes, no mode"),
     "a number": (hg.with_direct_link(HOP, HOP), mode_late_filter(PLANT, SENSOR, LINK), BEFORE, "GainAndNoise, no mode"),
-    "late class": (with_flag(LINK, EYE, late=True), told_filter(PLANT, SENSOR, LINK, EYE),
+    "late class": (with_flag(LINK, EYE, late=True), side_information_filter(PLANT, SENSOR, LINK, EYE),
                    r"hg\.model\.with_flag\(link, flags\)", "the step before"),
     "inside": (with_flag(LINK), hg.filters.late_filter(mode_late_filter(PLANT, SENSOR, LINK), 2), BEFORE, "this step"),
 }  # fmt: skip
@@ -61,8 +61,8 @@ WRONG = {
 
 @pytest.mark.parametrize("name", WRONG)
 def test_a_node_refuses_flags_of_another_step(name):
-    channel, item, wanted, came = WRONG[name]
-    with pytest.raises(ValueError, match=f"^filter 'f', flags: expected those of {wanted}, got .*{came}$"):
+    channel, item, expected, came = WRONG[name]
+    with pytest.raises(ValueError, match=f"^filter 'f', flags: expected those of {expected}, got .*{came}$"):
         hg.Node(SENSOR, channel, {"f": item})
 
 

@@ -29,24 +29,24 @@ def build():
 def oracle(design, received, missing=()):
     """xhat+ = f(xhat) + K (received - E1 d1bar h(xhat)), a missing component counted as expected."""
     expected = paper.E1 @ np.array([0.8 * 0.75, 0.7])
-    x, found, correction = np.array([1.7, 1.6]), [], np.zeros(2)
+    x, results, correction = np.array([1.7, 1.6]), [], np.zeros(2)
     for s in range(len(received)):
         x = np.array([0.7 * x[0] * np.cos(0.1 * x[1]), 0.7 * x[1] * np.sin(s * x[0])]) + correction
-        found.append(x)
+        results.append(x)
         innovation = received[s] - expected * paper.h[0] * x.sum()
         correction = design.gains[s] @ np.where(np.isin(np.arange(2), missing) & (s == 3), 0.0, innovation)
-    return np.array(found)
+    return np.array(results)
 
 
 def test_it_is_equation_6():
     item, design = build()
     received = np.random.default_rng(0).normal(size=(16, 2))
-    state, found = item.init(), []
+    state, results = item.init(), []
     for s in range(16):
         state, estimate = item.step(state, received[s], [float(s)], s)
-        found.append(estimate.mean)
+        results.append(estimate.mean)
         assert estimate.claim == "none" and np.isnan(estimate.covariance).all()
-    np.testing.assert_allclose(found, oracle(design, received), atol=1e-13)
+    np.testing.assert_allclose(results, oracle(design, received), atol=1e-13)
 
 
 def test_a_component_that_did_not_arrive_corrects_nothing():
@@ -54,11 +54,11 @@ def test_a_component_that_did_not_arrive_corrects_nothing():
     received = np.random.default_rng(1).normal(size=(16, 2))
     with_gap = received.copy()
     with_gap[3, 1] = np.nan
-    state, found = item.init(), []
+    state, results = item.init(), []
     for s in range(16):
         state, estimate = item.step(state, with_gap[s], [float(s)], s)
-        found.append(estimate.mean)
-    np.testing.assert_allclose(found, oracle(design, received, missing=[1]), atol=1e-13)
+        results.append(estimate.mean)
+    np.testing.assert_allclose(results, oracle(design, received, missing=[1]), atol=1e-13)
 
 
 def test_in_a_network_its_record_is_sound():

@@ -31,12 +31,12 @@ def test_it_is_scipys(m, units):
 def test_components_that_did_not_arrive_are_left_out():
     covariance = np.array([[2.0, 0.5, 0.3], [0.5, 1.0, 0.2], [0.3, 0.2, 3.0]])
     with jax.enable_x64(True):
-        found = gaussian_innovation(np.array([1.0, np.nan, -2.0]), np.array([0.5, 0.0, 0.0]), covariance)
+        result = gaussian_innovation(np.array([1.0, np.nan, -2.0]), np.array([0.5, 0.0, 0.0]), covariance)
     left = np.array([0, 2])
-    assert np.array_equal(np.isnan(found.value), [False, True, False])
-    assert np.array_equal(np.isnan(found.covariance), np.isnan(found.value)[:, None] | np.isnan(found.value))
+    assert np.array_equal(np.isnan(result.value), [False, True, False])
+    assert np.array_equal(np.isnan(result.covariance), np.isnan(result.value)[:, None] | np.isnan(result.value))
     expected = stats.multivariate_normal(np.zeros(2), covariance[np.ix_(left, left)]).logpdf([0.5, -2.0])
-    assert float(found.log_likelihood) == pytest.approx(expected, rel=ROUNDING)
+    assert float(result.log_likelihood) == pytest.approx(expected, rel=ROUNDING)
     assert density([np.nan, np.nan], np.eye(2)) == 0
 
 
@@ -56,8 +56,8 @@ def test_an_indefinite_covariance_gives_nan():
 def test_a_silent_channel_says_nothing():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     item = hg.linear_filter(plant, sensor, hg.model.silent())
-    heard = item.correct(item.predict(item.init()), [0.0])[1]
-    assert heard.value[0] == 0 and heard.covariance[0, 0] == 0 and heard.log_likelihood == 0
+    received = item.correct(item.predict(item.init()), [0.0])[1]
+    assert received.value[0] == 0 and received.covariance[0, 0] == 0 and received.log_likelihood == 0
 
 
 def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
@@ -69,9 +69,9 @@ def test_the_covariance_behind_a_random_gain_is_that_of_the_data():
     expected = gain.moment(2) * variance + spread * mean**2 + 0.3
     for make in (hg.linear_filter, hg.cubature_filter):
         item = make(plant, sensor, hg.hop(gain, 0.3))
-        heard = item.correct(item.predict(item.init()), [2.0])[1]
-        assert heard.covariance[0, 0] == pytest.approx(expected, rel=ROUNDING)
-        assert heard.value[0] == pytest.approx(2.0 - gain.moment(1) * mean, rel=ROUNDING)
+        received = item.correct(item.predict(item.init()), [2.0])[1]
+        assert received.covariance[0, 0] == pytest.approx(expected, rel=ROUNDING)
+        assert received.value[0] == pytest.approx(2.0 - gain.moment(1) * mean, rel=ROUNDING)
 
 
 def test_a_step_that_is_not_asked_for_it_does_not_compute_it():

@@ -13,8 +13,8 @@ STEPS = 200  # after which no variance changes any more
 
 def test_fading_in_bursts():
     """P_1, P_2, P_10, P_inf to the digits given."""
-    found = variances(PLANT, SENSOR, bursts(), STEPS)[[0, 1, 9, -1], 0]
-    np.testing.assert_allclose(found, [0.323796, 0.283304, 0.248939, 0.238689], atol=6e-7)
+    result = variances(PLANT, SENSOR, bursts(), STEPS)[[0, 1, 9, -1], 0]
+    np.testing.assert_allclose(result, [0.323796, 0.283304, 0.248939, 0.238689], atol=6e-7)
 
 
 @pytest.mark.parametrize(("shared", "limit"), [(True, 0.227110), (False, 0.148447)])
@@ -28,9 +28,9 @@ def test_two_sensors_in_one_shadow_or_in_two(shared, limit):
 def test_two_drifting_hops():
     plant = hg.LinearPlant([[0.98, 0.1], [0, 0.95]], np.diag([0.002, 0.02]), [1.0, 0.0], np.diag([1.0, 0.2]))
     first, second = (hg.autoregressive_fading(m, s, r, 0.05) for m, s, r in ((1.0, 0.4, 0.95), (0.8, 0.3, 0.9)))
-    found = variances(plant, hg.LinearSensor([[1.0, 0.0]], 0.05), hg.amplify_and_forward([first, second]), 100)
+    result = variances(plant, hg.LinearSensor([[1.0, 0.0]], 0.05), hg.amplify_and_forward([first, second]), 100)
     known = [[0.444130, 0.200298], [0.393069, 0.199766], [0.293346, 0.179459], [0.299861, 0.158136]]
-    np.testing.assert_allclose(found[[0, 1, 9, 99]], known, atol=6e-7)
+    np.testing.assert_allclose(result[[0, 1, 9, 99]], known, atol=6e-7)
 
 
 LIMITS = {  # a channel that remembers, and the same without memory or in other words
@@ -54,8 +54,8 @@ LIMITS = {  # a channel that remembers, and the same without memory or in other 
 
 @pytest.mark.parametrize("name", LIMITS)
 def test_limits(name):
-    one, other = (variances(PLANT, SENSOR, channel, STEPS) for channel in LIMITS[name])
-    np.testing.assert_allclose(one, other, rtol=1e-12)
+    item, other = (variances(PLANT, SENSOR, channel, STEPS) for channel in LIMITS[name])
+    np.testing.assert_allclose(item, other, rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -74,10 +74,10 @@ def test_estimates_do_not_depend_on_the_order_of_modes_and_hold_in_simulation():
 def test_what_does_not_arrive_is_left_out():
     item = hg.linear_filter(PLANT, SENSOR, bursts())
     state = item.predict(item.init())
-    after, heard = item.correct(state, [np.nan])
+    after, innovation = item.correct(state, [np.nan])
     np.testing.assert_allclose(after.mean, state.mean, atol=0)
     np.testing.assert_allclose(after.covariance, state.covariance, rtol=1e-15)
-    assert heard.log_likelihood == 0
+    assert innovation.log_likelihood == 0
 
 
 @pytest.mark.slow
@@ -86,19 +86,19 @@ def test_a_mean_far_from_zero_costs_no_digits(radius):
     """Where modes differ in their noise alone, a mean of 1e8 deviations moves all estimates and no covariance."""
     chain = hg.random_affine.MarkovChain(BURSTS, radius=radius)
     channel = hg.markov_fading([hg.hop(0.7, noise) for noise in (0.05, 0.5)], chain)
-    z, found = np.random.default_rng(1).normal(size=(8, 1)), []
+    z, results = np.random.default_rng(1).normal(size=(8, 1)), []
     for far in (0.0, 1e8):
         plant = hg.LinearPlant(np.eye(2), 0.1 * np.eye(2), [far, 0.0], np.eye(2))
         item = hg.linear_filter(plant, hg.LinearSensor([[1.0, 0.5]], 0.05), channel)
         network = hg.Network(plant, {"node": hg.Node(item.sensor, channel, {"one": item})})
         data = {"node": np.where(np.arange(8)[:, None] == 3, np.nan, z + 0.7 * far)}
         record = hg.run(network, data, smooth=hg.smoothing.FixedInterval())
-        each = record.estimates["node"]["one"], record.smoothed.estimates["node"]["one"]
-        means, claimed = [one.mean - [far, 0.0] for one in each], [one.covariance for one in each]
-        found.append((means, claimed, item.planned(np.zeros((8, 0))).covariances))
-    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-6)  # of 1e8, with rounding of 1e-8 a step
-    np.testing.assert_allclose(found[1][1], found[0][1], rtol=1e-12)
-    np.testing.assert_allclose(found[1][2], found[0][2], rtol=1e-12)
+        items = record.estimates["node"]["one"], record.smoothed.estimates["node"]["one"]
+        means, claimed = [single.mean - [far, 0.0] for single in items], [single.covariance for single in items]
+        results.append((means, claimed, item.planned(np.zeros((8, 0))).covariances))
+    np.testing.assert_allclose(results[1][0], results[0][0], atol=1e-6)  # of 1e8, with rounding of 1e-8 a step
+    np.testing.assert_allclose(results[1][1], results[0][1], rtol=1e-12)
+    np.testing.assert_allclose(results[1][2], results[0][2], rtol=1e-12)
 
 
 def test_it_keeps_the_contract_of_filters():

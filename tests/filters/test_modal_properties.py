@@ -48,27 +48,27 @@ def test_equal_rows_are_no_memory(seed, plant, sensor, maps, rows, law):
     """Against the mixture of the maps, which the filter of links that forget hears."""
     chain = hg.random_affine.MarkovChain([law] * 3)
     forgets = hg.random_affine.Mixture(maps, law)
-    found = variances(plant, sensor, Modes(chain, maps), 30)
-    np.testing.assert_allclose(found, variances(plant, sensor, forgets, 30), rtol=1e-11)
+    result = variances(plant, sensor, Modes(chain, maps), 30)
+    np.testing.assert_allclose(result, variances(plant, sensor, forgets, 30), rtol=1e-11)
 
 
 @of_problems(6)
 def test_the_order_of_modes_changes_nothing(seed, plant, sensor, maps, rows, law):
     order = np.random.default_rng(seed + 100).permutation(3)
-    one = Modes(hg.random_affine.MarkovChain(rows, law), maps)
+    item = Modes(hg.random_affine.MarkovChain(rows, law), maps)
     turned = Modes(hg.random_affine.MarkovChain(rows[np.ix_(order, order)], law[order]), [maps[i] for i in order])
-    np.testing.assert_allclose(variances(plant, sensor, one, 30), variances(plant, sensor, turned, 30), rtol=1e-11)
+    np.testing.assert_allclose(variances(plant, sensor, item, 30), variances(plant, sensor, turned, 30), rtol=1e-11)
 
 
 @of_problems(6)
 def test_a_claim_is_the_propagated_truth_and_no_filter_does_better(seed, plant, sensor, maps, rows, law):
     """Of the filter itself to rounding; a filter made for other rows is worse at every step."""
     channel, other = (Modes(hg.random_affine.MarkovChain(r, law), maps) for r in (rows, rows[::-1]))
-    own = hg.filters.true_error(hg.linear_filter(plant, sensor, channel), plant, sensor, channel, 30)
+    local = hg.filters.true_error(hg.linear_filter(plant, sensor, channel), plant, sensor, channel, 30)
     wrong = hg.filters.true_error(hg.linear_filter(plant, sensor, other), plant, sensor, channel, 30)
-    np.testing.assert_allclose(own.claimed, own.true, rtol=1e-9, atol=1e-12)
-    smallest = np.linalg.eigvalsh(wrong.true - own.true)[:, 0]
-    assert np.all(smallest >= -1e-10 * np.abs(own.true).max())
+    np.testing.assert_allclose(local.claimed, local.true, rtol=1e-9, atol=1e-12)
+    smallest = np.linalg.eigvalsh(wrong.true - local.true)[:, 0]
+    assert np.all(smallest >= -1e-10 * np.abs(local.true).max())
 
 
 @pytest.mark.slow

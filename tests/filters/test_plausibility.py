@@ -49,16 +49,18 @@ def test_no_absurd_value_leaves_a_trace(name):
         u, z = np.full(len(item.inputs), 0.1 * k), np.full(item.received, 0.3 - 0.1 * k)
         for value in ABSURD:
             for bad in [np.full(item.received, value)] if item.received == 1 else [[value, 0.2], [np.nan, value]]:
-                with pytest.raises(ValueError, match=f"measurement of step {k}: expected a plausible one, got") as one:
+                with pytest.raises(
+                    ValueError, match=f"measurement of step {k}: expected a plausible one, got"
+                ) as raised:
                     stream.push(bad, u)
-                assert "\n" not in str(one.value)
+                assert "\n" not in str(raised.value)
             for rest in (z, np.full(item.received, np.nan)) if item.inputs else ():
                 with pytest.raises(ValueError, match=f"inputs of step {k}: expected plausible ones, got"):
                     stream.push(rest, [value])
         assert stream.steps == k
-        got, wanted = stream.push(z, u), clean.push(z, u)
-        np.testing.assert_array_equal(got.mean, wanted.mean)
-        np.testing.assert_array_equal(got.covariance, wanted.covariance)
+        got, expected = stream.push(z, u), clean.push(z, u)
+        np.testing.assert_array_equal(got.mean, expected.mean)
+        np.testing.assert_array_equal(got.covariance, expected.covariance)
 
 
 @pytest.mark.parametrize("name", FILTERS)

@@ -27,28 +27,28 @@ def network(plant, parts, fused, order=None):
 def rules():
     """Every informed rule, of the filter "own"."""
     f = hg.fusion
-    found = {
+    results = {
         "matrix": f.MatrixWeights(),
         "matrix_with_mean": f.MatrixWeights(with_mean=True),
         "diagonal": f.DiagonalWeights(),
         "scalar": f.ScalarWeights(),
         "all_reports": f.AllReports(),
     }
-    return {name: hg.Fusion("own", rule) for name, rule in found.items()}
+    return {name: hg.Fusion("own", rule) for name, rule in results.items()}
 
 
 def case(name):
     """Plant and nodes of a case."""
-    one = np.eye(4)
+    item = np.eye(4)
     if name == "three_partial":
-        outputs = [one[[0]], one[[2]], (one[[0]] + one[[2]]) / np.sqrt(2)]
+        outputs = [item[[0]], item[[2]], (item[[0]] + item[[2]]) / np.sqrt(2)]
         parts = list(zip(outputs, [0.2] * 3, [0.8, 0.9, 0.7], [0.05, 0.1, 0.08], [0.1] * 3, strict=True))
-        return hg.LinearPlant(CV, CV_NOISE, np.zeros(4), one), parts
+        return hg.LinearPlant(CV, CV_NOISE, np.zeros(4), item), parts
     if name == "three_rooms":
         rooms = np.diag([0.9, 0.8, 0.95]) + 0.1 * np.diag([1, 1], 1)
         parts = [(np.eye(3)[[i]], 0.1, 0.8, 0.06, 0.05) for i in range(3)]
         return hg.LinearPlant(rooms, 0.1 * np.eye(3), np.zeros(3), np.eye(3)), parts
-    return hg.LinearPlant(CV, CV_NOISE, np.zeros(4), one), [(one[[0, 2]], 0.3, 0.8, 0.1, 0.2)] * 4
+    return hg.LinearPlant(CV, CV_NOISE, np.zeros(4), item), [(item[[0, 2]], 0.3, 0.8, 0.1, 0.2)] * 4
 
 
 def random_case(seed, nodes=3, n=3):

@@ -8,27 +8,27 @@ import heliograph as hg
 VALUES = np.array([[0.0, 0.0], [0.1, 0.0], [0.1, -0.5], [np.nan, np.nan], [0.3, -0.5]])
 
 
-@pytest.mark.parametrize("told", [True, False])
-def test_a_value_is_sent_when_it_has_changed_by_more_than_the_threshold(told):
+@pytest.mark.parametrize("known", [True, False])
+def test_a_value_is_sent_when_it_has_changed_by_more_than_the_threshold(known):
     """The first, and the third, whose second component moved by .5; one that is NaN is not there."""
-    sends = hg.fusion.EventSending([0.25, 0.25], told)
-    state, heard, symbols = sends.init(2), [], []
+    sends = hg.fusion.EventSending([0.25, 0.25], known)
+    state, received, symbols = sends.init(2), [], []
     for value in VALUES:
         state, sent = sends.step(state, value)
-        heard.append(sent.value)
+        received.append(sent.value)
         symbols.append(sent.symbols.sum())
     assert symbols == [2, 0, 2, 0, 0]
     held = VALUES[[0, 0, 2, 3, 2]]
-    expected = held if told else np.where((np.array(symbols) > 0)[:, None], held, np.nan)
-    np.testing.assert_array_equal(heard, expected)
-    assert sends.claim("exact") == ("upper" if told else "nominal")
-    np.testing.assert_array_equal(sends.error(2), [0.25, 0.25] if told else [0.0, 0.0])
+    expected = held if known else np.where((np.array(symbols) > 0)[:, None], held, np.nan)
+    np.testing.assert_array_equal(received, expected)
+    assert sends.claim("exact") == ("upper" if known else "nominal")
+    np.testing.assert_array_equal(sends.error(2), [0.25, 0.25] if known else [0.0, 0.0])
 
 
 def test_silence_taken_for_a_loss_needs_a_rule_that_hears_reports():
     plant, sensor = hg.LinearPlant([[0.9]], [[0.1]], [0.0], [[1.0]]), hg.LinearSensor([[1.0]], 0.1)
     nodes = {"a": hg.Node(sensor, hg.perfect(), {"own": hg.kalman_filter(plant, sensor)})}
-    sends = hg.fusion.EventSending(0.1, told=False)
+    sends = hg.fusion.EventSending(0.1, announced=False)
     with pytest.raises(ValueError, match="a rule that hears reports"):
         hg.Network(plant, nodes, {"one": hg.Fusion("own", hg.fusion.EqualIntersection(), quantizer=sends)})
     with pytest.raises(ValueError, match="threshold: expected positive numbers"):

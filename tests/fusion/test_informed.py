@@ -32,18 +32,18 @@ def test_every_rule_gives_the_best_linear_estimate_of_what_it_has(name):
     """Against the stacked problem in NumPy to 1e-9, and to the digits that the cases are stated with."""
     plant, parts = case(name)
     net, n = network(plant, parts, {name: rules()[name] for name in RULES}), len(plant.states)
-    found = {rule: np.trace(p[-1]) for rule, p in hg.simulation.fused_covariances(net, 200).items()}
+    results = {rule: np.trace(p[-1]) for rule, p in hg.simulation.fused_covariances(net, 200).items()}
     joint, central = brute_force(plant, parts, 200)
     scalar, *others, best = TARGETS[name]
-    assert found["scalar"] == pytest.approx(scalar, rel=1e-4)
+    assert results["scalar"] == pytest.approx(scalar, rel=1e-4)
     for rule, expected in zip(RULES[1:], others, strict=True):
-        assert found[rule] == pytest.approx(expected, abs=6e-7)  # half of the last digit, and rounding of it
+        assert results[rule] == pytest.approx(expected, abs=6e-7)  # half of the last digit, and rounding of it
     assert np.trace(central) == pytest.approx(best, abs=6e-7)
-    assert found["all_reports"] == pytest.approx(np.trace(central), rel=1e-9)  # every gain has full column rank
+    assert results["all_reports"] == pytest.approx(np.trace(central), rel=1e-9)  # every gain has full column rank
     ones = np.tile(np.eye(n), (len(parts), 1))
     # Of partial outputs P is singular, across the range of the ones: e3_x - e3_y = x - y = e2_x - e1_y.
     information = ones.T @ np.linalg.pinv(joint[n:, n:], rcond=1e-11, hermitian=True) @ ones
-    assert found["matrix"] == pytest.approx(np.trace(np.linalg.inv(information)), rel=1e-9)
+    assert results["matrix"] == pytest.approx(np.trace(np.linalg.inv(information)), rel=1e-9)
     assert set(net.claims()["fused"].values()) == {"exact"}
 
 
@@ -53,19 +53,19 @@ def test_cross_covariances_are_those_of_the_stacked_problem(seed):
     """Nodes of different lengths, a plant with a mean: 1e-9 of what brute force says; the order changes nothing."""
     plant, parts = random_case(seed)
     n = len(plant.states)
-    found = hg.simulation.cross_covariances(network(plant, parts, {}), "own", 12)
+    cross = hg.simulation.cross_covariances(network(plant, parts, {}), "own", 12)
     joint, _ = brute_force(plant, parts, 12)
-    np.testing.assert_allclose(found.joint.reshape(joint[n:, n:].shape), joint[n:, n:], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.of_state.reshape(-1, n), joint[n:, :n], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(found.state_covariance, joint[:n, :n], rtol=1e-12)
-    np.testing.assert_allclose(found.bias, 0.0, atol=1e-14)
+    np.testing.assert_allclose(cross.joint.reshape(joint[n:, n:].shape), joint[n:, n:], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(cross.of_state.reshape(-1, n), joint[n:, :n], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(cross.state_covariance, joint[:n, :n], rtol=1e-12)
+    np.testing.assert_allclose(cross.bias, 0.0, atol=1e-14)
     order = [2, 1, 0]
     turned = hg.simulation.cross_covariances(network(plant, parts, {}, order), "own", 12)
     assert turned.nodes == tuple(f"node {i}" for i in order)
-    np.testing.assert_allclose(turned.joint, found.joint[order][:, :, order], rtol=1e-12, atol=1e-14)
-    weights, covariance = found.matrix_weights()
-    lost = 10 * np.finfo(float).eps * np.linalg.cond(found.joint.reshape(3 * n, 3 * n))  # digits that a solve loses
-    np.testing.assert_allclose(weights, hg.fusion.matrix_weights(found.joint), atol=lost * np.abs(weights).max())
+    np.testing.assert_allclose(turned.joint, cross.joint[order][:, :, order], rtol=1e-12, atol=1e-14)
+    weights, covariance = cross.matrix_weights()
+    lost = 10 * np.finfo(float).eps * np.linalg.cond(cross.joint.reshape(3 * n, 3 * n))  # digits that a solve loses
+    np.testing.assert_allclose(weights, hg.fusion.matrix_weights(cross.joint), atol=lost * np.abs(weights).max())
     np.testing.assert_allclose(weights.sum(axis=1), np.eye(n), atol=1e-12)
     dense = hg.simulation.fused_covariances(network(plant, parts, {"m": rules()["matrix"]}), 12)["m"][-1]
     np.testing.assert_allclose(covariance, dense, rtol=1e-9)
@@ -164,8 +164,8 @@ def test_losses_at_random_keep_the_claim():
     nodes = {
         name: hg.Node(node.sensor, hg.erasure(node.channel, 0.6), node.filters) for name, node in perfect.nodes.items()
     }
-    kept = {name: rules()[name] for name in ("matrix", "all_reports")}
-    record = hg.monte_carlo(hg.Network(plant, nodes, kept), 4, 3000, 11)
+    stored = {name: rules()[name] for name in ("matrix", "all_reports")}
+    record = hg.monte_carlo(hg.Network(plant, nodes, stored), 4, 3000, 11)
     for name, estimate in record.estimates["fused"].items():
         covariance = np.asarray(estimate.covariance)[:, -1]
         assert estimate.claim == "exact" and np.ptp(np.trace(covariance, axis1=1, axis2=2)) > 0
@@ -177,14 +177,14 @@ def test_nodes_that_hear_the_same_and_estimates_without_error():
     """One rank rule: a copy changes nothing, and an estimate without error is followed whatever the others say."""
     draw = np.random.default_rng(0)
     root = draw.normal(size=(4, 4))
-    one = (root @ root.T).reshape(2, 2, 2, 2)
-    copied = one[[0, 1, 1]][:, :, [0, 1, 1]]
-    alone, both = hg.fusion.matrix_weights(one), hg.fusion.matrix_weights(copied)
+    item = (root @ root.T).reshape(2, 2, 2, 2)
+    copied = item[[0, 1, 1]][:, :, [0, 1, 1]]
+    alone, both = hg.fusion.matrix_weights(item), hg.fusion.matrix_weights(copied)
     np.testing.assert_allclose(both[:, 1] + both[:, 2], alone[:, 1], rtol=1e-9)
-    known = one.copy()
+    known = item.copy()
     known[0], known[:, :, 0] = 0.0, 0.0
     np.testing.assert_allclose(hg.fusion.matrix_weights(known)[:, 0], np.eye(2), atol=1e-9)
-    np.testing.assert_allclose(hg.fusion.matrix_weights(one * 1e-20), alone, rtol=1e-9)
+    np.testing.assert_allclose(hg.fusion.matrix_weights(item * 1e-20), alone, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -241,8 +241,8 @@ def test_a_large_tree_is_the_small_one():
     draw = np.random.default_rng(1)
     numbers = {"output": draw.normal(size=(11, 1, 3)), "noise": 0.1 + draw.random(11)}
 
-    def leaf(one):
-        sensor, channel = hg.LinearSensor(one["output"], 0.2), hg.hop(two_gains(0.8, 0.05), noise=one["noise"])
+    def leaf(item):
+        sensor, channel = hg.LinearSensor(item["output"], 0.2), hg.hop(two_gains(0.8, 0.05), noise=item["noise"])
         return hg.Node(sensor, channel, {"own": hg.linear_filter(plant, sensor, channel)})
 
     tree = hg.simulation.relay_tree(plant, leaf, numbers, 3, 5)

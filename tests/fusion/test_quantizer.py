@@ -144,27 +144,27 @@ def test_a_bound_that_is_told_holds_whatever_was_lost_and_is_told_again_within_t
     quantizer = hg.fusion.EscapeQuantizer(9, 1.0, 0.6, 0.6, 1e-3, interval=interval)
     missed = [k for k in range(25) if not arrives[k]]
     for k, x, received, state in sent_over(quantizer, values, arrives):
-        told = np.isfinite(received.error[0])
-        assert told == state.synchronised[0] == np.isfinite(received.value[0])
-        assert not told or abs(received.value[0] - x) <= received.error[0] * (1 + 1e-12)
+        known = np.isfinite(received.error[0])
+        assert known == state.synchronised[0] == np.isfinite(received.value[0])
+        assert not known or abs(received.value[0] - x) <= received.error[0] * (1 + 1e-12)
         start = k - k % interval  # the last value that began from the first amplitude
-        assert told or any(start <= lost <= k for lost in missed)  # the values since then have not all arrived
+        assert known or any(start <= lost <= k for lost in missed)  # the values since then have not all arrived
 
 
 def test_without_an_interval_a_loss_is_told_and_a_request_mends_it():
     values = [0.3, 40.0, 0.1, 0.2, 0.3, 0.4]
-    found = {k: (r.error[0], s.synchronised[0]) for k, _, r, s in
+    results = {k: (r.error[0], s.synchronised[0]) for k, _, r, s in
              sent_over(ESCAPE, values, [True, False, True, True, True, True], lambda k: k == 4)}  # fmt: skip
     assert (
-        [k for k, (error, _) in found.items() if np.isnan(error)]
+        [k for k, (error, _) in results.items() if np.isnan(error)]
         == [2, 3]
-        == [k for k, (_, synchronised) in found.items() if not synchronised]
+        == [k for k, (_, synchronised) in results.items() if not synchronised]
     )
 
 
 def test_nothing_that_is_no_number_counts_as_lost():
-    found = [s.synchronised[0] for *_, s in sent_over(ESCAPE, [0.1, np.nan, 0.2], [True, False, True])]
-    assert found == [True, True]
+    results = [s.synchronised[0] for *_, s in sent_over(ESCAPE, [0.1, np.nan, 0.2], [True, False, True])]
+    assert results == [True, True]
 
 
 @settings(max_examples=40)

@@ -61,10 +61,10 @@ def test_estimates_that_claim_no_covariance():
     "rule", [hg.CovarianceIntersection(), hg.fusion.EqualIntersection(), hg.fusion.FixedIntersection([0.5, 0.5])]
 )
 def test_equal_inputs_are_returned(rule):
-    one = estimates(covariances(0, 1, 3))[0]
-    fused = hg.fusion.fuse(rule, [one, one])
-    np.testing.assert_allclose(fused.mean, one.mean, rtol=1e-9)
-    np.testing.assert_allclose(fused.covariance, one.covariance, rtol=1e-9)
+    item = estimates(covariances(0, 1, 3))[0]
+    fused = hg.fusion.fuse(rule, [item, item])
+    np.testing.assert_allclose(fused.mean, item.mean, rtol=1e-9)
+    np.testing.assert_allclose(fused.covariance, item.covariance, rtol=1e-9)
 
 
 def test_a_dominating_sensor_is_returned():
@@ -188,15 +188,15 @@ def faded():
         "optimal": hg.Fusion("linear", hg.CovarianceIntersection()),
         "equal": hg.Fusion("cubature", hg.fusion.EqualIntersection()),
     }
-    found = network(hg.hop(hg.Rayleigh(0.8), 0.05), lambda n: rules)
-    return rules, hg.monte_carlo(found, 8, 2000, 1)
+    result = network(hg.hop(hg.Rayleigh(0.8), 0.05), lambda n: rules)
+    return rules, hg.monte_carlo(result, 8, 2000, 1)
 
 
 def test_fusion_inside_the_scan_is_fusion_outside(faded):
     rules, record = faded
     for name, fusion in rules.items():
         local = [record.estimates[node][fusion.filter] for node in ROWS]
-        some = [hg.model.Estimate(one.mean[:4], one.covariance[:4], one.claim) for one in local]
+        some = [hg.model.Estimate(item.mean[:4], item.covariance[:4], item.claim) for item in local]
         outside, inside = hg.fusion.fuse(fusion.rule, some), record.estimates["fused"][name]
         np.testing.assert_allclose(inside.mean[:4], outside.mean, atol=1e-12)
         np.testing.assert_allclose(inside.covariance[:4], outside.covariance, atol=1e-12)

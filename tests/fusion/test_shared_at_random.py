@@ -42,8 +42,8 @@ def network(d, rules, order=(0, 1, 2)):
     hops = [hg.hop(two_gains(d["gains"][i], d["spreads"][i]), noise=d["noises"][i]) for i in range(2)]
     shared = two_gains(d["gains"][2], d["spreads"][2])
     first = hg.hop(shared, noise=0.05, dimension=2)
-    heard = hg.random_affine.known(SAME[list(order)][:, :2])
-    channel = hg.amplify_and_forward([first, hg.parallel(hops), heard])
+    received = hg.random_affine.known(SAME[list(order)][:, :2])
+    channel = hg.amplify_and_forward([first, hg.parallel(hops), received])
     filters = {}
     for node in order:
         i = min(node, 1)
@@ -90,19 +90,19 @@ def test_what_holds_for_every_network(seed, growth):
 
 
 def check_what_holds(d, net):
-    found = hg.simulation.cross_covariances(net, "own", STEPS)
-    joint = found.joint + np.einsum("ia,jb->iajb", found.bias, found.bias)
+    cross = hg.simulation.cross_covariances(net, "own", STEPS)
+    joint = cross.joint + np.einsum("ia,jb->iajb", cross.bias, cross.bias)
     plans = [net.nodes[f"node {i}"].filters["own"].planned(np.zeros((STEPS, 0))) for i in range(2)]
     expected = by_hand(d, [np.asarray(p.steps.values.gain)[:, :, 0] for p in plans])
     size = np.abs(joint).max()
     np.testing.assert_allclose(joint[:2, :, :2].transpose(0, 2, 1, 3), expected, rtol=1e-8, atol=1e-10 * size)
     np.testing.assert_allclose(joint[2], joint[1], rtol=1e-12, atol=1e-12 * size)  # a copy
     turned = hg.simulation.cross_covariances(network(d, {}, TURNED), "own", STEPS)
-    np.testing.assert_allclose(turned.joint, found.joint[TURNED][:, :, TURNED], rtol=1e-9, atol=1e-11 * size)
+    np.testing.assert_allclose(turned.joint, cross.joint[TURNED][:, :, TURNED], rtol=1e-9, atol=1e-11 * size)
     fused = hg.simulation.fused_covariances(net, STEPS)
     matrix, with_mean, everything = (float(np.trace(fused[name][-1])) for name in RULES)
     assert everything <= with_mean * (1 + 1e-7) and with_mean <= matrix * (1 + 1e-7)
-    two = found.joint[:2][:, :, :2]
+    two = cross.joint[:2][:, :, :2]
     weights = hg.fusion.matrix_weights(two)
     without = np.trace(np.einsum("aib,ibjc,djc->ad", weights, two, weights))
     assert abs(matrix - without) <= 1e-7 * without

@@ -10,14 +10,17 @@ from tests.oracles.shared_information import local_gains
 A, Q = np.array([[0.95, 0.2], [0.0, 0.9]]), 0.1 * np.eye(2)
 MEAN = np.array([1.0, -0.5])
 R = np.array([[0.2, 0.12], [0.12, 0.3]])
-FIRST, OWN = (0.8, 0.1), ((0.9, 0.05), (0.7, 0.02))  # mean and variance of the gains of the shared hop and each node's
+FIRST, LOCAL = (
+    (0.8, 0.1),
+    ((0.9, 0.05), (0.7, 0.02)),
+)  # mean and variance of the gains of the shared hop and each node's
 HOP_NOISE, OWN_NOISE = 0.05, 0.1
 
 
 def shared_network(fused):
     """One sensor of two outputs with correlated noise, one hop for both, then a hop to each node."""
     plant = hg.LinearPlant(A, Q, MEAN, np.eye(2))
-    hops = [hg.hop(two_gains(*gain), noise=OWN_NOISE) for gain in OWN]
+    hops = [hg.hop(two_gains(*gain), noise=OWN_NOISE) for gain in LOCAL]
     common = hg.hop(two_gains(*FIRST), noise=HOP_NOISE, dimension=2)
     channel = hg.amplify_and_forward([common, hg.parallel(hops)])
     filters = {}
@@ -30,16 +33,16 @@ def shared_network(fused):
 
 def spread(second):
     """E[nu nu'] for z_i = h_i (g y_i + n_i) + m_i."""
-    gains = np.array([mean for mean, _ in OWN])
-    heard = (FIRST[0] ** 2 + FIRST[1]) * (second + R) + HOP_NOISE * np.eye(2)
-    total = np.outer(gains, gains) * heard + np.diag([variance for _, variance in OWN]) * heard
+    gains = np.array([mean for mean, _ in LOCAL])
+    received = (FIRST[0] ** 2 + FIRST[1]) * (second + R) + HOP_NOISE * np.eye(2)
+    total = np.outer(gains, gains) * received + np.diag([variance for _, variance in LOCAL]) * received
     known = FIRST[0] * np.diag(gains)
     return total + OWN_NOISE * np.eye(2) - known @ second @ known
 
 
 def by_hand(steps):
     """Cov of (e_1, e_2)."""
-    model, known = (A, Q, MEAN, np.eye(2)), FIRST[0] * np.diag([mean for mean, _ in OWN])
+    model, known = (A, Q, MEAN, np.eye(2)), FIRST[0] * np.diag([mean for mean, _ in LOCAL])
     gains = [local_gains(model, known[[i]], lambda s, i=i: spread(s)[i : i + 1, i : i + 1], steps) for i in range(2)]
     state, mean, joint = np.eye(2), MEAN, np.ones((2, 2, 2, 2)) * np.eye(2)[None, :, None, :]
     for k in range(steps):
@@ -58,9 +61,9 @@ def by_hand(steps):
 
 
 def test_cross_covariances_of_what_is_shared():
-    found = hg.simulation.cross_covariances(shared_network({}), "own", 15)
-    np.testing.assert_allclose(found.joint, by_hand(15), rtol=1e-9, atol=1e-12)
-    _, covariance = found.matrix_weights()
+    cross = hg.simulation.cross_covariances(shared_network({}), "own", 15)
+    np.testing.assert_allclose(cross.joint, by_hand(15), rtol=1e-9, atol=1e-12)
+    _, covariance = cross.matrix_weights()
     net = shared_network({"matrix": hg.Fusion("own", hg.fusion.MatrixWeights())})
     np.testing.assert_allclose(hg.simulation.fused_covariances(net, 15)["matrix"][-1], covariance, rtol=1e-9)
 

@@ -9,8 +9,8 @@ import heliograph as hg
 def parts(seed, nodes=3, n=2):
     """Joint covariance of the known parts, covariances of the unknown ones."""
     draw = np.random.default_rng(seed)
-    root, own = draw.normal(size=(nodes * n, nodes * n)), draw.normal(size=(nodes, n, n))
-    return (root @ root.T).reshape(nodes, n, nodes, n) / n, own @ np.swapaxes(own, 1, 2)
+    root, local = draw.normal(size=(nodes * n, nodes * n)), draw.normal(size=(nodes, n, n))
+    return (root @ root.T).reshape(nodes, n, nodes, n) / n, local @ np.swapaxes(local, 1, 2)
 
 
 def estimates(known, unknown):
@@ -21,14 +21,14 @@ def estimates(known, unknown):
 def gain(rule, given):
     """The weights that a rule uses, read off its answers to unit means."""
     nodes, n = len(given), given[0].mean.shape[0]
-    found = np.zeros((n, nodes, n))
+    values = np.zeros((n, nodes, n))
     for i in range(nodes):
         unit = [
             hg.model.Estimate(np.eye(n) * (j == i), np.tile(e.covariance, (n, 1, 1)), e.claim)
             for j, e in enumerate(given)
         ]
-        found[:, i] = hg.fusion.fuse(rule, unit).mean.T
-    return found
+        values[:, i] = hg.fusion.fuse(rule, unit).mean.T
+    return values
 
 
 def test_it_is_above_whatever_the_unknown_parts_have_in_common():

@@ -59,9 +59,9 @@ def stacked(arrives):
         for i, (h, spread) in enumerate(known):
             place = N + N * STEPS + len(PARTS) * k + i
             start[place, place] = spread(state + np.outer(means, means))[0, 0]
-            heard = h @ x + np.eye(1, sources, place)
+            received = h @ x + np.eye(1, sources, place)
             before = a @ estimates[i]
-            estimates[i] = before + gains[i][k] @ (heard - h @ before)
+            estimates[i] = before + gains[i][k] @ (received - h @ before)
             if arrives[k, i]:
                 second = estimates[i] @ start @ estimates[i].T + np.outer(means, means)
                 rows.append(GAIN[0] * estimates[i])
@@ -83,9 +83,9 @@ def test_late_lost_and_fading_reports_give_the_best_linear_estimate(net):
     sent = {name: hg.simulation.SentReports(v, delay[:, i]) for i, (name, v) in enumerate(values.items())}
     zeros = dict.fromkeys(net.nodes, hg.simulation.SentReports(np.zeros((STEPS, N)), np.zeros(STEPS, dtype=int)))
     reports = {name: sent if name == "everything" else zeros for name in net.fused}
-    found = hg.run(net, silent, reports=reports).estimates["fused"]["everything"]
+    result = hg.run(net, silent, reports=reports).estimates["fused"]["everything"]
     arrives = ~lost & (np.arange(STEPS)[:, None] + delay < STEPS)
-    np.testing.assert_allclose(found.covariance[-1], stacked(arrives), rtol=1e-9)
+    np.testing.assert_allclose(result.covariance[-1], stacked(arrives), rtol=1e-9)
 
 
 @pytest.mark.slow
@@ -105,11 +105,11 @@ def test_monte_carlo_agrees(record):
 def test_runs_and_streams_give_what_was_simulated(net, record):
     """One run again: from its recording with the reports that came, and the centre alone fed with these."""
     data = {node: z[0] for node, z in record.measurements.items()}
-    told = {
-        fusion: {node: hg.simulation.SentReports(r.values[0], r.delay[0]) for node, r in own.items()}
-        for fusion, own in record.reports.items()
+    known = {
+        fusion: {node: hg.simulation.SentReports(r.values[0], r.delay[0]) for node, r in report.items()}
+        for fusion, report in record.reports.items()
     }
-    again = hg.run(net, data, reports=told)
+    again = hg.run(net, data, reports=known)
     for name, estimate in record.estimates["fused"].items():
         ours = again.estimates["fused"][name]
         np.testing.assert_allclose(ours.mean, np.asarray(estimate.mean)[0], rtol=1e-8, atol=1e-10)
@@ -117,12 +117,12 @@ def test_runs_and_streams_give_what_was_simulated(net, record):
     centre = hg.simulation.centre_filter(net, "everything")
     stream = hg.Stream(centre)
     for k in range(STEPS):
-        heard = [
+        received = [
             r.values[k - age] if k >= age and r.delay[k - age] == age else np.full(N, np.nan)
             for age in range(len(LATE))
-            for r in told["everything"].values()
+            for r in known["everything"].values()
         ]
-        live = stream.push(np.concatenate(heard))
+        live = stream.push(np.concatenate(received))
     np.testing.assert_allclose(live.mean, again.estimates["fused"]["everything"].mean[-1], rtol=1e-9)
     assert live.claim == "exact"
 

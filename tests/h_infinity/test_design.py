@@ -64,17 +64,17 @@ def test_smallest_levels_over_the_horizon(i):
     np.testing.assert_allclose(design.level, HORIZON[i], rtol=3e-5)
     closed = np.sqrt(0.05**2 * 2 * (1 - 0.7**32) / ((1 - 0.7**2) * 15))
     np.testing.assert_allclose(separate.level, closed, rtol=1e-5)
-    for found in (design, separate):
-        assert hg.h_infinity.certify_level(
-            node(i), found.gains, found.weights, found.multipliers, found.level
-        ).certified
+    for item in (design, separate):
+        assert hg.h_infinity.certify_level(node(i), item.gains, item.weights, item.multipliers, item.level).certified
 
 
 def test_the_recursion_cannot_look_ahead():
-    found = hg.h_infinity.smallest_recursive_level(node(0))
-    np.testing.assert_allclose(found.level, 0.02696, rtol=5e-4)
-    assert found.level > HORIZON[0]
-    assert hg.h_infinity.certify_level(node(0), found.gains, found.weights, found.multipliers, found.level).certified
+    result = hg.h_infinity.smallest_recursive_level(node(0))
+    np.testing.assert_allclose(result.level, 0.02696, rtol=5e-4)
+    assert result.level > HORIZON[0]
+    assert hg.h_infinity.certify_level(
+        node(0), result.gains, result.weights, result.multipliers, result.level
+    ).certified
 
 
 def test_steps_that_are_the_same_are_compiled_once(monkeypatch):
@@ -174,7 +174,7 @@ def test_structure_pays():
     """x+ = A x + phi with A known against all of it in one growth constant."""
     a = np.array([[0.9, 0.2], [-0.2, 0.9]])
     common = dict(
-        disturbance=0.1 * np.eye(2), feedthrough=np.zeros((1, 2)), wanted=np.eye(2), channel=hg.hop(1.0, 0.01)
+        disturbance=0.1 * np.eye(2), feedthrough=np.zeros((1, 2)), target=np.eye(2), channel=hg.hop(1.0, 0.01)
     )
     known = hg.h_infinity.growth_system(12, growth=0.05, transition=a, output=[[1.0, 0.0]], **common)
     unknown = hg.h_infinity.growth_system(12, growth=0.05 + np.linalg.norm(a, 2), output_growth=1.0, **common)

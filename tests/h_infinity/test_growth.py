@@ -21,19 +21,19 @@ REFUTED = {
 @pytest.mark.parametrize("name", REFUTED)
 def test_evidence_of_its_own_refutes(name):
     function, constant, text = REFUTED[name]
-    found = check_growth(function, constant, [-1.0], [1.0])
-    assert found.refuted and not found.proved
-    assert text in found.text
+    result = check_growth(function, constant, [-1.0], [1.0])
+    assert result.refuted and not result.proved
+    assert text in result.text
 
 
 @pytest.mark.parametrize(("low", "high"), [(-0.5, 0.9), (0.2, 0.7), (-3.0, -1.0)])
 def test_one_less_a_square_holds_every_sample(low, high):
     """JAX 0.12 writes a slope of tanh so; earlier releases never do."""
-    found = ARITHMETIC["one_minus_square"](Interval(np.array(low), np.array(high)))
+    result = ARITHMETIC["one_minus_square"](Interval(np.array(low), np.array(high)))
     points = np.linspace(low, high, 1001)
-    assert found.low <= np.min(1 - points**2) and np.max(1 - points**2) <= found.high
+    assert result.low <= np.min(1 - points**2) and np.max(1 - points**2) <= result.high
     nearest, farthest = (0.0 if low < 0 < high else min(abs(low), abs(high))), max(abs(low), abs(high))
-    np.testing.assert_allclose((found.low, found.high), (1 - farthest**2, 1 - nearest**2), rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose((result.low, result.high), (1 - farthest**2, 1 - nearest**2), rtol=1e-14, atol=1e-15)
 
 
 SMOOTH = {
@@ -50,12 +50,12 @@ SMOOTH = {
 @pytest.mark.parametrize("name", SMOOTH)
 def test_a_true_constant_is_proved_and_no_sample_exceeds_the_bound(name):
     function, constant = SMOOTH[name]
-    found = check_growth(function, constant, [-1.0, -1.0], [1.0, 1.0])
-    assert found.proved and "is proved in the box" in found.text
+    result = check_growth(function, constant, [-1.0, -1.0], [1.0, 1.0])
+    assert result.proved and "is proved in the box" in result.text
     points = np.random.default_rng(0).uniform(-1, 1, size=(4000, 2))
     with jax.enable_x64(True):
         slopes = np.asarray(jax.jit(jax.vmap(jax.jacfwd(lambda x: jnp.atleast_1d(function(x)))))(points))
-    assert np.linalg.norm(slopes, 2, axis=(1, 2)).max() <= found.bound <= found.limit
+    assert np.linalg.norm(slopes, 2, axis=(1, 2)).max() <= result.bound <= result.limit
     false = check_growth(function, 0.9 * np.linalg.norm(slopes, 2, axis=(1, 2)).max(), [-1.0, -1.0], [1.0, 1.0])
     assert false.refuted
 
@@ -73,14 +73,14 @@ def test_values_are_inside_their_intervals():
     random = np.random.default_rng(1)
     with jax.enable_x64(True):
         for function in operations:
-            jaxpr, many = jax.make_jaxpr(function)(jnp.zeros(2)), jax.jit(jax.vmap(jax.vmap(function)))
+            jaxpr, values_ = jax.make_jaxpr(function)(jnp.zeros(2)), jax.jit(jax.vmap(jax.vmap(function)))
             for width in (0.0, 0.1, 3.0):
                 middle = random.uniform(-1.5, 1.5, size=(20, 2))
                 lows, highs = np.maximum(middle - width, -3), np.minimum(middle + width, 3)
-                sampled = np.asarray(many(random.uniform(lows, highs, size=(50, 20, 2))))
+                sampled = np.asarray(values_(random.uniform(lows, highs, size=(50, 20, 2))))
                 for low, high, values in zip(lows, highs, np.moveaxis(sampled, 1, 0), strict=True):
-                    (found,) = evaluate(jaxpr, [Interval(low, high)], continuous=True)
-                    assert np.all(values >= found.low) and np.all(values <= found.high)
+                    (result,) = evaluate(jaxpr, [Interval(low, high)], continuous=True)
+                    assert np.all(values >= result.low) and np.all(values <= result.high)
 
 
 @pytest.mark.parametrize(
@@ -93,8 +93,8 @@ def test_values_are_inside_their_intervals():
     ids=["a jump", "a sign", "an operation"],
 )
 def test_what_cannot_be_followed_is_assumed_and_says_so(function, reason):
-    found = slope_bound(function, np.array([-1.0]), np.array([1.0]), 1.0)
-    assert found.value == np.inf and reason in found.reason
+    result = slope_bound(function, np.array([-1.0]), np.array([1.0]), 1.0)
+    assert result.value == np.inf and reason in result.reason
 
 
 def growing(constant):

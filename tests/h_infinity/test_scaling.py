@@ -9,15 +9,15 @@ from heliograph.h_infinity import certify_level, horizon_design, known_channel_d
 TURN = 0.95 * np.array([[np.cos(0.4), np.sin(0.4)], [-np.sin(0.4), np.cos(0.4)]])
 
 
-def system(initial, states=(1.0, 1.0), wanted=1.0, output=1.0, heard=1.0):
+def system(initial, states=(1.0, 1.0), target=1.0, output=1.0, received=1.0):
     """A rotation, with every quantity in units of its own."""
     s = np.array(states)
     return hg.h_infinity.growth_system(
         6,
         s[:, None] * np.array([[0.2, 0.0], [0.0, 0.1]]),
         output * np.array([[0.0, 0.3]]),
-        wanted * np.eye(2) / s,
-        hg.hop(heard / output, 0.04 * heard**2),
+        target * np.eye(2) / s,
+        hg.hop(received / output, 0.04 * received**2),
         0.0,
         transition=s[:, None] * TURN / s,
         output=output * np.array([[1.0, 0.5]]) / s,
@@ -50,8 +50,8 @@ def test_smallest_levels_are_the_riccati_forms_in_any_units(initial):
         scaled = system(initial, *units)
         design = horizon_design(scaled)
         np.testing.assert_allclose(design.level / units[1], expected, rtol=1e-5)
-        found = certify_level(scaled, design.gains, design.weights, design.multipliers, design.level)
-        assert found.certified and found.margin > 0
+        result = certify_level(scaled, design.gains, design.weights, design.multipliers, design.level)
+        assert result.certified and result.margin > 0
         step_by_step = recursive_design(scaled, 2 * design.level, search=False)
         assert step_by_step.feasible
         parts = step_by_step.gains, step_by_step.weights, step_by_step.multipliers, step_by_step.level
@@ -72,9 +72,9 @@ def test_a_system_known_by_growth_alone(size):
             6, s * np.array([[0.05], [0.1]]), [[0.2]], np.eye(2) / s, hg.hop(hg.random_affine.bernoulli(0.8), 0.01),
             0.7, 0.0, output=np.array([[1.0, 0.5]]) / s, initial_weight=5.0 / s**2,
         )  # fmt: skip
-        found = horizon_design(of)
-        assert certify_level(of, found.gains, found.weights, found.multipliers, found.level).certified
-        return found.level
+        outcome = horizon_design(of)
+        assert certify_level(of, outcome.gains, outcome.weights, outcome.multipliers, outcome.level).certified
+        return outcome.level
 
     np.testing.assert_allclose(design(size), design(1.0), rtol=1e-4)
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.learning.recordings import gathered
+from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.solution import Solution
-from heliograph.learning.surface import Surface
 from tests.oracles.learning_links import likelihood
 
 STEPS = 400
@@ -40,81 +40,82 @@ def recording():
 
 
 @pytest.fixture(scope="module")
-def found(recording):
+def result(recording):
     return hg.fit(network, recording, INPUTS, starts=3)
 
 
 def oracle(values, z, form, inputs=INPUTS):
     mean, variance, noise = values["mean gain"], values["gain variance"], values["hop noise"]
-    m, one = np.diag([mean, 1.0]), np.eye(1)
+    m, item = np.diag([mean, 1.0]), np.eye(1)
 
     def spread(w):
         return np.diag([variance * w[0, 0] + noise, 0.0])
 
     c, r = np.ones((2, 1)), np.diag([0.3, 0.2])
-    model = (0.95 * one, one, values["plant noise"] * one, c, r, 0.0, m, np.zeros(2), spread, np.zeros(1), one)
+    model = (0.95 * item, item, values["plant noise"] * item, c, r, 0.0, m, np.zeros(2), spread, np.zeros(1), item)
     return likelihood(model, z, inputs, form)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("form", ["linear", "conditional"])
-def test_the_likelihood_is_that_of_the_recursion(found, recording, form):
-    solution = next(one for one in found.solutions if one.form == form)
-    values = found.description.parameters.known(solution.x)
+def test_the_likelihood_is_that_of_the_recursion(result, recording, form):
+    solution = next(single for single in result.solutions if single.form == form)
+    values = result.description.parameters.known(solution.x)
     assert set(values) == {"plant noise", "mean gain", "gain variance", "hop noise"}
     expected = oracle(values, recording.measurements["node"][0], form)
-    assert found.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
+    assert result.log_likelihood[form] == pytest.approx(expected, rel=1e-12)
 
 
-def test_what_is_learned_covers_the_truth(found):
-    assert found.converged
-    for row in found.rows():
+def test_what_is_learned_covers_the_truth(result):
+    assert result.converged
+    for row in result.rows():
         assert row.low < row.estimate < row.high and row.identified and not row.boundary
         assert abs(row.estimate - TRUTH[row.name]) < 4 * row.standard_error
 
 
-def test_the_network_runs(found, recording):
-    record = hg.run(found.network, {"node": recording.measurements["node"][0]}, INPUTS)
+def test_the_network_runs(result, recording):
+    record = hg.run(result.network, {"node": recording.measurements["node"][0]}, INPUTS)
     assert record.measurements["node"].shape == (STEPS, 2)
-    assert found.network.plant.noise.covariance[0, 0] == found.values["plant noise"]
+    assert result.network.plant.noise.covariance[0, 0] == result.values["plant noise"]
 
 
-def test_scores_are_derivatives_of_the_likelihood(found, recording):
+def test_scores_are_derivatives_of_the_likelihood(result, recording):
     """By central differences, whose own error is of the order of the step's square."""
     step, shifts = 1e-5, 1e-5 * np.eye(4)
-    for solution in found.solutions:
+    for solution in result.solutions:
         surface = solution.surface
         x = solution.x + np.array([0.3, -0.2, 0.1, 0.4])
-        at = surface.found(x[None])
-        totals = surface.found(np.concatenate([x + shifts, x - shifts])).total
+        at = surface.result(x[None])
+        totals = surface.result(np.concatenate([x + shifts, x - shifts])).total
         np.testing.assert_allclose(at.gradient[0], (totals[:4] - totals[4:]) / (2 * step), rtol=1e-6, atol=1e-4)
         np.testing.assert_allclose(at.information, at.halves.sum(axis=1))
-        gradients = surface.found(solution.x[None]).gradient
+        gradients = surface.result(solution.x[None]).gradient
         assert np.abs(gradients).max() < 1e-5
 
 
-def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(found):
+def test_intervals_by_every_method_hold_the_estimate_and_hardly_differ_in_order(result):
     rows = {
-        method: found.rows(method, "conditional") for method in ("cosines", "bartlett", "white", "hessian", "bootstrap")
+        method: result.rows(method, "conditional")
+        for method in ("cosines", "bartlett", "white", "hessian", "bootstrap")
     }
-    for each in zip(*rows.values(), strict=True):
-        errors = [row.standard_error for row in each]
+    for item in zip(*rows.values(), strict=True):
+        errors = [row.standard_error for row in item]
         assert max(errors) < 3 * min(errors)
-        assert all(row.low < row.estimate < row.high for row in each)
+        assert all(row.low < row.estimate < row.high for row in item)
     np.testing.assert_allclose(
-        np.sqrt(np.diag(found.covariance)), [row.standard_error for row in rows["cosines"]], rtol=1e-8
+        np.sqrt(np.diag(result.covariance)), [row.standard_error for row in rows["cosines"]], rtol=1e-8
     )
     with pytest.raises(ValueError, match="method of intervals: expected one of cosines"):
-        found.rows("wald")
+        result.rows("wald")
 
 
 @pytest.mark.slow
-def test_a_profile_ends_where_the_likelihood_has_fallen(found, monkeypatch):
+def test_a_profile_ends_where_the_likelihood_has_fallen(result, monkeypatch):
     """At the end of an interval, with all others at their best, l is lower by half the 95 % point of chi-square."""
-    linear, profile = found.solutions[0], Solution._profile
+    linear, profile = result.solutions[0], Solution._profile
     place = linear.parameters.entries[1].place
     monkeypatch.setattr(Solution, "_profile", lambda *of: profile(*of) if of[1] == place else (0.0, 0.0))
-    row = found.rows("profile", "linear")[1]
+    row = result.rows("profile", "linear")[1]
     start = np.repeat(linear.x[None], 2, axis=0)
     start[:, place] = np.log([row.low, row.high])
     active = np.ones(start.shape, dtype=bool)
@@ -123,16 +124,16 @@ def test_a_profile_ends_where_the_likelihood_has_fallen(found, monkeypatch):
     np.testing.assert_allclose(fallen, 1.9207, atol=0.01)  # two refinements leave an eighth of an eighth of an error
 
 
-def test_several_recordings_are_one_likelihood(found, recording):
+def test_several_recordings_are_one_likelihood(result, recording):
     z = recording.measurements["node"][0]
-    solution = found.solutions[0]
+    solution = result.solutions[0]
     surface = solution.surface
-    parts = gathered(found.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
+    parts = gathered(result.description.start, [z, z[:150]], [INPUTS, INPUTS[:150]], 4)
     assert parts.lengths == (STEPS, 150) and parts.measurements.shape == (2, STEPS, 2)
-    whole = Surface(surface.objective, parts).found(solution.x[None]).total
-    values = found.description.parameters.known(solution.x)
+    whole = Surface(surface.objective, parts).result(solution.x[None]).total
+    values = result.description.parameters.known(solution.x)
     short = oracle(values, z[:150], solution.form, INPUTS[:150])
-    assert whole == pytest.approx(surface.found(solution.x[None]).total + short, rel=1e-12)
+    assert whole == pytest.approx(surface.result(solution.x[None]).total + short, rel=1e-12)
 
 
 def test_who_interrupts_keeps_the_best_so_far(recording):
@@ -140,10 +141,10 @@ def test_who_interrupts_keeps_the_best_so_far(recording):
         if "linear: step 2" in line:
             raise KeyboardInterrupt
 
-    found = hg.fit(network, recording, INPUTS, starts=3, progress=stop)
-    assert found.stopped and not found.converged
-    assert found.sentences[0] == "Stopped before the end: this is the best so far."
-    assert all(np.isfinite(row.estimate) for row in found.rows())
+    fitted = hg.fit(network, recording, INPUTS, starts=3, progress=stop)
+    assert fitted.stopped and not fitted.converged
+    assert fitted.sentences[0] == "Stopped before the end: this is the best so far."
+    assert all(np.isfinite(row.estimate) for row in fitted.rows())
 
 
 def chain():

@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize
 
 from heliograph.learning.intervals import bartlett, block_sums, cosines, white
-from heliograph.learning.maximise import maximise
+from heliograph.learning.likelihood.maximise import maximise
 from heliograph.learning.parameters import Parameter, Parameters
 from heliograph.learning.ridges import confounded, product_text, rank_of, sum_text
 from heliograph.numerics.domain import POSITIVE, REAL
@@ -30,18 +30,18 @@ def evaluate(x):
 
 def test_the_climb_ends_where_another_package_ends():
     start = np.array([[0.0, 0.0], [1.0, 1.0], [-1.0, -2.0]])
-    found = maximise(evaluate, start)
+    result = maximise(evaluate, start)
     theirs = optimize.least_squares(lambda x: residuals(x[None])[0][0], start[0], xtol=1e-15, ftol=1e-15, gtol=1e-15)
-    assert found.converged.all()
-    np.testing.assert_allclose(found.x, np.repeat(theirs.x[None], 3, axis=0), atol=1e-7)
+    assert result.converged.all()
+    np.testing.assert_allclose(result.x, np.repeat(theirs.x[None], 3, axis=0), atol=1e-7)
 
 
 def test_what_does_not_move_stays_and_the_impossible_is_given_up():
     fixed = maximise(evaluate, np.array([[0.0, 0.3]]), np.array([[True, False]]))
     assert fixed.converged[0] and fixed.x[0, 1] == 0.3
     assert abs(evaluate(fixed.x)[1][0, 0]) < 1e-6
-    nowhere = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
-    assert not nowhere.converged[0]
+    none_at_all = maximise(lambda x: (np.full(len(x), -np.inf), 0 * x, np.zeros((len(x), 2, 2))), np.zeros((1, 2)))
+    assert not none_at_all.converged[0]
 
 
 def test_long_run_covariances_of_an_autoregression():
@@ -69,22 +69,22 @@ def parameters(*domains):
     return Parameters(tuple(Parameter(names[i], np.array(1.0), d) for i, d in enumerate(domains)))
 
 
-def informed(told, parameters, points):
+def informed(known, parameters, points):
     """Ranks of the information of what is told, functions of the values, at points of the line."""
     ranks = []
     for x in points:
         values, turned = parameters.entries_at(x), parameters.jacobian(x)
         step = 1e-6 * np.eye(len(values))
-        rows = np.stack([(told(values + h) - told(values - h)) / 2e-6 for h in step], axis=1) @ turned
+        rows = np.stack([(known(values + h) - known(values - h)) / 2e-6 for h in step], axis=1) @ turned
         ranks.append(rank_of(rows.T @ rows + 0.0))
     return ranks
 
 
-def groups_of(told, *domains):
-    own = parameters(*domains)
+def groups_of(known, *domains):
+    local = parameters(*domains)
     points = [np.random.default_rng(i).uniform(0.3, 1.0, len(domains)) for i in range(3)]
     with np.errstate(all="ignore"):
-        return confounded(own, points, informed(told, own, points))
+        return confounded(local, points, informed(known, local, points))
 
 
 def test_a_product_is_found_and_put_in_words():

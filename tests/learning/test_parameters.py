@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import heliograph as hg
+from heliograph.learning.likelihood.transforms import from_line, link, slope, to_line, unlink
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.transforms import from_line, link, slope, to_line, unlink
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain
 
 
@@ -18,8 +18,8 @@ def network(channel, plant_noise=0.1, sensor_noise=0.1):
     return hg.Network(plant, {"node": hg.Node(hg.LinearSensor([[1.0]], sensor_noise), channel, {})})
 
 
-def found(build):
-    return {one.name: one.domain for one in hg.learning.describe(build).parameters.every}
+def result(build):
+    return {item.name: item.domain for item in hg.learning.describe(build).parameters.every}
 
 
 def test_where_a_number_stands_says_what_it_is():
@@ -28,7 +28,7 @@ def test_where_a_number_stands_says_what_it_is():
         bad = hg.dropout(hg.hop(hg.Rician(hg.free(1.0), hg.free(0.5)), 0.1), hg.free(0.7))
         return network(hg.gilbert_elliott(good, bad, hg.free(0.1), 0.2), hg.free(0.1), hg.free(0.2))
 
-    assert found(build) == {
+    assert result(build) == {
         "Nakagami shape": Domain(low=0.5),
         "Nakagami power": POSITIVE,
         "hop noise": POSITIVE,
@@ -57,7 +57,7 @@ def test_matrices_vectors_and_numbers_of_ones_own():
             },
         )
 
-    assert found(build) == {
+    assert result(build) == {
         "low": REAL,
         "chances": SIMPLEX,
         "mine": POSITIVE,
@@ -74,7 +74,7 @@ def test_one_name_is_one_number_and_places_without_names_are_counted():
         return network(hg.amplify_and_forward(shared))
 
     described = hg.learning.describe(build)
-    assert [one.name for one in described.parameters.every] == ["gain", "hop noise", "hop noise 2"]
+    assert [item.name for item in described.parameters.every] == ["gain", "hop noise", "hop noise 2"]
     built = described.at({"gain": 0.5, "hop noise": 0.3, "hop noise 2": 0.4})
     hops = built.nodes["node"].channel.maps
     assert [float(h.matrix[0, 0] * h.law.value) for h in hops] == [0.5, 0.5]
@@ -106,14 +106,14 @@ def test_the_line_and_back(domain, x):
     ],
 )
 def test_vectors_and_matrices_go_to_the_line_and_back(domain, value):
-    one = Parameter("it", value, domain)
+    item = Parameter("it", value, domain)
     x = to_line("it", domain, value)
-    assert len(x) == one.size
+    assert len(x) == item.size
     with jax.enable_x64(True):
         np.testing.assert_allclose(from_line(domain, value.shape, jnp.asarray(x)), value, rtol=1e-14)
-    known = Parameters((one,)).known(x)
+    known = Parameters((item,)).known(x)
     np.testing.assert_allclose(known["it"], value, rtol=1e-14)
-    assert len(Parameters((one,)).entries) == len(one.entries)
+    assert len(Parameters((item,)).entries) == len(item.entries)
 
 
 def test_what_cannot_be_marked_is_refused_in_one_line():

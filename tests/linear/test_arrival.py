@@ -26,8 +26,8 @@ def sensor(matrix, noise=2.5):
     ids=["scalar", "coupled", "three states", "all seen"],
 )
 def test_published_examples(matrix, output, lower, upper):
-    found = hg.linear.critical_arrival(plant(np.array(matrix, dtype=float)), sensor(output))
-    np.testing.assert_allclose(found[:2], (lower, upper), atol=5e-7)
+    result = hg.linear.critical_arrival(plant(np.array(matrix, dtype=float)), sensor(output))
+    np.testing.assert_allclose(result[:2], (lower, upper), atol=5e-7)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -37,29 +37,29 @@ def test_one_output_needs_the_product_of_all_unstable_eigenvalues(seed):
     matrix = generator.normal(size=(3, 3))
     matrix *= 1.4 / np.abs(np.linalg.eigvals(matrix)).max()
     sizes = np.abs(np.linalg.eigvals(matrix))
-    found = hg.linear.critical_arrival(plant(matrix), sensor(generator.normal(size=(1, 3))))
-    np.testing.assert_allclose(found.upper, 1 - np.prod(sizes[sizes > 1]) ** -2, atol=1e-7)
-    np.testing.assert_allclose(found.lower, 1 - 1.4**-2, atol=1e-12)
+    result = hg.linear.critical_arrival(plant(matrix), sensor(generator.normal(size=(1, 3))))
+    np.testing.assert_allclose(result.upper, 1 - np.prod(sizes[sizes > 1]) ** -2, atol=1e-7)
+    np.testing.assert_allclose(result.lower, 1 - 1.4**-2, atol=1e-12)
 
 
 def test_a_gain_that_is_kept():
     """(1 - arrival) a^2 + arrival (a - k)^2 = 1."""
     k = -0.70078691  # the Kalman gain where everything arrives
-    found = hg.linear.critical_arrival(plant([[-1.25]]), sensor([[1.0]]), gain=[[k]])
+    result = hg.linear.critical_arrival(plant([[-1.25]]), sensor([[1.0]]), gain=[[k]])
     expected = (1.25**2 - 1) / (1.25**2 - (-1.25 - k) ** 2)
-    np.testing.assert_allclose(found[:2], (expected, expected), atol=1e-8)
-    assert round(found.upper, 4) == 0.4461
+    np.testing.assert_allclose(result[:2], (expected, expected), atol=1e-8)
+    assert round(result.upper, 4) == 0.4461
 
 
 def test_a_stable_plant_needs_nothing():
-    found = hg.linear.critical_arrival(plant([[0.9]]), sensor([[1.0]]))
-    assert found[:2] == (0.0, 0.0)
+    result = hg.linear.critical_arrival(plant([[0.9]]), sensor([[1.0]]))
+    assert result[:2] == (0.0, 0.0)
 
 
 def test_no_process_or_sensor_noise_changes_no_threshold():
     quiet = hg.LinearPlant([[1.25, 0.0], [1.0, 1.1]], np.zeros((2, 2)), np.zeros(2), np.eye(2))
-    found = hg.linear.critical_arrival(quiet, sensor([[1.0, 1.0]], 0.0))
-    np.testing.assert_allclose(found.upper, 1 - 1.375**-2, atol=1e-7)
+    result = hg.linear.critical_arrival(quiet, sensor([[1.0, 1.0]], 0.0))
+    np.testing.assert_allclose(result.upper, 1 - 1.375**-2, atol=1e-7)
 
 
 def test_bad_input_is_one_line():

@@ -27,11 +27,11 @@ def test_system_is_lemmas_3_and_4(system, horizon):
     (x, spread), (z, _) = half(len(system.F) + system.C.shape[1]), half(len(system.C))
     before = hg.linear.state_moments(ours)
     for k in range(horizon):
-        plant, heard, s = steps[k], steps[k + 1], ours.step(k)
+        plant, received, s = steps[k], steps[k + 1], ours.step(k)
         scale = np.abs(seconds[k + 1]).max()
         pairs = [
             (s.transition, plant.A[x] @ spread), (s.drift, plant.M[x]), (s.process, plant.R_W[np.ix_(x, x)]),
-            (s.output, heard.C_c[z] @ spread), (s.offset, heard.N_c[z]), (s.noise, heard.R_Vc[np.ix_(z, z)]),
+            (s.output, received.C_c[z] @ spread), (s.offset, received.N_c[z]), (s.noise, received.R_Vc[np.ix_(z, z)]),
             (before.mean[k + 1], means[k + 1][x]),
         ]  # fmt: skip
         for mine, printed in pairs:
@@ -65,15 +65,15 @@ def test_error_is_that_of_regression_on_all_paths():
     s = scalar_system()
     x, p = oracle.independent(s.x0, s.eps0)
     features = np.ones((len(p), 1))
-    heard = oracle.independent(s.l, s.m, s.v, s.varpi, s.sigma)
+    received = oracle.independent(s.l, s.m, s.v, s.varpi, s.sigma)
     for t in range(2):
         a, b, w = oracle.augmented(s, t)
         pairs = np.array(
-            [(i, j, k) for i in range(len(p)) for j in range(len(w.chance)) for k in range(len(heard.chance))]
+            [(i, j, k) for i in range(len(p)) for j in range(len(w.chance)) for k in range(len(received.chance))]
         )
         i, j, k = pairs.T
-        x, p = x[i] @ a.T + w.points[j] @ b.T, p[i] * w.chance[j] * heard.chance[k]
-        power, relay, v, varpi, sigma = heard.points[k].T
+        x, p = x[i] @ a.T + w.points[j] @ b.T, p[i] * w.chance[j] * received.chance[k]
+        power, relay, v, varpi, sigma = received.points[k].T
         y = x[:, 0] * s.C[0, 0] + s.D[0, 0] * v
         z = s.theta * np.sqrt(relay) * (np.sqrt(power) * y + varpi) + sigma
         features = np.column_stack([features[i], z, z**2])
@@ -119,7 +119,7 @@ def test_without_coupling_the_bias_does_not_matter():
 def test_a_sensor_that_sees_nothing_leaves_the_open_loop():
     system = hg.linear.lifted_system(*model(replace(EXAMPLE, C=np.zeros((1, 2))), 20), 2, 20)
     spread = hg.linear.state_moments(system).covariance[1:]
-    expected = system.want @ spread @ system.want.T
+    expected = system.projection @ spread @ system.projection.T
     np.testing.assert_allclose(hg.linear.lmmse(system).gains.covariance, expected, rtol=0, atol=1e-14)
 
 
@@ -128,8 +128,8 @@ def test_any_invertible_mix_of_the_measurements_gives_the_same_filter(mix):
     s = model(two_sensors(), 10)
     mixed = hg.random_affine.Series([s.channel, hg.random_affine.known(mix)])
     expected = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, 10)).gains.covariance
-    found = hg.linear.lmmse(hg.linear.lifted_system(s.plant, s.sensor, mixed, 2, 10)).gains.covariance
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
+    result = hg.linear.lmmse(hg.linear.lifted_system(s.plant, s.sensor, mixed, 2, 10)).gains.covariance
+    np.testing.assert_allclose(result, expected, rtol=0, atol=1e-11 * np.abs(expected).max())
 
 
 def test_the_sign_of_all_sources_does_not_matter():
@@ -202,10 +202,10 @@ def test_steps_after_the_moments_have_come_to_stay_are_copied():
     burst = hg.gilbert_elliott(hop, hg.hop(0.2, 0.1), 0.2, 0.2)
     for channel in (hop, burst):
         still = lifted_system(plant, sensor, channel, 2, 200)
-        each = lifted_system(plant, sensor, hg.model.over_time([channel] * 200), 2, 200)
+        items = lifted_system(plant, sensor, hg.model.over_time([channel] * 200), 2, 200)
         assert still.steady_from < 150
-        for one, two in zip(lmmse(still).gains, lmmse(each).gains, strict=True):
-            np.testing.assert_allclose(one, two, rtol=1e-13, atol=1e-15)
+        for gain, two in zip(lmmse(still).gains, lmmse(items).gains, strict=True):
+            np.testing.assert_allclose(gain, two, rtol=1e-13, atol=1e-15)
     begun = time.perf_counter()
     item = hg.polynomial_filter(plant, sensor, hop, horizon=100_000)
     assert time.perf_counter() - begun < 20  # 1 s; step by step it was 60 s

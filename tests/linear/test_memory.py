@@ -37,19 +37,19 @@ def test_second_step_is_regression_on_all_products_of_all_paths():
     """Two steps: z_2 times the linear estimate is z_2 z_1 up to a factor: the full second-order Volterra filter."""
     s = scalar_system()
     x, p = oracle.independent(s.x0, s.eps0)
-    heard, past = oracle.independent(s.l, s.m, s.v, s.varpi, s.sigma), []
+    received, past = oracle.independent(s.l, s.m, s.v, s.varpi, s.sigma), []
     for t in range(2):
         a, b, w = oracle.augmented(s, t)
         i, j, k = (
-            axis.reshape(-1) for axis in np.meshgrid(*map(np.arange, (len(p), len(w.chance), len(heard.chance))))
+            axis.reshape(-1) for axis in np.meshgrid(*map(np.arange, (len(p), len(w.chance), len(received.chance))))
         )
-        x, p = x[i] @ a.T + w.points[j] @ b.T, p[i] * w.chance[j] * heard.chance[k]
-        power, relay, v, varpi, sigma = heard.points[k].T
+        x, p = x[i] @ a.T + w.points[j] @ b.T, p[i] * w.chance[j] * received.chance[k]
+        power, relay, v, varpi, sigma = received.points[k].T
         y = x[:, 0] * s.C[0, 0] + s.D[0, 0] * v
         past = [z[i] for z in past]
         past.append(s.theta * np.sqrt(relay) * (np.sqrt(power) * y + varpi) + sigma)
-    one, two = past
-    features = np.column_stack([np.ones(len(p)), one, one**2, two, two**2, one * two])
+    item, two = past
+    features = np.column_stack([np.ones(len(p)), item, item**2, two, two**2, item * two])
     root = np.sqrt(p)[:, None]
     residual = x - features @ np.linalg.lstsq(root * features, root * x, rcond=None)[0]
     covariance = hg.linear.lmmse(designs(s, 2)[2]).gains.covariance

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.random_affine.second_moments import nominal_spread
+from heliograph.random_affine.moments.second_moments import nominal_spread
 from tests.filters.modal_problems import PLANT, SENSOR, bursts, variances
 
 Series, Stack, Modes, known = (getattr(hg.random_affine, n) for n in ("Series", "Stack", "Modes", "known"))
@@ -20,9 +20,9 @@ A, Q, C, R, K = 0.9, 0.3, 1.0, 0.1, 0.4
 def relay(link):
     """(x, s) -> (x+, s+): x+ = A x + w, s+ = (A - K A) s + K z, where the relay hears z of x+ through `link`."""
     plant = GainAndNoise(Constant(1.0), np.diag([A, 1.0]), np.diag([Q, 0.0]))
-    heard = Series([GainAndNoise(Constant(1.0), [[C, 0.0]], R), link])
+    observed = Series([GainAndNoise(Constant(1.0), [[C, 0.0]], R), link])
     use = known([[1.0, 0.0, 0.0], [0.0, A - K * A, K]])
-    return Series([plant, Stack([known(np.eye(2)), heard]), use])
+    return Series([plant, Stack([known(np.eye(2)), observed]), use])
 
 
 def received(link):
@@ -30,9 +30,9 @@ def received(link):
     return Series([known([[0.0, 1.0]]), link])
 
 
-def step(second, size, move, hear):
+def step(second, size, move, receive):
     """E[r r'] of r = (y, 1, z_1, ..., z_k) moved and heard once: what is known of a map is its mean and spread."""
-    for channel, replace in ((move, True), (hear, False)):
+    for channel, replace in ((move, True), (receive, False)):
         mean, spread = np.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel).center
         y = second[:size, :size]
         rows = np.hstack([mean, np.zeros((len(mean), len(second) - size))])
@@ -49,22 +49,22 @@ def step(second, size, move, hear):
     return second
 
 
-def over_paths(moves, hears, rows, law, mean, covariance, steps):
+def over_paths(moves, observe, rows, law, mean, covariance, steps):
     """Error covariances of y given (1, z_1, ..., z_k), from all paths of the modes."""
     size, start = len(mean) + 1, np.append(mean, 1.0)
     first = np.outer(start, start) + np.pad(covariance, ((0, 1), (0, 1)))
-    found = []
+    results = []
     for k in range(steps):
         total = 0.0
         for path in product(range(len(law)), repeat=k + 1):
             weight, second = law[path[0]] * np.prod([rows[i][j] for i, j in pairwise(path)]), first
             for mode in path:
-                second = step(second, size, moves[mode], hears[mode])
+                second = step(second, size, moves[mode], observe[mode])
             total = total + weight * second
         y, z = total[: size - 1], total[size - 1 :]
         cross, gram = y[:, size - 1 :], z[:, size - 1 :]
-        found.append(y[:, : size - 1] - cross @ np.linalg.pinv(gram, rcond=1e-14) @ cross.T)
-    return np.array(found)
+        results.append(y[:, : size - 1] - cross @ np.linalg.pinv(gram, rcond=1e-14) @ cross.T)
+    return np.array(results)
 
 
 def test_a_relay_that_filters_in_the_shadow_of_its_receiver():
@@ -84,21 +84,21 @@ def test_a_plant_that_changes_with_the_mode():
     link = hg.markov_fading([0.4, 1.0], [[0.7, 0.3], [0.2, 0.8]], 0.1)
     system = hg.linear.modal_system(Modes(CHAIN, plants), link, [0.3], [[0.5]], 4)
     joint = hg.random_affine.joint_modes(link)
-    moves, hears = [p for p in plants for _ in range(2)], list(joint.maps) * 2
+    moves, observe = [p for p in plants for _ in range(2)], list(joint.maps) * 2
     rows, law = np.kron(CHAIN.transition, joint.transition), np.kron(CHAIN.initial, joint.initial)
-    expected = over_paths(moves, hears, rows, law, [0.3], [[0.5]], 4)
-    found = hg.linear.lmmse(system).gains.covariance
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    expected = over_paths(moves, observe, rows, law, [0.3], [[0.5]], 4)
+    result = hg.linear.lmmse(system).gains.covariance
+    np.testing.assert_allclose(result, expected, rtol=1e-9)
     item = hg.filters.LinearSystemFilter(system)
     hg.testing.check_filter(item, steps=4)
 
 
 def test_without_modes_of_the_plant_it_is_the_linear_filter():
     move = GainAndNoise(Constant(1.0), PLANT.matrix, PLANT.noise)
-    heard = Series([GainAndNoise(Constant(1.0), SENSOR.matrix, SENSOR.noise), bursts()])
-    system = hg.linear.modal_system(move, heard, PLANT.initial_mean, PLANT.initial_covariance, 20)
-    found = hg.linear.lmmse(system).gains.covariance[:, 0]
-    np.testing.assert_allclose(found, variances(PLANT, SENSOR, bursts(), 20), rtol=1e-12)
+    observed = Series([GainAndNoise(Constant(1.0), SENSOR.matrix, SENSOR.noise), bursts()])
+    system = hg.linear.modal_system(move, observed, PLANT.initial_mean, PLANT.initial_covariance, 20)
+    result = hg.linear.lmmse(system).gains.covariance[:, 0]
+    np.testing.assert_allclose(result, variances(PLANT, SENSOR, bursts(), 20), rtol=1e-12)
 
 
 def test_what_does_not_fit_is_refused():

@@ -13,8 +13,8 @@ EXAMPLE = oracle.paper_example()
 
 
 def scalar(process=1.0, noise=1.0, horizon=5):
-    one = np.ones((horizon, 1, 1))
-    steps = hg.linear.Steps(one, one[:, 0], process * one, one, np.zeros((horizon, 1)), noise * one)
+    values = np.ones((horizon, 1, 1))
+    steps = hg.linear.Steps(values, values[:, 0], process * values, values, np.zeros((horizon, 1)), noise * values)
     return hg.linear.LinearSystem(steps, [0.0], [[2.0]], [[1.0]])
 
 
@@ -31,10 +31,10 @@ def test_scalar_recursion_by_hand():
 def test_slow_covariance_is_not_taken_for_its_limit():
     """a = 1 - 1e-5, begun 4e-10 above the limit: 100 steps change 8e-13 of it, and 5000 steps fifty times as much."""
     a, r, horizon = 1 - 1e-5, 1e6, 5000
-    q, one = 1 - a**2, np.ones((horizon, 1, 1))
+    q, item = 1 - a**2, np.ones((horizon, 1, 1))
     half = (q + r * (1 - a**2)) / (2 * a**2)
     limit = np.sqrt(half**2 + r * q / a**2) - half
-    steps = hg.linear.Steps(a * one, 0 * one[:, 0], q * one, one, 0 * one[:, 0], r * one)
+    steps = hg.linear.Steps(a * item, 0 * item[:, 0], q * item, item, 0 * item[:, 0], r * item)
     system = hg.linear.LinearSystem(steps, [0.0], [[limit * (1 + 4e-10)]], [[1.0]])
     p, expected = system.covariance, []
     for k in range(horizon):
@@ -63,12 +63,12 @@ def test_printed_filter_claims_and_has_what_the_oracle_says(system):
 
 
 def test_with_known_powers_the_printed_filter_is_the_best():
-    one = oracle.Atoms(np.array([[1.3]]), np.array([1.0]))
-    s = model(EXAMPLE.__class__(**{**EXAMPLE.__dict__, "l": one, "m": one}), 20)
+    item = oracle.Atoms(np.array([[1.3]]), np.array([1.0]))
+    s = model(EXAMPLE.__class__(**{**EXAMPLE.__dict__, "l": item, "m": item}), 20)
     best = hg.linear.lmmse(hg.linear.lifted_system(*s, 2, 20)).gains.covariance
-    found = printed.printed_quadratic(*s, 20)
-    np.testing.assert_allclose(found.true_covariance, best, rtol=0, atol=1e-14)
-    np.testing.assert_allclose(found.schedule.gains.covariance, best, rtol=0, atol=1e-14)
+    result = printed.printed_quadratic(*s, 20)
+    np.testing.assert_allclose(result.true_covariance, best, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(result.schedule.gains.covariance, best, rtol=0, atol=1e-14)
 
 
 def test_true_error_of_wrong_gains_counts_bias_and_spread():
@@ -81,8 +81,8 @@ def test_true_error_of_wrong_gains_counts_bias_and_spread():
     )  # fmt: skip
     # x+ = x + 1 + w has mean 1 and variance 3
     expected = 0.25 * 3 + 0.25 + (0.5 - 0.2) ** 2
-    found = hg.linear.true_covariance(system, hg.linear.Schedule(gains, [0.0], "nominal"))
-    assert found[0, 0, 0] == pytest.approx(expected, rel=1e-14)
+    result = hg.linear.true_covariance(system, hg.linear.Schedule(gains, [0.0], "nominal"))
+    assert result[0, 0, 0] == pytest.approx(expected, rel=1e-14)
 
 
 def test_linear_degree_is_the_linear_filter_of_the_library():
@@ -113,14 +113,14 @@ SKEWED = hg.random_affine.FiniteSupport([[2.0], [-0.5]], [0.2, 0.8])
 def test_a_state_that_outgrows_its_error_costs_no_digits():
     """Growth by half at each step, 60 of them: E[x^2] is 1e21, and the error's is that of the Riccati equation."""
     plant, sensor = hg.LinearPlant([[1.5]], SKEWED, [0.0], 1.0), hg.LinearSensor([[1.0]], SKEWED)
-    found = {d: hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), d, 60)) for d in (1, 2)}
+    results = {d: hg.linear.lmmse(hg.linear.lifted_system(plant, sensor, hg.perfect(), d, 60)) for d in (1, 2)}
     p = 1.0
     for _ in range(60):
         p = 1 / (1 / (2.25 * p + 1) + 1)
-    assert found[1].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
-    assert all(schedule.claim == "exact" for schedule in found.values())
-    assert found[2].gains.covariance[10, 0, 0] < p * (1 - 1e-6)  # what squares add vanishes as x grows
-    assert found[2].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
+    assert results[1].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
+    assert all(schedule.claim == "exact" for schedule in results.values())
+    assert results[2].gains.covariance[10, 0, 0] < p * (1 - 1e-6)  # what squares add vanishes as x grows
+    assert results[2].gains.covariance[-1, 0, 0] == pytest.approx(p, rel=1e-9)
 
 
 def test_digits_lost_lower_the_claim_and_what_is_left_is_no_better_than_the_linear_filter():

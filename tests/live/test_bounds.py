@@ -52,8 +52,8 @@ def test_each_row_is_final_once_and_in_order_and_no_more_are_held_than_allowed(n
     np.testing.assert_array_equal(np.concatenate([part.time for part in final]), moments)
     dt = np.diff(moments, prepend=0.0)
     expected = hg.run(network, {"a": np.sin(moments)}, np.column_stack([np.zeros(300), dt])).estimates["a"]["f"]
-    found = np.concatenate([part.estimates["a"]["f"].mean for part in final])
-    np.testing.assert_allclose(found, expected.mean, rtol=1e-10, atol=1e-13)
+    values = np.concatenate([part.estimates["a"]["f"].mean for part in final])
+    np.testing.assert_allclose(values, expected.mean, rtol=1e-10, atol=1e-13)
 
 
 def test_what_is_older_than_the_window_is_used_if_nothing_newer_is_final(network):

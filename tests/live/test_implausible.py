@@ -9,11 +9,11 @@ from tests.live.worlds import FADING, PLANT, SENSOR, events, forgetful, moving
 ABSURD = [1e16, -1e20, 3.4e38, 1e155, -1e308]
 
 
-def same(found, wanted):
-    for node, filters in wanted.items():
+def same(result, expected):
+    for node, filters in expected.items():
         for name, estimate in filters.items():
-            np.testing.assert_array_equal(found[node][name].mean, estimate.mean, f"{node}/{name}")
-            np.testing.assert_array_equal(found[node][name].covariance, estimate.covariance, f"{node}/{name}")
+            np.testing.assert_array_equal(result[node][name].mean, estimate.mean, f"{node}/{name}")
+            np.testing.assert_array_equal(result[node][name].covariance, estimate.covariance, f"{node}/{name}")
 
 
 @pytest.mark.parametrize("make", [forgetful, moving])
@@ -36,9 +36,9 @@ def test_absurd_events_leave_no_trace(make):
     same(stained.lagged(2.0), clean.lagged(2.0))
     for timeline in (clean, stained):
         timeline.advance(1e3)
-    found, wanted = stained.final(), clean.final()
-    np.testing.assert_array_equal(found.time, wanted.time)
-    same(found.estimates, wanted.estimates)
+    result, expected = stained.final(), clean.final()
+    np.testing.assert_array_equal(result.time, expected.time)
+    same(result.estimates, expected.estimates)
 
 
 def test_one_filter_alone_leaves_out_what_only_it_finds_implausible():
@@ -49,13 +49,13 @@ def test_one_filter_alone_leaves_out_what_only_it_finds_implausible():
     network = hg.Network(PLANT, {"a": hg.Node(SENSOR, FADING, {"lost": lost, "fine": fine})})
     timeline = hg.Timeline(network, window=5.0)
     assert [timeline.push("a", k, k, [1.0]) for k in range(2)] == ["used", "used"]
-    found = timeline.estimates()["a"]
-    assert found["lost"].mean[0] == 0.0 and found["fine"].mean[0] > 0.5
+    result = timeline.estimates()["a"]
+    assert result["lost"].mean[0] == 0.0 and result["fine"].mean[0] > 0.5
     assert timeline.lagged(0.0)["a"]["lost"].mean[0] == 0.0
     with pytest.warns(UserWarning, match="filter 'lost' of 'a' alone: 2 rows .1, 2. are implausible, left out: more"):
         record = hg.run(network, {"a": np.ones((2, 1))})
     np.testing.assert_array_equal(record.estimates["a"]["lost"].mean, [[0.0], [0.0]])
-    np.testing.assert_allclose(record.estimates["a"]["fine"].mean[-1], found["fine"].mean, atol=1e-14)
+    np.testing.assert_allclose(record.estimates["a"]["fine"].mean[-1], result["fine"].mean, atol=1e-14)
 
 
 def limited():
@@ -77,11 +77,11 @@ def test_values_beyond_limits_count_as_not_arrived():
     assert again.dropped == {"a": 4}
     with pytest.warns(UserWarning, match=r"node 'a': 4 of 10 values count as not arrived; row 2: near 6 is outside -5"):
         record = hg.run(network, {"a": z})
-    wanted = hg.run(free, {"a": seen})
-    same(record.estimates, wanted.estimates)
+    record_ = hg.run(free, {"a": seen})
+    same(record.estimates, record_.estimates)
     np.testing.assert_array_equal(record.measurements["a"], seen)
     last = timeline.estimates()["a"]["f"].mean
-    np.testing.assert_allclose(last, wanted.estimates["a"]["f"].mean[-1], atol=1e-14)  # two programs
+    np.testing.assert_allclose(last, record_.estimates["a"]["f"].mean[-1], atol=1e-14)  # two programs
 
 
 @pytest.mark.parametrize("smooth", [None, hg.smoothing.FixedInterval()])
@@ -93,15 +93,15 @@ def test_absurd_rows_of_a_recording_leave_no_trace(smooth):
     clean, stained = ({name: rows.copy() for name, rows in z.items()} for _ in range(2))
     for name, row, value in (("a", 3, 1e20), ("a", 7, -1e308), ("b", 3, 1e155)):
         clean[name][row], stained[name][row] = np.nan, value
-    wanted = hg.run(network, clean, smooth=smooth)
+    record = hg.run(network, clean, smooth=smooth)
     with pytest.warns(UserWarning, match="implausible") as said:
-        found = hg.run(network, stained, smooth=smooth)
+        outcome = hg.run(network, stained, smooth=smooth)
     words = "implausible, as if not arrived: more than 1e6 deviations from what was expected"
-    lines = [str(one.message) for one in said]
+    lines = [str(single.message) for single in said]
     assert [line.partition(words)[0] for line in lines] == ["node 'a': 2 rows (4, 8) are ", "node 'b': row 4 is "]
-    same(found.estimates, wanted.estimates)
+    same(outcome.estimates, record.estimates)
     if smooth is not None:
-        same(found.smoothed.estimates, wanted.smoothed.estimates)
+        same(outcome.smoothed.estimates, record.smoothed.estimates)
 
 
 def test_absurd_inputs_of_a_recording_are_named():

@@ -15,9 +15,9 @@ GAPS = {"a": (3, 5, 11), "b": (3, 5, 7, 11)}  # two of them at both nodes, one a
 def test_in_steps_it_is_the_smoother_of_the_rows():
     plant = hg.LinearPlant([[1.0, 1.0], [0.0, 0.95]], np.diag([0.01, 0.05]), [0.0, 1.0], np.eye(2))
     sensor, channel = hg.LinearSensor([[1.0, 0.0]], 0.3), hg.hop(hg.Rayleigh(1.0), 0.05)
-    own = {"linear": hg.linear_filter(plant, sensor, channel)}
+    local = {"linear": hg.linear_filter(plant, sensor, channel)}
     fused = {"equal": hg.Fusion("linear", hg.fusion.EqualIntersection())}
-    nodes = {"a": hg.Node(sensor, channel, own), "b": hg.Node(sensor, channel, own)}
+    nodes = {"a": hg.Node(sensor, channel, local), "b": hg.Node(sensor, channel, local)}
     generator = np.random.default_rng(0)
     z = {name: generator.normal(size=(12, 1)) for name in nodes}
     for name, gaps in GAPS.items():
@@ -33,11 +33,11 @@ def test_in_steps_it_is_the_smoother_of_the_rows():
         timeline.lagged(9.0)
     before = timeline.save()
     for lag in (0, 3, 4, 6, 8):
-        found = timeline.lagged(lag)
-        assert {node: set(filters) for node, filters in found.items()} == {
+        result = timeline.lagged(lag)
+        assert {node: set(filters) for node, filters in result.items()} == {
             "a": {"linear"}, "b": {"linear"}, "fused": {"equal"},
         }  # fmt: skip
-        for node, filters in found.items():
+        for node, filters in result.items():
             for name, estimate in filters.items():
                 expected = whole.smoothed.estimates[node][name]
                 assert estimate.claim == expected.claim
@@ -61,9 +61,9 @@ def test_in_continuous_time_it_is_the_conditional_law():
         moment = 12.0 - lag
         cross = start + q * np.minimum(moment, times)
         gain = np.linalg.solve(start + q * np.minimum(times[:, None], times) + r * np.eye(9), cross)
-        found = timeline.lagged(lag)["a"]["f"]
-        np.testing.assert_allclose(found.mean, 0.5 + gain @ (z - 0.5), rtol=1e-12)
-        np.testing.assert_allclose(found.covariance, [[start + q * moment - gain @ cross]], rtol=1e-11)
+        result = timeline.lagged(lag)["a"]["f"]
+        np.testing.assert_allclose(result.mean, 0.5 + gain @ (z - 0.5), rtol=1e-12)
+        np.testing.assert_allclose(result.covariance, [[start + q * moment - gain @ cross]], rtol=1e-11)
 
 
 def test_filters_without_a_covariance_refuse_and_are_left_out():
@@ -79,6 +79,6 @@ def test_filters_without_a_covariance_refuse_and_are_left_out():
         timeline.lagged(1.0)
     both = {"f": gains, "linear": hg.linear_filter(plant, sensor, hg.perfect())}
     fused = {"informed": hg.Fusion("linear", hg.fusion.MatrixWeights())}
-    beside = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
-    smoothed = Sweeper(beside, None, player(beside).structure).item
-    assert smoothed.fusions == () and [beside.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]
+    others = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), both)}, fused)
+    smoothed = Sweeper(others, None, player(others).structure).item
+    assert smoothed.fusions == () and [others.kinds[kind].filters for kind in smoothed.kinds] == [("linear",)]

@@ -17,7 +17,7 @@ ROW = hg.LinearSensor([[1.0, 0.0]], 0.5)
 PACKAGES = ("heliograph", "jax", "equinox")
 
 
-class Keeping(hg.filters.AbstractFilter):
+class Remembering(hg.filters.AbstractFilter):
     """Its state is the measurement before, and its mean the sum of that one and the present one."""
 
     claim: Claim = eqx.field(static=True, default="none")
@@ -120,14 +120,14 @@ def test_its_numbers_are_those_of_run():
     rng = np.random.default_rng(0)
     z, u = rng.normal(size=(20, 1)), rng.normal(size=(20, 1))
     z[4] = np.nan
-    told = hg.run(hg.Network(PLANT, {"n": hg.Node(ROW, relay, items)}), {"n": z}, u).estimates["n"]
+    known = hg.run(hg.Network(PLANT, {"n": hg.Node(ROW, relay, items)}), {"n": z}, u).estimates["n"]
     for name, item in items.items():
         stream = hg.Stream(item)
         for k in range(len(z)):
             estimate = stream.push(z[k], u[k])
-            np.testing.assert_allclose(estimate.mean, told[name].mean[k], rtol=0, atol=1e-14)
-            np.testing.assert_allclose(estimate.covariance, told[name].covariance[k], rtol=0, atol=1e-14)
-            assert estimate.claim == told[name].claim
+            np.testing.assert_allclose(estimate.mean, known[name].mean[k], rtol=0, atol=1e-14)
+            np.testing.assert_allclose(estimate.covariance, known[name].covariance[k], rtol=0, atol=1e-14)
+            assert estimate.claim == known[name].claim
 
 
 def test_a_sample_runs_little_python():
@@ -148,20 +148,20 @@ def test_a_sample_runs_little_python():
 
 def test_what_is_pushed_is_copied():
     """The caller may fill one array again and again."""
-    stream, other = hg.Stream(Keeping()), hg.Stream(Keeping())
+    stream, other = hg.Stream(Remembering()), hg.Stream(Remembering())
     z = np.zeros(64)
     for k in range(4):
         z[:] = k
-        told = stream.push(z).mean, other.push(np.full(64, float(k))).mean
+        known = stream.push(z).mean, other.push(np.full(64, float(k))).mean
         z[:] = np.nan
-        np.testing.assert_array_equal(*told)
+        np.testing.assert_array_equal(*known)
 
 
 def test_streams_of_one_filter_share_what_they_do_not_change():
     item = hg.kalman_filter(PLANT, SENSOR)
-    one, other = hg.Stream(item), hg.Stream(item)
-    one.push([1.0, 2.0], [0.0])
-    assert one._placed is other._placed
+    single, other = hg.Stream(item), hg.Stream(item)
+    single.push([1.0, 2.0], [0.0])
+    assert single._placed is other._placed
     np.testing.assert_array_equal(other.push([1.0, 2.0], [0.0]).mean, hg.Stream(item).push([1.0, 2.0], [0.0]).mean)
 
 
@@ -173,13 +173,13 @@ def test_what_is_no_filter_makes_no_stream():
 def test_a_stream_that_was_saved_goes_on_with_the_same_bits():
     filter_ = hg.linear_filter(PLANT, SENSOR, hg.perfect(2))
     z = np.random.default_rng(0).normal(size=(6, 2))
-    one = hg.Stream(filter_)
+    item = hg.Stream(filter_)
     for row in z[:3]:
-        one.push(row, [0.1])
-    other = hg.Stream.restore(filter_, one.save())
+        item.push(row, [0.1])
+    other = hg.Stream.restore(filter_, item.save())
     assert other.steps == 3
     for row in z[3:]:
-        a, b = one.push(row, [0.1]), other.push(row, [0.1])
+        a, b = item.push(row, [0.1]), other.push(row, [0.1])
         assert np.array_equal(a.mean, b.mean) and np.array_equal(a.covariance, b.covariance)
 
 

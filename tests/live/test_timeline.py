@@ -47,7 +47,7 @@ def timeline(network, window=WINDOW, capacity=CAPACITY):
     return hg.Timeline(network, window, capacity=capacity)
 
 
-def told(item):
+def outputs_of(item):
     return [
         part
         for filters in item.estimates().values()
@@ -56,8 +56,8 @@ def told(item):
     ]
 
 
-def assert_same_bits(one, other):
-    for a, b in zip(told(one), told(other), strict=True):
+def assert_same_bits(item, other):
+    for a, b in zip(outputs_of(item), outputs_of(other), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -103,8 +103,8 @@ def test_whatever_comes_its_bits_are_those_of_what_it_accepted(world, seed, mixi
         assert all(time >= item.now - WINDOW for time in held) and len(held) <= CAPACITY
         if i == stop:
             item = hg.Timeline.restore(network, item.save())
-    assert sum(sum(each.values()) for each in item.counts.values()) == counted
-    assert sum(each["used"] for each in item.counts.values()) == len(accepted) and item.forced == 0
+    assert sum(sum(count.values()) for count in item.counts.values()) == counted
+    assert sum(count["used"] for count in item.counts.values()) == len(accepted) and item.forced == 0
     assert_same_bits(item, in_order(network, accepted, item.now))
 
 
@@ -121,15 +121,15 @@ def assert_unchanged(before, after):
 def test_any_order_within_the_window_and_everything_twice(world, seed):
     network, continuous = world.network, world.continuous
     generator = np.random.default_rng(seed)
-    found = [
+    results = [
         e._replace(arrival=e.time + WINDOW * generator.random()) for e in worlds.events(network, seed, 12, continuous)
     ]
     once, twice = timeline(network), timeline(network)
-    for event in sorted(found, key=lambda e: e.arrival):
+    for event in sorted(results, key=lambda e: e.arrival):
         assert once.push(*event) == "used"
         assert twice.push(*event) == "used" and twice.push(*event) == "duplicate"
     assert_same_bits(once, twice)
-    assert_same_bits(once, in_order(network, found, once.now))
+    assert_same_bits(once, in_order(network, results, once.now))
 
 
 @pytest.mark.slow
@@ -149,10 +149,10 @@ def test_what_comes_in_order_is_used_however_late(world, seed):
 def test_its_estimates_are_those_of_run(world):
     """Rows in order, with the time since the row before where that is an input; two programs, so to rounding."""
     network = world.network
-    found = worlds.events(network, 5, 9, world.continuous)
+    result = worlds.events(network, 5, 9, world.continuous)
     joint = not world.continuous or world.name == "sharing"
     rows, held, last = [], np.zeros(1), 0.0
-    for event in found:
+    for event in result:
         if not rows or not (joint and rows[-1]["time"] == event.time):
             rows.append({"time": event.time, "u": [held, event.time - last], "heard": {}})
         last = event.time
@@ -173,7 +173,7 @@ def test_its_estimates_are_those_of_run(world):
     if world.continuous:
         u = np.column_stack([u, [row["u"][1] for row in rows]])
     record, item = hg.run(network, z, u if network.inputs else None), timeline(network, window=10.0)
-    for event in reversed(found):
+    for event in reversed(result):
         assert item.push(*event[:4], 9.0) == "used"
     item.now = last
     for node, filters in item.estimates().items():

@@ -19,7 +19,7 @@ LOSSES = hg.gilbert_elliott(hg.erasure(hg.hop(1.0, 0.05), 0.9), hg.erasure(hg.ho
 def forgetful() -> hg.Network:
     """Steps, an input, two nodes behind hops that forget, fused in every way."""
     parts = PUSHED, SENSOR, FADING
-    own = {
+    local = {
         "linear": hg.linear_filter(*parts),
         "cubature": hg.cubature_filter(*parts),
         "mixture": hg.mixture_filter(*parts),
@@ -32,13 +32,13 @@ def forgetful() -> hg.Network:
         "weights": hg.Fusion("linear", hg.fusion.MatrixWeights()),
         "sent": hg.Fusion("cubature", hg.fusion.EqualIntersection(), hg.fusion.EscapeQuantizer(9, 1.0, 0.9, 2.0, 0.1)),
     }
-    return hg.Network(PUSHED, {"a": hg.Node(SENSOR, FADING, own), "b": hg.Node(SENSOR, FADING, own)}, fused)
+    return hg.Network(PUSHED, {"a": hg.Node(SENSOR, FADING, local), "b": hg.Node(SENSOR, FADING, local)}, fused)
 
 
 def remembering() -> hg.Network:
     """Steps, links that remember, one that loses, filters over their modes; and gains fixed before any data."""
     parts = PLANT, SENSOR, BURSTS
-    own = {
+    local = {
         "linear": hg.linear_filter(*parts),
         "imm": hg.filters.imm_filter(*parts),
         "particles": hg.filters.particle_filter(*parts, particles=8),
@@ -53,8 +53,8 @@ def remembering() -> hg.Network:
         "polynomial": hg.polynomial_filter(*sure, STEPS),
         "scheduled": hg.filters.scheduled_polynomial_filter(*sure, STEPS),
     }  # fmt: skip
-    told = {"told": hg.filters.told_filter(PLANT, SENSOR, LOSSES)}
-    nodes = {"a": hg.Node(*parts[1:], own), "b": hg.Node(SENSOR, LOSSES, told), "c": hg.Node(*sure[1:], gains)}
+    known = {"told": hg.filters.side_information_filter(PLANT, SENSOR, LOSSES)}
+    nodes = {"a": hg.Node(*parts[1:], local), "b": hg.Node(SENSOR, LOSSES, known), "c": hg.Node(*sure[1:], gains)}
     return hg.Network(PLANT, nodes)
 
 
@@ -63,27 +63,27 @@ def moving(shared: bool = False) -> hg.Network:
     share the sensor's noise."""
     plant = hg.Plant(lambda x, u: x + u[0] * u[1], lambda u: jnp.diag(0.3 * u[1:]), [0.0], 1.0, inputs=["speed", "dt"])
     if not shared:
-        own = {
+        local = {
             "cubature": hg.cubature_filter(plant, SENSOR, FADING),
             "extended": hg.extended_filter(plant, SENSOR, FADING),
         }
-        central = hg.filters.sequential_filter([own["cubature"], own["cubature"]])
-        node = hg.Node(SENSOR, FADING, own)
+        central = hg.filters.sequential_filter([local["cubature"], local["cubature"]])
+        node = hg.Node(SENSOR, FADING, local)
         return hg.Network(plant, {"a": node, "b": node}, {"central": central})
     sensor = hg.LinearSensor([[1.0], [1.0]], [[0.2, 0.15], [0.15, 0.2]])
     joint = hg.cubature_filter(plant, sensor, hg.perfect(2))
-    own = {"cubature": hg.cubature_filter(plant, hg.LinearSensor([[1.0]], 0.2), hg.perfect())}
-    return hg.Network.sharing(plant, sensor, hg.perfect(2), {"a": own, "b": own}, {"central": joint})
+    local = {"cubature": hg.cubature_filter(plant, hg.LinearSensor([[1.0]], 0.2), hg.perfect())}
+    return hg.Network.sharing(plant, sensor, hg.perfect(2), {"a": local, "b": local}, {"central": joint})
 
 
 def events(network: hg.Network, seed: int, count: int, continuous: bool) -> list[Event]:
     """At distinct moments, some of all nodes at once, in the order of time; every third of the inputs."""
     generator = np.random.default_rng(seed)
-    found = []
+    results = []
     for i in range(count):
         time = float(np.round(0.3 * i + 0.2 * generator.random(), 3)) if continuous else float(i)
         if network.inputs and generator.random() < 0.3:
-            found.append(Event("inputs", i, time, generator.normal(size=1)))
+            results.append(Event("inputs", i, time, generator.normal(size=1)))
         here = [name for name in network.names if generator.random() < 0.7]
-        found += [Event(name, i, time, generator.normal(size=1)) for name in here]
-    return found
+        results += [Event(name, i, time, generator.normal(size=1)) for name in here]
+    return results

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import heliograph as hg
 from heliograph.model import centred, delayed, expected_signal
 from heliograph.random_affine.base import conditional_moments
-from heliograph.random_affine.second_moments import second_order
+from heliograph.random_affine.moments.second_moments import second_order
 
 HORIZON, RUNS = 8, 4000
 Z_LIMIT = 4.0  # one number in 30,000 beyond it by chance; the seed is fixed and a few dozen numbers are compared
@@ -25,20 +25,20 @@ numbers = st.floats(-50.0, 50.0)
 @given(y=numbers, r=numbers)
 def test_the_mean_stays_and_the_spread_is_that_of_what_is_sent(y: float, r: float) -> None:
     """E[z | y] as without, Var(z | y) as of y - r: of any hops, from their moments."""
-    found, plain = (conditional_moments(item, [y], 2) for item in (centred(RELAYED, r), RELAYED))
+    result, plain = (conditional_moments(item, [y], 2) for item in (centred(RELAYED, r), RELAYED))
     sent = conditional_moments(RELAYED, [y - r], 2)
     variance = sent[0] - sent[1] ** 2
     size = 1 + y**2 + r**2  # rounding of differences of squares
-    np.testing.assert_allclose(found[1], plain[1], rtol=0, atol=1e-12 * size)
-    np.testing.assert_allclose(found[0] - found[1] ** 2, variance, rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(result[1], plain[1], rtol=0, atol=1e-12 * size)
+    np.testing.assert_allclose(result[0] - result[1] ** 2, variance, rtol=0, atol=1e-12 * size)
 
 
 def test_the_expected_signal_is_the_mean() -> None:
-    mean, found = np.array([8.0, -4.0]), []
+    mean, results = np.array([8.0, -4.0]), []
     for u in INPUTS[:, 0]:
         mean = np.array(PLANT.matrix) @ mean + [0.5 * u, 0.0]
-        found.append(mean @ [1.0, 0.5])
-    np.testing.assert_allclose(expected_signal(PLANT, SENSOR, HORIZON, INPUTS)[:, 0], found, rtol=1e-14)
+        results.append(mean @ [1.0, 0.5])
+    np.testing.assert_allclose(expected_signal(PLANT, SENSOR, HORIZON, INPUTS)[:, 0], results, rtol=1e-14)
     moving = hg.Plant(lambda x, u: jnp_sine(x), 0.1, [0.3], [[1.0]])
     curved = expected_signal(moving, hg.Sensor(lambda x: x**2, 0.1), 2)
     np.testing.assert_allclose(curved[:, 0], [np.sin(0.3) ** 2, np.sin(np.sin(0.3)) ** 2], rtol=1e-14)
@@ -51,7 +51,7 @@ def jnp_sine(x: object) -> object:
 
 
 @pytest.fixture(scope="module")
-def found() -> dict[str, dict[str, hg.Statistics]]:
+def result() -> dict[str, dict[str, hg.Statistics]]:
     """The plain relay, less the trajectory, less a constant between the hops, and a bursty link less a constant."""
     bursts = hg.gilbert_elliott(hg.hop(GAIN, 0.1), hg.hop(0.1, 0.4), 0.3, 0.2)
     channels = {
@@ -69,8 +69,8 @@ def found() -> dict[str, dict[str, hg.Statistics]]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["plain", "trajectory", "relay", "bursts"])
-def test_claims_are_exact(found: dict[str, dict[str, hg.Statistics]], name: str) -> None:
-    s = found[name]["linear"]
+def test_claims_are_exact(result: dict[str, dict[str, hg.Statistics]], name: str) -> None:
+    s = result[name]["linear"]
     assert s.claim == "exact"
     batch = s.outer / s.count[:, None, None, None]
     error = batch.std(axis=0, ddof=1) / np.sqrt(len(batch))
@@ -80,21 +80,21 @@ def test_claims_are_exact(found: dict[str, dict[str, hg.Statistics]], name: str)
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "sent"), [("plain", 1.0), ("trajectory", 0.0)])
 def test_the_error_is_that_of_the_power_that_is_sent(
-    found: dict[str, dict[str, hg.Statistics]], name: str, sent: float
+    result: dict[str, dict[str, hg.Statistics]], name: str, sent: float
 ) -> None:
     """P^-1 = (A P A' + Q)^-1 + c' c / N, N = (nu_1 nu_2 s + nu_2 .1 + .02) / (mu_1 mu_2)^2 - s + .1."""
     a, c, q = np.array(PLANT.matrix), np.array([[1.0, 0.5]]), 0.05 * np.eye(2)
     (mu_1, nu_1), (mu_2, nu_2) = ((float(h.law.moment(1)), float(h.law.moment(2))) for h in HOPS)
-    p = own = np.array(PLANT.initial_covariance)
+    p = values = np.array(PLANT.initial_covariance)
     claims = []
     for mean in expected_signal(PLANT, SENSOR, HORIZON, INPUTS)[:, 0]:
-        p, own = a @ p @ a.T + q, a @ own @ a.T + q
-        variance = (c @ own @ c.T).item()
+        p, values = a @ p @ a.T + q, a @ values @ a.T + q
+        variance = (c @ values @ c.T).item()
         second = variance + 0.1 + sent * mean**2
         noise = (nu_1 * nu_2 * second + nu_2 * 0.1 + 0.02) / (mu_1 * mu_2) ** 2 - (second - 0.1)
         p = np.linalg.inv(np.linalg.inv(p) + c.T @ c / noise)
         claims.append(p)
-    np.testing.assert_allclose(found[name]["linear"].claimed(), claims, rtol=1e-9)
+    np.testing.assert_allclose(result[name]["linear"].claimed(), claims, rtol=1e-9)
 
 
 def test_the_gain_noise_of_one_path_of_many_is_its_own() -> None:
@@ -117,9 +117,9 @@ def test_angles_stay_angles() -> None:
     link = hg.hop(1.0, 0.02)
     plain, less = (hg.cubature_filter(plant, compass, item) for item in (link, centred(link, 0.4)))
     for z in (0.1, 3.1, -3.1, 6.3):  # without a random gain nothing changes
-        (_, one), (_, other) = (item.step(item.init(), [z]) for item in (plain, less))
-        np.testing.assert_allclose(other.mean, one.mean, atol=1e-14)
-        np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-12)
+        (_, single), (_, other) = (item.step(item.init(), [z]) for item in (plain, less))
+        np.testing.assert_allclose(other.mean, single.mean, atol=1e-14)
+        np.testing.assert_allclose(other.covariance, single.covariance, rtol=1e-12)
     with pytest.raises(ValueError, match="gain 1 on circular outputs"):
         hg.cubature_filter(plant, compass, centred(hg.hop(GAIN, 0.1), 0.4))
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import special
 
 import heliograph as hg
-from heliograph.random_affine.push import push
+from heliograph.random_affine.moments.push import push
 
 STEPS = 6
 LOST = 2  # the step of which nothing arrives
@@ -92,8 +92,8 @@ def test_the_gradient_of_the_final_error_is_that_of_finite_differences(name):
 
     with jax.enable_x64(True):
         value, gradient, along = jax.tree.map(np.asarray, jax.jit(both_ways)(p))
-    each = STEP * np.eye(len(p))
-    differences = [(concrete(channel, p + e) - concrete(channel, p - e)) / (2 * STEP) for e in each]
+    items = STEP * np.eye(len(p))
+    differences = [(concrete(channel, p + e) - concrete(channel, p - e)) / (2 * STEP) for e in items]
     np.testing.assert_allclose(gradient, differences, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(along, gradient @ direction, rtol=1e-9)
     np.testing.assert_allclose(value, concrete(channel, p), rtol=1e-12)
@@ -126,7 +126,7 @@ LAWS = {
 def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name):
     make, parameters = LAWS[name]
     p = np.array(parameters)
-    each = np.eye(len(p)) * STEP
+    items = np.eye(len(p)) * STEP
     orders = range(5)
 
     def moments(p):
@@ -140,9 +140,9 @@ def test_moments_of_traced_laws_have_the_derivatives_of_finite_differences(name)
     np.testing.assert_allclose(value, known, rtol=1e-13)
     if name == "rician without sight":  # negative sight is refused; moments are even in it, so the slope is zero
         np.testing.assert_allclose(slope[:, 0], 0.0, atol=1e-12)
-        each = each[1:]
+        items = items[1:]
         slope = slope[:, 1:]
-    rows = [[(make(*(p + e)).moment(k) - make(*(p - e)).moment(k)) / (2 * STEP) for e in each] for k in orders]
+    rows = [[(make(*(p + e)).moment(k) - make(*(p - e)).moment(k)) / (2 * STEP) for e in items] for k in orders]
     np.testing.assert_allclose(slope, rows, rtol=1e-6, atol=1e-8)
 
 
@@ -169,14 +169,14 @@ def test_noises_and_moments_of_every_map_can_be_traced():
             [hg.dropout(relayed, p[5]), hg.erasure(hg.random_affine.known([[1.0, p[0]]], [p[2]]), 1.0).base]
         )
 
-    def found(p):
+    def evaluate(p):
         item = make(p)
         return item.moments(1).matrix, item.moments(4).matrix, push(item, 4, np.ones(15))
 
     p = np.array([0.5, 0.3, 0.1, 0.8, 0.4, 0.7])
     with jax.enable_x64(True):
-        one, two, pushed = jax.jit(found)(p)
-    np.testing.assert_allclose(one, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
+        single, two, pushed = jax.jit(evaluate)(p)
+    np.testing.assert_allclose(single, make(p).moments(1).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(two, make(p).moments(4).matrix, rtol=1e-12, atol=1e-14)
     np.testing.assert_allclose(pushed, make(p).moments(4).matrix @ np.ones(15), rtol=1e-12)
 

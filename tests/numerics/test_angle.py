@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from heliograph.filters.transform import Cubature, Linearization, PolynomialMoments
+from heliograph.filters.gaussian.transform import Cubature, Linearization, PolynomialMoments
 from heliograph.numerics.angle import TURN, angles_named, continued, nearest, wrapped
 
 ANGLE = st.floats(-1e3, 1e3)
@@ -13,10 +13,10 @@ ANGLE = st.floats(-1e3, 1e3)
 
 @given(ANGLE, ANGLE)
 def test_the_same_angle_within_half_a_turn(value, reference):
-    found = nearest(np.array([value, value]), np.array([reference, reference]), (1,))
-    assert found[0] == value  # no angle, no change
-    assert abs(found[1] - reference) <= TURN / 2 * (1 + 1e-9)
-    turns = (found[1] - value) / TURN
+    result = nearest(np.array([value, value]), np.array([reference, reference]), (1,))
+    assert result[0] == value  # no angle, no change
+    assert abs(result[1] - reference) <= TURN / 2 * (1 + 1e-9)
+    turns = (result[1] - value) / TURN
     assert abs(turns - round(turns)) < 1e-9  # 1e3 radians know a turn to 1e-13
 
 
@@ -48,12 +48,12 @@ def test_an_angle_that_follows_another_has_exact_moments_however_wide(rule, devi
     slope = np.array([[1.0, 0.1], [0.0, 1.0]])
     with jax.enable_x64(True):
         mean = jnp.array([0.2, 0.3])
-        found = rule.apply(continued(heading, mean, (0,), (0,)), mean, jnp.asarray(covariance))
-    near = nearest(np.asarray(found.mean), np.array([3.23, 0.3]), (0,))
+        result = rule.apply(continued(heading, mean, (0,), (0,)), mean, jnp.asarray(covariance))
+    near = nearest(np.asarray(result.mean), np.array([3.23, 0.3]), (0,))
     np.testing.assert_allclose(near, [3.23, 0.3], rtol=0, atol=1e-10)
     # 1e-9: points at 1e2 radians, of which turns are taken off
-    np.testing.assert_allclose(found.covariance, slope @ covariance @ slope.T, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(found.cross, covariance @ slope.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result.covariance, slope @ covariance @ slope.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result.cross, covariance @ slope.T, rtol=1e-9, atol=1e-9)
 
 
 def test_a_bearing_across_the_cut_is_the_one_away_from_it_turned():

@@ -27,14 +27,14 @@ def test_an_option_of_another_release_costs_no_other(monkeypatch):
 
 @pytest.mark.parametrize(("wrap", "at_a_lower_level"), [(quickly_compiled, True), (fully_optimised, False)])
 def test_only_what_runs_millions_of_steps_asks_for_the_last_level(monkeypatch, wrap, at_a_lower_level):
-    asked = {}
+    requested = {}
 
     def jitted(function, *, donate, compiler_options):
-        asked.update(compiler_options)
+        requested.update(compiler_options)
         return function
 
     monkeypatch.setattr(compiler, "understood", lambda: dict(compiler.OPTIONS))
     monkeypatch.setattr(compiler.eqx, "filter_jit", jitted)
     assert wrap(lambda x: x + 1)(1) == 2
-    assert (LEVEL in asked) is at_a_lower_level
-    assert "xla_cpu_use_fusion_emitters" in asked
+    assert (LEVEL in requested) is at_a_lower_level
+    assert "xla_cpu_use_fusion_emitters" in requested

@@ -28,5 +28,5 @@ REFUSED = (
 
 
 def test_a_fork_is_told_before_it_hangs():
-    found = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=120)
-    assert found.stdout.splitlines() == ["None", REFUSED], found.stderr
+    completed = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, timeout=120)
+    assert completed.stdout.splitlines() == ["None", REFUSED], completed.stderr

@@ -27,8 +27,8 @@ def test_methods_are_bound_as_python_does():
 
 def test_they_can_be_transformed_all_the_same():
     """Bound or as an argument, the arrays of a module are traced."""
-    one = Scaled(jnp.array([2.0, 3.0]))
-    assert jnp.array_equal(jax.vmap(one.of)(jnp.ones((4, 2))), jnp.tile(one.factor, (4, 1)))
-    slope = jax.grad(lambda item: item.of(jnp.ones(2)).sum())(one)
+    single = Scaled(jnp.array([2.0, 3.0]))
+    assert jnp.array_equal(jax.vmap(single.of)(jnp.ones((4, 2))), jnp.tile(single.factor, (4, 1)))
+    slope = jax.grad(lambda item: item.of(jnp.ones(2)).sum())(single)
     assert jnp.array_equal(slope.factor, jnp.ones(2))
-    assert jnp.array_equal(jax.jit(one.of)(jnp.ones(2)), one.factor)
+    assert jnp.array_equal(jax.jit(single.of)(jnp.ones(2)), single.factor)

@@ -27,30 +27,30 @@ def test_axes_of_vmap_are_last_in_the_kernel_and_first_outside():
     """And it is traced for one matrix and for all, not for what lies between."""
     with jax.enable_x64(True):
         seen.clear()
-        found, traces = jax.jit(over_two)(A, B)
-    np.testing.assert_allclose(found, A @ B, rtol=1e-15, atol=1e-15)
+        result, traces = jax.jit(over_two)(A, B)
+    np.testing.assert_allclose(result, A @ B, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(traces, np.trace(A, axis1=2, axis2=3), rtol=1e-15)
     assert sorted(set(seen)) == [(2, 2), (2, 2, 4, 3)] and len(seen) == 2, seen
 
 
 def test_a_kernel_that_says_its_shapes_is_traced_for_all_runs_alone():
     @runs_last_of(lambda a, b: (b.shape, ()))
-    def told(a, b):
+    def report(a, b):
         seen.append(a.shape)
         return times(a, b), a[0, 0] + a[1, 1]
 
     with jax.enable_x64(True):
         seen.clear()
-        found, traces = jax.jit(jax.vmap(told, in_axes=(0, None)))(A[0], B)
+        result, traces = jax.jit(jax.vmap(report, in_axes=(0, None)))(A[0], B)
     assert seen == [(2, 2, 4)] and traces.dtype == np.float64, seen
-    np.testing.assert_allclose(found, A[0] @ B, rtol=1e-15, atol=1e-15)
+    np.testing.assert_allclose(result, A[0] @ B, rtol=1e-15, atol=1e-15)
     np.testing.assert_allclose(traces, np.trace(A[0], axis1=1, axis2=2), rtol=1e-15)
 
 
 def test_results_that_no_run_has_a_part_in_come_for_each():
     with jax.enable_x64(True):
-        found, traces = jax.vmap(lambda b: product(B, b))(A[0])
-    np.testing.assert_allclose(found, B @ A[0], rtol=1e-15, atol=1e-15)
+        result, traces = jax.vmap(lambda b: product(B, b))(A[0])
+    np.testing.assert_allclose(result, B @ A[0], rtol=1e-15, atol=1e-15)
     np.testing.assert_array_equal(traces, [np.trace(B)] * 4)
 
 
@@ -60,10 +60,10 @@ def test_derivatives_are_those_of_the_arithmetic_forward_and_back_one_or_many():
         b = jnp.asarray(B)
         expected = 2 * np.einsum("rsij,rsik,kl->jl", A, A, B)
         for slopes in (jax.grad, jax.jacfwd):
-            found = slopes(lambda b: jnp.sum(over_two(A, b)[0] ** 2))(b)
-            np.testing.assert_allclose(found, expected, rtol=1e-14)
-        each = jax.vmap(jax.grad(lambda a: jnp.sum(product(a, b)[0] ** 2)))(jnp.asarray(A[0]))
-        np.testing.assert_allclose(each, 2 * A[0] @ B @ B.T, rtol=1e-14, atol=1e-14)
+            result = slopes(lambda b: jnp.sum(over_two(A, b)[0] ** 2))(b)
+            np.testing.assert_allclose(result, expected, rtol=1e-14)
+        items = jax.vmap(jax.grad(lambda a: jnp.sum(product(a, b)[0] ** 2)))(jnp.asarray(A[0]))
+        np.testing.assert_allclose(items, 2 * A[0] @ B @ B.T, rtol=1e-14, atol=1e-14)
 
 
 def test_costly_cases_are_told_run_by_run_and_have_derivatives():
@@ -95,6 +95,6 @@ def test_the_precision_is_that_of_the_call_though_it_is_compiled_later():
             return jax.vmap(shifted)(x)
 
     with jax.enable_x64(True):
-        found = jax.jit(single)(np.ones((3, 2, 2), np.float32))
-    assert found.dtype == np.float32
-    np.testing.assert_array_equal(found, [np.ones((2, 2)) + np.eye(2)] * 3)
+        result = jax.jit(single)(np.ones((3, 2, 2), np.float32))
+    assert result.dtype == np.float32
+    np.testing.assert_array_equal(result, [np.ones((2, 2)) + np.eye(2)] * 3)

@@ -110,8 +110,8 @@ def test_equality_is_of_everything():
     assert same(np.nan, float("nan")) and not same(1.0, 1) and not same({"a": 1}, {"b": 1})
     assert same(jax.random.key(3), jax.random.key(3)) and not same(jax.random.key(3), jax.random.key(4))
     assert hg.Rayleigh(0.8) != hg.Rayleigh(0.9) and hg.Rayleigh(0.8) != hg.Rician(1.0, 0.8)
-    one, two = (simulation.Uplink(("a",), np.zeros((2, 1, 2), dtype=bool), np.full((2, 1, 2), v)) for v in (1.0, 2.0))
-    assert one != two and [one] == [copy.copy(one)] and one in [two, copy.deepcopy(one)]
+    item, two = (simulation.Uplink(("a",), np.zeros((2, 1, 2), dtype=bool), np.full((2, 1, 2), v)) for v in (1.0, 2.0))
+    assert item != two and [item] == [copy.copy(item)] and item in [two, copy.deepcopy(item)]
 
 
 def test_names_do_not_act_on_a_page_or_a_terminal():
@@ -124,14 +124,14 @@ def test_names_do_not_act_on_a_page_or_a_terminal():
 
 def test_long_things_are_counted_and_short():
     @readable
-    class Many:
+    class Large:
         def __init__(self):
             self.values = list(range(1000))
             self._hidden = 1
 
     for i in range(30):
-        setattr(Many, f"p{i}", i)
-    item = Many()
+        setattr(Large, f"p{i}", i)
+    item = Large()
     item.__dict__ |= {f"part{i}": np.zeros(9) for i in range(30)}
     assert repr(item).splitlines()[-2] == "  … 23 more" and "_hidden" not in repr(item)
     assert "… 992 more" in repr(item) and "11 more" in item._repr_html_()
@@ -153,8 +153,8 @@ def test_a_timeline_goes_on_after_a_pickle():
     assert timeline.push("n", 0, 2.0, [0.5, 0.1]) == "used"
     other = pickle.loads(pickle.dumps(timeline))
     assert other == timeline and repr(other) == repr(timeline) and len(repr(other).splitlines()) <= LONG + 1
-    for one in (timeline, other):
-        assert one.push("n", 1, 1.0, [0.2, 0.0], arrival=2.5) == "used"
+    for item in (timeline, other):
+        assert item.push("n", 1, 1.0, [0.2, 0.0], arrival=2.5) == "used"
     assert same(other.estimates(), timeline.estimates())
     timeline.push("n", 2, 3.0, [0.2, 0.0])
     assert other != timeline

@@ -36,8 +36,8 @@ def test_a_product_broadcasts_what_is_not_mapped(inner):
     times = runs_last(small_matrix.times)
     rng = np.random.default_rng(3)
     a, b = rng.normal(size=(2, inner)), rng.normal(size=(RUNS, NODES, inner, 4))
-    found = nested(lambda b: times(a, b), b)
-    np.testing.assert_allclose(found, a @ b, atol=ROUNDING * inner)
+    result = nested(lambda b: times(a, b), b)
+    np.testing.assert_allclose(result, a @ b, atol=ROUNDING * inner)
     with jax.enable_x64(True):
         over_nodes = jax.vmap(lambda b: jax.vmap(lambda row: times(row[None], b)[0])(jnp.asarray(a)))(b[:, 0])
     np.testing.assert_allclose(over_nodes, a @ b[:, 0], atol=ROUNDING * inner)
@@ -53,8 +53,8 @@ def test_both_kinds_of_derivatives_pass_through():
     with jax.enable_x64(True):
         forward, backward = jax.jacfwd(trace)(jnp.asarray(a)), jax.grad(trace)(jnp.asarray(a))
     # d 1' A^-1 1 = -x' dA x; the factor reads the lower half only, so compare what a symmetric dA sees.
-    for found in (forward, backward):
-        np.testing.assert_allclose(found + found.T, -2 * x @ x.T, atol=1e3 * ROUNDING)
+    for item in (forward, backward):
+        np.testing.assert_allclose(item + item.T, -2 * x @ x.T, atol=1e3 * ROUNDING)
 
 
 def test_a_run_without_a_factor_leaves_the_others_alone():
@@ -76,5 +76,5 @@ def test_further_axes_are_carried_along():
         a_last, b_last = map(jnp.asarray, last)
         np.testing.assert_allclose(small_matrix.inner(a_last, b_last), np.einsum("rij,rij->r", a, b), rtol=ROUNDING)
         np.testing.assert_allclose(small_matrix.trace(a_last), np.trace(a, axis1=1, axis2=2), rtol=ROUNDING)
-        found = np.moveaxis(np.asarray(small_matrix.congruence(a_last, b_last)), -1, 0)
-    np.testing.assert_allclose(found, a @ b @ np.swapaxes(a, 1, 2), atol=ROUNDING * np.abs(found).max())
+        result = np.moveaxis(np.asarray(small_matrix.congruence(a_last, b_last)), -1, 0)
+    np.testing.assert_allclose(result, a @ b @ np.swapaxes(a, 1, 2), atol=ROUNDING * np.abs(result).max())

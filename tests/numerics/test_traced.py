@@ -9,14 +9,14 @@ from heliograph.numerics.traced import is_traced
 
 @pytest.mark.parametrize("hold", [lambda x: x, lambda x: [1.0, x], lambda x: {"a": (np.ones(2), x)}])
 def test_a_traced_number_is_found_where_it_stands(hold):
-    found = []
+    results = []
 
-    def asked(x):
-        found.append((is_traced(np.ones(2), 3, hold(x)), is_traced(hold(2.0))))
+    def requested(x):
+        results.append((is_traced(np.ones(2), 3, hold(x)), is_traced(hold(2.0))))
         return x
 
-    jax.make_jaxpr(asked)(1.0)
-    assert found == [(True, False)]
+    jax.make_jaxpr(requested)(1.0)
+    assert results == [(True, False)]
 
 
 @pytest.mark.parametrize("value", [1, 2.0, True, np.float64(3), np.ones(2), None, "text", [1.0, np.ones(2)], ()])

@@ -57,13 +57,13 @@ printed_terms, tight_terms = partial(box_terms, sign=1), partial(box_terms, sign
 def vertices(law: Law) -> Array:
     """Vertices of {q : |q - p| <= r, sum q = 1, 0 <= q <= 1}: all coordinates but one at an end."""
     lo, hi = np.maximum(law[1] - law[2], 0.0), np.minimum(law[1] + law[2], 1.0)
-    n, found = len(lo), []
+    n, results = len(lo), []
     for free in range(n):
         for ends in product(*[(lo[j], hi[j]) for j in range(n) if j != free]):
             q = np.insert(np.array(ends), free, 1.0 - sum(ends))
             if lo[free] - 1e-12 <= q[free] <= hi[free] + 1e-12:
-                found.append(q)
-    return np.unique(np.round(found, 14), axis=0)
+                results.append(q)
+    return np.unique(np.round(results, 14), axis=0)
 
 
 def poly_terms(s: Setting) -> Terms:

@@ -25,7 +25,7 @@ def signals(a, q, c, r, mean, covariance, steps):
     return np.array(means), y, xx, xy, yy
 
 
-def of_untold(parts, pair, first, second, noise):
+def of_unknown(parts, pair, first, second, noise):
     """E z, Cov(x, z), Cov(z, z) for z_1, ..., z_T; `pair(k, j)` is P(d_k, d_j), `first`, `second` are E g, E g^2."""
     _, y, _, xy, yy = parts
     steps, m = len(y) - 1, y.shape[1]
@@ -45,7 +45,7 @@ def of_untold(parts, pair, first, second, noise):
     return z, xz, zz - np.einsum("ka,lb->kalb", z, z)
 
 
-def of_told(parts, delays, first, second, noise):
+def of_known(parts, delays, first, second, noise):
     """The same for known delays d_1, ..., d_T: what is heard twice is one y, with two noises."""
     law = max(delays) + 1
 
@@ -54,22 +54,22 @@ def of_told(parts, delays, first, second, noise):
         both[delays[k - 1], delays[j - 1]] = 1.0
         return both
 
-    return of_untold(parts, pair, first, second, noise)
+    return of_unknown(parts, pair, first, second, noise)
 
 
-def best_linear(parts, heard, k):
+def best_linear(parts, received, k):
     """Error covariance of x_k from (1, z_1, ..., z_k)."""
     _, _, xx, _, _ = parts
-    _, xz, zz = heard
+    _, xz, zz = received
     n, m = xx.shape[1], zz.shape[1]
     gram, cross = zz[1 : k + 1, :, 1 : k + 1].reshape(k * m, k * m), xz[k, :, 1 : k + 1].reshape(n, k * m)
     return xx[k, :, k] - cross @ np.linalg.solve(gram, cross.T)
 
 
-def error_of(parts, heard, weights, offset, k):
+def error_of(parts, received, weights, offset, k):
     """E[(x_k - xhat)(x_k - xhat)'] of xhat = sum_j weights[j] z_j + offset; weights (k, n, m)."""
     mean, _, xx, _, _ = parts
-    z, xz, zz = heard
+    z, xz, zz = received
     n, m = xx.shape[1], zz.shape[1]
     w = np.concatenate(list(weights), axis=1)
     gram, cross = zz[1 : k + 1, :, 1 : k + 1].reshape(k * m, k * m), xz[k, :, 1 : k + 1].reshape(n, k * m)

@@ -72,10 +72,12 @@ def by_all_paths(second, sensors, sensor_noises, initial, transitions, means, sp
         weight = initial[path[0]] * np.prod([transitions[k][path[k], path[k + 1]] for k in range(steps - 1)])
         if weight == 0:
             continue
-        one = path_moments(sent, [means[k][i] for k, i in enumerate(path)], [spreads[k][i] for k, i in enumerate(path)])
+        item = path_moments(
+            sent, [means[k][i] for k, i in enumerate(path)], [spreads[k][i] for k, i in enumerate(path)]
+        )
         total = (
-            [weight * part for part in one]
+            [weight * part for part in item]
             if isinstance(total, float)
-            else [a + weight * b for a, b in zip(total, one, strict=True)]
+            else [a + weight * b for a, b in zip(total, item, strict=True)]
         )
     return best_linear(second, *total)

@@ -179,10 +179,10 @@ def lemma_4(system: System, Upsilon: Array, H: Array) -> tuple[Array, ...]:
     g3, g4, o3, o4 = G @ v3 @ G2.T, G2 @ v4 @ G2.T, system.Psi @ o3 @ P2.T, P2 @ o4 @ P2.T
     hx, gv, po = vec(Hx), vec(Gv), vec(Po)
 
-    own = th**2 * m[2] * l[2] * Gv + th**2 * m[2] * Po + Sg
-    R11 = th**2 * c1 * Hx + own
+    local = th**2 * m[2] * l[2] * Gv + th**2 * m[2] * Po + Sg
+    R11 = th**2 * c1 * Hx + local
     R12 = th**3 * (mu * c1 * q3 @ S(s).T + c2 * q3 + m[3] * l[3] * g3 + m[3] * o3) + s3
-    phi = th**2 * c1 * hx + vec(own)
+    phi = th**2 * c1 * hx + vec(local)
     pairs = (
         (th**4 * c4, Hx, Gv), (th**4 * c5, Hx, Po), (th**2 * c1, Hx, Sg),
         (th**4 * m[4] * l[2], Gv, Po), (th**2 * m[2] * l[2], Gv, Sg), (th**2 * m[2], Po, Sg),
@@ -192,12 +192,12 @@ def lemma_4(system: System, Upsilon: Array, H: Array) -> tuple[Array, ...]:
         Q = Q + S(s) @ (c * np.kron(a, b)) @ S(s).T + Sym(c * np.outer(vec(a), vec(b)))
     cross = np.kron(Hx, c6 * Gv + c7 * Po) @ S(s).T
     T = th**4 * (mu * c2 * q4 + c6 * np.outer(hx, gv) + c7 * np.outer(hx, po) + cross)
-    spread = th**4 * mu**2 * c1 * q4 + th**2 * mu**2 * np.kron(Hx, own)
+    spread = th**4 * mu**2 * c1 * q4 + th**2 * mu**2 * np.kron(Hx, local)
     R22 = S(s) @ spread @ S(s).T + Q - np.outer(phi, phi) + Sym(S(s) @ T)
 
     R_V = np.block([[R11, R12], [R12.T, R22]])
     R_Vc = np.block([[R11, R12], [R12.T, R22 - th**4 * c1**2 * (q4 - np.outer(hx, hx))]])
-    return phi, R_V, vec(own), R_Vc
+    return phi, R_V, vec(local), R_Vc
 
 
 def measurement(system: System, Upsilon: Array) -> tuple[Array, ...]:

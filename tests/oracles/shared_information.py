@@ -27,14 +27,16 @@ def stacked_errors(plant, nodes, steps, starts=None):
             spreads.append(spread(second))
             noise[rows, rows] = gains[k] @ spreads[-1] @ gains[k].T
         joint = use @ joint @ use.T + noise
-        heard = np.concatenate([h for h, _, _ in nodes])
-        total = np.zeros((len(heard), len(heard)))
+        received = np.concatenate([h for h, _, _ in nodes])
+        total = np.zeros((len(received), len(received)))
         start = 0
         for spread in spreads:
             total[start : start + len(spread), start : start + len(spread)] = spread
             start += len(spread)
         before = a @ central @ a.T + q
-        central = before - before @ heard.T @ np.linalg.solve(heard @ before @ heard.T + total, heard @ before)
+        central = before - before @ received.T @ np.linalg.solve(
+            received @ before @ received.T + total, received @ before
+        )
     return joint, central
 
 

@@ -47,15 +47,15 @@ def stacked(mean, covariance, steps) -> Stacked:
     gain = [np.einsum("a,aij->ij", s.chances, s.gains) for s in steps]
     h = [g @ s.c for g, s in zip(gain, steps, strict=True)]
     y = [s.c @ m + s.noise_mean for s, m in zip(steps, means, strict=True)]
-    heard = np.concatenate([g @ one + s.offset for g, one, s in zip(gain, y, steps, strict=True)])
+    received = np.concatenate([g @ item + s.offset for g, item, s in zip(gain, y, steps, strict=True)])
     xz = [[joint[i, j] @ h[j].T for j in range(time)] for i in range(time)]
     zz = [[h[i] @ joint[i, j] @ h[j].T for j in range(time)] for i in range(time)]
     for k, s in enumerate(steps):
         second = s.c @ joint[k, k] @ s.c.T + s.r + np.outer(y[k], y[k])
-        each = np.einsum("a,aij,jl,aml->im", s.chances, s.gains, second, s.gains)
-        zz[k][k] = each + s.n - np.outer(gain[k] @ y[k], gain[k] @ y[k])
+        items = np.einsum("a,aij,jl,aml->im", s.chances, s.gains, second, s.gains)
+        zz[k][k] = items + s.n - np.outer(gain[k] @ y[k], gain[k] @ y[k])
     xx = joint.transpose(0, 2, 1, 3).reshape(time * n, time * n)
-    return Stacked(means, xx, heard, np.block(xz), np.block(zz))
+    return Stacked(means, xx, received, np.block(xz), np.block(zz))
 
 
 def estimate(s: Stacked, z: np.ndarray, given: int):

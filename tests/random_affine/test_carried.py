@@ -11,7 +11,7 @@ MODES = hg.random_affine.Modes
 
 
 @pytest.mark.parametrize(
-    ("channel", "sent", "found"),
+    ("channel", "sent", "result"),
     [
         (hg.perfect(3), (0, 2), (0, 2)),
         (hg.hop(0.5, 0.1), (), ()),
@@ -24,11 +24,11 @@ MODES = hg.random_affine.Modes
         (MODES(CHAIN, [CLEAN, hg.erasure(NOISY, 0.2)]), (0,), (0,)),
         (hg.random_affine.known([[0.0, 1.0], [2.0, 0.0]]), (1,), (0,)),
         (hg.model.silent(1), (0,), ()),
-        (hg.model.delayed(CLEAN, 2, told=True), (0,), (0,)),
+        (hg.model.delayed(CLEAN, 2, timestamped=True), (0,), (0,)),
     ],
 )
-def test_gain_one_noise_and_losses_that_are_told(channel, sent, found):
-    assert carried(channel, sent) == found
+def test_gain_one_noise_and_losses_that_are_told(channel, sent, result):
+    assert carried(channel, sent) == result
 
 
 @pytest.mark.parametrize(

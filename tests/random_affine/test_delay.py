@@ -17,7 +17,7 @@ delayed = hg.model.delayed
     "channel",
     [
         hg.with_direct_link(hg.hop(0.5, 0.1, delay=LAW), LINK),
-        delayed(LINK, CHAIN, told=True),
+        delayed(LINK, CHAIN, timestamped=True),
     ],
     ids=["random", "chain"],
 )
@@ -32,9 +32,9 @@ def test_what_is_late_stands_where_it_was_sent():
     h = np.asarray(both.sample(jax.random.key(0)))
     line = np.arange(9.0)  # y_k = (0, 1, 2), y_{k-1} = (3, 4, 5), y_{k-2} = (6, 7, 8)
     np.testing.assert_array_equal(h[:-1, :-1] @ line, [2 * 6.0, 3 * 1.0, 3 * 2.0])
-    told = delayed(hg.hop(2.0, 0.0), 1, told=True)
-    np.testing.assert_array_equal(told.sample(jax.random.key(0))[:-1, :-1], [[0, 2], [0, 0]])
-    np.testing.assert_array_equal(told.sample(jax.random.key(0))[:-1, -1], [0, 1])
+    known = delayed(hg.hop(2.0, 0.0), 1, timestamped=True)
+    np.testing.assert_array_equal(known.sample(jax.random.key(0))[:-1, :-1], [[0, 2], [0, 0]])
+    np.testing.assert_array_equal(known.sample(jax.random.key(0))[:-1, -1], [0, 1])
 
 
 def test_a_relay_holds_what_it_drew():
@@ -61,12 +61,12 @@ def test_delays_in_series_add_up():
 
 
 REFUSED = {
-    "delays told: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, told=True)]),
+    "delays told: expected those of one": lambda: hg.amplify_and_forward([LINK, delayed(LINK, LAW, timestamped=True)]),
     "series: expected links that are late each": lambda: hg.amplify_and_forward(
         [LINK, hg.with_direct_link(delayed(LINK, 1), LINK)]
     ),
     "delays told: expected those of one link": lambda: hg.amplify_and_forward(
-        [delayed(LINK, LAW, told=True), delayed(LINK, 1)]
+        [delayed(LINK, LAW, timestamped=True), delayed(LINK, 1)]
     ),
     "link before a delay: expected one that forgets": lambda: hg.amplify_and_forward(
         [hg.gilbert_elliott(LINK, LINK, 0.1, 0.2), delayed(LINK, 1)]

@@ -13,8 +13,8 @@ LIMIT = 4.5 / np.sqrt(DRAWS)  # of a share's deviation, at most .5 standard devi
 def received(channel, y, seed=0):
     with jax.enable_x64(True):
         keys = jax.random.split(jax.random.key(seed), DRAWS)
-        one = jax.jit(jax.vmap(lambda key: (channel.sample(key), apply(channel.sample(key), jnp.asarray(y)))))
-        h, z = one(keys)
+        item = jax.jit(jax.vmap(lambda key: (channel.sample(key), apply(channel.sample(key), jnp.asarray(y)))))
+        h, z = item(keys)
     bottom = np.eye(1, channel.inputs + 1, channel.inputs)
     assert np.array_equal(h[:, -1:], np.broadcast_to(bottom, (DRAWS, 1, channel.inputs + 1)))
     return np.asarray(z)
@@ -84,6 +84,6 @@ def test_a_filter_of_the_channel_inside_is_exact_behind_known_losses():
     with pytest.raises(ValueError, match="without erasures"):
         hg.linear_filter(plant, sensor, hg.erasure(inside, 0.6))
     node = hg.Node(sensor, hg.erasure(inside, 0.6), {"kalman": hg.cubature_filter(plant, sensor, inside)})
-    found = hg.monte_carlo(hg.Network(plant, {"n": node}), 10, 2000, 0, hg.Statistics())["n"]["kalman"]
-    _, low, high = found.nees_per_dimension(0.9999)
-    assert found.claim == "exact" and low < 1 < high and high - low < 0.2
+    result = hg.monte_carlo(hg.Network(plant, {"n": node}), 10, 2000, 0, hg.Statistics())["n"]["kalman"]
+    _, low, high = result.nees_per_dimension(0.9999)
+    assert result.claim == "exact" and low < 1 < high and high - low < 0.2

@@ -8,9 +8,9 @@ import pytest
 
 import heliograph as hg
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.disturbance import disturbed_gain
-from heliograph.random_affine.interval import moment_interval
-from heliograph.random_affine.push import push
+from heliograph.random_affine.moments.disturbance import disturbed_gain
+from heliograph.random_affine.moments.interval import moment_interval
+from heliograph.random_affine.moments.push import push
 from heliograph.testing import check_random_affine
 
 GAINS = np.array([0.2, 1.0])
@@ -100,17 +100,17 @@ def test_the_state_survives(name):
     assert channel.remembers
 
     def pair(key):
-        start, one, two = jax.random.split(key, 3)
-        state, first = channel.draw(channel.init(start), one)
+        start, item, two = jax.random.split(key, 3)
+        state, first = channel.draw(channel.init(start), item)
         return first[entry] * channel.draw(state, two)[1][entry]
 
     with jax.enable_x64(True):
         products = np.asarray(jax.jit(jax.vmap(pair))(jax.random.split(jax.random.key(1), PAIRS)))
-    heard = products[~np.isnan(products)]
-    error = heard.std() / np.sqrt(len(heard))
-    assert abs(heard.mean() - expected) < 4 * error
+    received = products[~np.isnan(products)]
+    error = received.std() / np.sqrt(len(received))
+    assert abs(received.mean() - expected) < 4 * error
     if name in ("itself", "series", "stack", "erasure", "parallel"):
-        assert abs(heard.mean() - MEAN**2) > 20 * error  # what independent draws would give
+        assert abs(received.mean() - MEAN**2) > 20 * error  # what independent draws would give
 
 
 @pytest.mark.parametrize("name", ["itself", "lift", "all of them"])

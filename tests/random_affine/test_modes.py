@@ -71,10 +71,10 @@ def test_the_check_finds_a_wrong_memory_whose_marginals_are_right(kind):
 
 def test_one_object_or_one_name_is_one_memory():
     chain = hg.random_affine.MarkovChain(BURSTS)
-    own, same = Series([link(), link()]), Series([Modes(chain, [GOOD, BAD]), Modes(chain, [BAD, GOOD])])
+    local, same = Series([link(), link()]), Series([Modes(chain, [GOOD, BAD]), Modes(chain, [BAD, GOOD])])
     named = Series([link("road"), hg.gilbert_elliott(GOOD, BAD, 0.2, 0.1)])
-    assert [len(memories(c)) for c in (own, same, named)] == [2, 1, 2]
-    assert [len(joint_modes(c).maps) for c in (own, same, named)] == [4, 2, 4]
+    assert [len(memories(c)) for c in (local, same, named)] == [2, 1, 2]
+    assert [len(joint_modes(c).maps) for c in (local, same, named)] == [4, 2, 4]
     with pytest.raises(ValueError, match=r"^memory 'road': expected one transition and one initial law, got several"):
         Series([link("road"), hg.gilbert_elliott(GOOD, BAD, 0.2, 0.1, name="road")]).init(jax.random.key(0))
 

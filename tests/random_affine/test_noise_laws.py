@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import heliograph as hg
-from heliograph.random_affine.moment_noise import MOMENT_ERROR
+from heliograph.random_affine.moments.moment_noise import MOMENT_ERROR
 from heliograph.testing import check_random_affine
 from heliograph_studies.quadratic_bias.setting import TABLE_1
 

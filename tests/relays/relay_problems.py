@@ -27,8 +27,8 @@ def network_of(p: oracle.Problem) -> RelayNetwork:
     slots = []
     for k in range(1, n_steps + 1):
         i, j = oracle.turns(k)
-        own = {"sensor": link(k, i, p.G[k, i]), RELAYS[j]: link(k, 2, np.zeros((m, m)))}
-        slots.append({RELAYS[i]: own, "receiver": {RELAYS[j]: link(k, 3 + j, p.O[k, j])}})
+        local = {"sensor": link(k, i, p.G[k, i]), RELAYS[j]: link(k, 2, np.zeros((m, m)))}
+        slots.append({RELAYS[i]: local, "receiver": {RELAYS[j]: link(k, 3 + j, p.O[k, j])}})
     return RelayNetwork(over_time(plants), over_time(sensors), RELAYS, slots)
 
 

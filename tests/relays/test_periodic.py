@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.linear import linear_filter
+from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.channel import hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant
@@ -20,7 +20,7 @@ PAPER = 1.066244e-5  # steady sum of even and odd tr P, by the oracle's 4000 ste
 
 
 @pytest.fixture(scope="module")
-def own():
+def local():
     return periodic_own_error_design(example())
 
 
@@ -28,28 +28,28 @@ def traces(covariance):
     return np.trace(covariance, axis1=1, axis2=2)
 
 
-def test_the_steady_state_is_where_the_recursion_settles(own):
-    odd, even = own.trace("receiver")[1:]
+def test_the_steady_state_is_where_the_recursion_settles(local):
+    odd, even = local.trace("receiver")[1:]
     assert (even, odd) == pytest.approx((5.307279e-6, 5.355157e-6), rel=1e-6)  # digits given
     long = own_error_design(example(), 1500)  # the plant forgets by 0.98 a step
-    assert relative(own.moments[1:], long.moments[-2:]) < 1e-9
-    given = periodic_given_design(example(), own.gains)
-    assert relative(given.moments, own.moments) < 1e-9  # of a linear solve: condition about 1e3
+    assert relative(local.moments[1:], long.moments[-2:]) < 1e-9
+    given = periodic_given_design(example(), local.gains)
+    assert relative(given.moments, local.moments) < 1e-9  # of a linear solve: condition about 1e3
 
 
-def test_tuned_together_at_no_more_power(own):
+def test_tuned_together_at_no_more_power(local):
     """The reproduction's tests have the designs without a limit."""
-    quiet = periodic_receiver_error_design(example(), power_limit=own.total_power())
-    assert np.all(quiet.total_power() <= own.total_power() * (1 + 1e-6))
+    quiet = periodic_receiver_error_design(example(), power_limit=local.total_power())
+    assert np.all(quiet.total_power() <= local.total_power() * (1 + 1e-6))
     assert np.sum(quiet.trace("receiver")[1:]) < 1.054e-5  # found: 1.05271e-5, against 1.06624e-5
     gains = {name: np.tile(gain, (1000, 1, 1)) for name, gain in quiet.gains.items()}
     assert relative(given_design(example(), gains).moments[-2:], quiet.moments[1:]) < 1e-6  # what 0.974 a period leaves
 
 
-def test_the_best_receiver_behind_given_relays(own):
-    behind = periodic_behind_relays(example(), own.gains)
+def test_the_best_receiver_behind_given_relays(local):
+    behind = periodic_behind_relays(example(), local.gains)
     assert np.sum(traces(behind)) == pytest.approx(1.05316e-5, rel=1e-5)  # digits given
-    long = receiver_behind_relays(example(), {f: np.tile(g, (1000, 1, 1)) for f, g in own.gains.items()})
+    long = receiver_behind_relays(example(), {f: np.tile(g, (1000, 1, 1)) for f, g in local.gains.items()})
     assert relative(long.gains.covariance[-2:], behind) < 1e-9
 
 
@@ -66,7 +66,7 @@ def test_without_relays_it_is_the_linear_filter():
     assert np.trace(steady) == pytest.approx(1.0790e-6, rel=1e-4)
 
 
-def test_what_has_no_steady_state_is_refused(own):
+def test_what_has_no_steady_state_is_refused(local):
     net = example()
     unstable = LinearPlant(1.1 * np.eye(3), np.eye(3), np.zeros(3), np.eye(3))
     with pytest.raises(ValueError, match="spectral radius below 1"):
@@ -74,13 +74,13 @@ def test_what_has_no_steady_state_is_refused(own):
     varying = RelayNetwork(over_time([net.plant] * 4), net.sensor, net.relays, net.slots)
     with pytest.raises(ValueError, match="varies with its slots only"):
         periodic_own_error_design(varying)
-    loud = {name: 30 * gain for name, gain in own.gains.items()}
+    loud = {name: 30 * gain for name, gain in local.gains.items()}
     with pytest.raises(ValueError, match="second moments that settle, got growth by"):
         periodic_given_design(net, loud)
     with pytest.raises(ValueError, match="some under which they diverge"):
         periodic_receiver_error_design(net, start=loud)
     with pytest.raises(ValueError, match="one for each of the 2 slots"):
-        periodic_given_design(net, {name: np.tile(gain, (2, 1, 1)) for name, gain in own.gains.items()})
+        periodic_given_design(net, {name: np.tile(gain, (2, 1, 1)) for name, gain in local.gains.items()})
     alone = RelayNetwork(net.plant, net.sensor, (), ({"receiver": {"sensor": hop(1.0, 1e-6)}},))
     with pytest.raises(ValueError, match="no relays"):
         periodic_relays_for_best_receiver(alone)
@@ -93,5 +93,5 @@ def test_descent_finds_the_bottom_of_a_curved_valley_beside_a_cliff():
         a, b = 1 - x[0], x[1] - x[0] ** 2
         return a**2 + 100 * b**2, np.array([-2 * a - 400 * x[0] * b, 200 * b])
 
-    found = bfgs(rosenbrock, np.array([-1.2, 1.0]))
-    np.testing.assert_allclose(found, [1.0, 1.0], atol=1e-6)  # of a value flat to 1e-12
+    result = bfgs(rosenbrock, np.array([-1.2, 1.0]))
+    np.testing.assert_allclose(result, [1.0, 1.0], atol=1e-6)  # of a value flat to 1e-12

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
 from tests.oracles import successive_relays as oracle
@@ -50,8 +50,8 @@ def test_it_is_the_best_linear_function_of_everything_heard():
     p = oracle.random_problem(2, horizon=6)
     net = network_of(p)
     gains = own_error_design(net, 6).gains
-    found = receiver_behind_relays(net, gains).gains.covariance
-    assert relative(found, best_from_all_measurements(p, gains)) < 1e-9  # of the batch solve
+    result = receiver_behind_relays(net, gains).gains.covariance
+    assert relative(result, best_from_all_measurements(p, gains)) < 1e-9  # of the batch solve
 
 
 def test_it_is_at_least_as_good_as_the_greedy_receiver():

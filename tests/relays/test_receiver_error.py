@@ -12,7 +12,7 @@ STEPS, SWEEPS = 6, 300  # of the network that is unusual
 
 
 @pytest.fixture(scope="module")
-def own():
+def local():
     return own_error_design(example(), HORIZON)
 
 
@@ -26,29 +26,29 @@ def free():
     return receiver_error_design(unusual(), STEPS, sweeps=SWEEPS)
 
 
-def ratio(design, own):
-    return design.trace("receiver")[1:] / own.trace("receiver")[1:]
+def ratio(design, local):
+    return design.trace("receiver")[1:] / local.trace("receiver")[1:]
 
 
 @pytest.mark.slow
-def test_tuned_together_the_receiver_errs_less(own):
+def test_tuned_together_the_receiver_errs_less(local):
     tuned = receiver_error_design(example(), HORIZON, sweeps=50)
-    assert np.mean(ratio(tuned, own)) <= 0.775  # found: 0.7680
-    found = recompute(example(), tuned.gains).covariance["receiver"]
-    assert relative(found, tuned.covariance["receiver"]) < 1e-10  # a route that made no gains
-    assert 1.0 < np.max(tuned.total_power() / own.total_power()) < 1.5
+    assert np.mean(ratio(tuned, local)) <= 0.775  # found: 0.7680
+    result = recompute(example(), tuned.gains).covariance["receiver"]
+    assert relative(result, tuned.covariance["receiver"]) < 1e-10  # a route that made no gains
+    assert 1.0 < np.max(tuned.total_power() / local.total_power()) < 1.5
 
 
 @pytest.mark.slow
-def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=40, found=0.8752):
+def test_a_tuned_relay_need_not_be_louder_and_nothing_hangs_on_rounding(horizon=40, result=0.8752):
     """Descents that stop after a count of steps differ by what rounding makes of it: 0.1 % of the error."""
-    own = own_error_design(example(), horizon)
-    power, noise = own.total_power(), np.random.default_rng(0).normal(size=horizon)
+    separate = own_error_design(example(), horizon)
+    power, noise = separate.total_power(), np.random.default_rng(0).normal(size=horizon)
     for change in (0.0, 1e-12, 1e-7):
         limit = power * (1 + change * noise)
         design = receiver_error_design(example(), horizon, power_limit=limit, sweeps=100)
         assert np.all(design.total_power() <= limit * (1 + 1e-6))  # the stated tolerance
-        np.testing.assert_allclose(np.mean(ratio(design, own)), found, rtol=1e-3)
+        np.testing.assert_allclose(np.mean(ratio(design, separate)), result, rtol=1e-3)
 
 
 def test_the_same_limit_gives_the_same_bits(horizon=40):
@@ -92,8 +92,8 @@ def test_steps_without_weight_keep_their_gains(greedy):
     assert costs[0] < 0.9999 * costs[2] and costs[1] <= costs[2] * (1 + 1e-12)
 
 
-def test_limits_that_can_not_be_met_are_refused(own):
-    low = 0.5 * own.total_power()
+def test_limits_that_can_not_be_met_are_refused(local):
+    low = 0.5 * local.total_power()
     with pytest.raises(
         ValueError, match=r"power limit: expected more than 0\.2116 at step 0, the power of the mean state"
     ):

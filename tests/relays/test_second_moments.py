@@ -42,10 +42,10 @@ def test_lemmas_and_gains_agree_with_the_oracle(name):
     solution = oracle.solve(p)
     design = own_error_design(network_of(p), len(p.Gam))
     assert compare(p, design, solution) < TOLERANCE
-    wanted = gains_of(solution.K, solution.L)
+    expected = gains_of(solution.K, solution.L)
     for filter_, gain in design.gains.items():
-        largest = np.abs(wanted[filter_]).max()
-        assert np.abs(gain - wanted[filter_]).max() < TOLERANCE * largest
+        largest = np.abs(expected[filter_]).max()
+        assert np.abs(gain - expected[filter_]).max() < TOLERANCE * largest
 
 
 def test_any_gains_agree_with_the_oracle():
@@ -66,10 +66,10 @@ def test_a_network_of_another_kind_agrees_with_raw_moments(scale):
     net, rng = unusual(), np.random.default_rng(1)
     design = own_error_design(net, 9)
     gains = {name: gain + scale * rng.normal(size=gain.shape) for name, gain in design.gains.items()}
-    design, found = given_design(net, gains), recompute(net, gains)
+    design, result = given_design(net, gains), recompute(net, gains)
     for name in net.filters:
-        assert relative(design.covariance[name], found.covariance[name]) < TOLERANCE
-        largest = found.correlation[name].max()
+        assert relative(design.covariance[name], result.covariance[name]) < TOLERANCE
+        largest = result.correlation[name].max()
         assert largest < 1e-10 if scale == 0.0 else largest > 1e-3
 
 

@@ -27,14 +27,14 @@ NETWORK = hg.Network(
 @pytest.fixture(scope="module")
 def health():
     record = hg.monte_carlo(NETWORK, STEPS, 1, key=1)
-    heard = {node: z[0].copy() for node, z in record.measurements.items()}
-    heard[BAD][10:14, 1] = np.nan
-    return examine(NETWORK, hg.run(NETWORK, heard), np.zeros((STEPS, 0)))
+    received = {node: z[0].copy() for node, z in record.measurements.items()}
+    received[BAD][10:14, 1] = np.nan
+    return examine(NETWORK, hg.run(NETWORK, received), np.zeros((STEPS, 0)))
 
 
 def test_claims_are_judged_by_innovations(health):
-    good, sure = (next(one for one in health.filters if one.filter == name) for name in ("good", "sure"))
-    assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.found
+    good, sure = (next(filter_ for filter_ in health.filters if filter_.filter == name) for name in ("good", "sure"))
+    assert abs(good.test.power - 1) < 4 * good.test.power_error and not good.test.result
     assert good.white.shape == (STEPS, 2) and sure.test.power > 5
     assert sure.test.correlation[0] > 0.3  # a filter that follows too slowly is wrong the same way again
     # the whitened innovation of one step by hand: the first, whose prior is the plant's own
@@ -46,8 +46,8 @@ def test_claims_are_judged_by_innovations(health):
 
 def test_links_are_told_as_they_were(health):
     links = {(link.node, link.component): link for link in health.links}
-    one = links[BAD, "right"]
-    assert one.share == 1 - 4 / STEPS and one.longest_gap == 4 and not one.loses and links["a", "left"].loses
+    item = links[BAD, "right"]
+    assert item.share == 1 - 4 / STEPS and item.longest_gap == 4 and not item.loses and links["a", "left"].loses
     assert Link("a", "b", np.zeros(7, bool), np.zeros(0), True).longest_gap == 7
     assert Link("a", "b", np.ones(7, bool), np.zeros(7), True).longest_gap == 0
 

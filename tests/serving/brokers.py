@@ -13,10 +13,10 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.nats import Nats
-from heliograph.serving.partition import Part, word
-from heliograph.serving.transport import Transport
-from heliograph.serving.url import Address, address
+from heliograph.serving.brokers.nats import Nats
+from heliograph.serving.brokers.partition import Part, word
+from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.url import Address, address
 from heliograph_studies.live.server import Server
 
 KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("nats", "NATS"), ("mqtt", "MQTT"))]
@@ -24,10 +24,10 @@ KINDS = [pytest.param(kind, marks=pytest.mark.real(part)) for kind, part in (("n
 
 def running(folder: Path) -> Iterator[Server]:
     """A server while a module's tests run."""
-    one = Server(folder)
-    one.start()
-    yield one
-    one.kill()
+    item = Server(folder)
+    item.start()
+    yield item
+    item.kill()
 
 
 def at(server: Server, kind: str, topic: str) -> Address:
@@ -36,14 +36,14 @@ def at(server: Server, kind: str, topic: str) -> Address:
 
 async def received(transport: Transport, count: int, acknowledge: bool = True) -> list[bytes]:
     """At least so many messages."""
-    found: list[bytes] = []
-    while len(found) < count:
+    results: list[bytes] = []
+    while len(results) < count:
         batch = await asyncio.wait_for(transport.receive(), 20)
         assert batch is not None
-        found += batch.payloads
+        results += batch.payloads
         if acknowledge:
             await batch.acknowledge()
-    return found
+    return results
 
 
 async def silent(transport: Transport, seconds: float = 0.3) -> bool:
@@ -67,8 +67,8 @@ def published(where: Address, bodies: list[bytes], below: str = "a") -> None:
     client = Client(CallbackAPIVersion.VERSION2)
     client.connect(where.host, where.port)
     client.loop_start()
-    for one in [client.publish(f"{where.topic}/in/{below}", body, 1) for body in bodies]:
-        one.wait_for_publish(10)
+    for item in [client.publish(f"{where.topic}/in/{below}", body, 1) for body in bodies]:
+        item.wait_for_publish(10)
     client.disconnect()
     client.loop_stop()
 

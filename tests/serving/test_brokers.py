@@ -13,12 +13,12 @@ pytest.importorskip("paho")
 import nats
 import nats.js.errors
 
-from heliograph.serving.mqtt import Mqtt
-from heliograph.serving.nats import Nats
+from heliograph.serving.brokers.mqtt import Mqtt
+from heliograph.serving.brokers.nats import Nats
+from heliograph.serving.brokers.partition import Part, part_of, word
+from heliograph.serving.brokers.transport import TakenOverError, Transport
+from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.output import Output
-from heliograph.serving.partition import Part, part_of, word
-from heliograph.serving.transport import TakenOverError, Transport
-from heliograph.serving.url import Address, address
 from heliograph_studies.live.server import Server
 from tests.serving.brokers import KINDS, at, made, numbered, published, received, running, sent, silent
 
@@ -29,10 +29,10 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 def test_the_url_is_told_without_what_is_secret():
-    found = address("mqtts://me:p%40ss@example.org/site/one", {})
-    assert (found.kind, found.host, found.port, found.topic) == ("mqtt", "example.org", 8883, "site/one")
-    assert (found.user, found.password) == ("me", "p@ss") and found.secure
-    assert "p@ss" not in f"{found!r}{found}" and "me:" not in f"{found!r}{found}"
+    result = address("mqtts://me:p%40ss@example.org/site/one", {})
+    assert (result.kind, result.host, result.port, result.topic) == ("mqtt", "example.org", 8883, "site/one")
+    assert (result.user, result.password) == ("me", "p@ss") and result.secure
+    assert "p@ss" not in f"{result!r}{result}" and "me:" not in f"{result!r}{result}"
     environment = {"HELIOGRAPH_BROKER_USER": "you", "HELIOGRAPH_BROKER_PASSWORD": "word"}
     assert address("nats://me:old@example.org", environment).password == "word"
     assert address("nats://example.org", {}).topic == "heliograph"
@@ -51,14 +51,14 @@ class Deaf:
     """A client of NATS that is cancelled while it flushes what it sends, or stalls: it goes on, or raises its own."""
 
     def __init__(self, error: Exception | None):
-        self.error, self.heard = error, 0
+        self.error, self.received = error, 0
 
     async def fetch(self, *_: object, **__: object) -> list[bytes]:
         try:
             await asyncio.sleep(5)
         except asyncio.CancelledError:
-            self.heard += 1
-            if self.heard > 1:  # so that the test ends where it fails
+            self.received += 1
+            if self.received > 1:  # so that the test ends where it fails
                 raise
         if self.error is not None:
             raise self.error
@@ -77,7 +77,7 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
         monkeypatch.setattr(transport, "_reader", deaf)
         monkeypatch.setattr(transport, "_connected", lambda: True)
         monkeypatch.setattr(transport, "_open", lambda: asyncio.sleep(0, deaf))
-        waits = [transport.receive] if error is None else [transport.receive, lambda: transport.publish(one)]
+        waits = [transport.receive] if error is None else [transport.receive, lambda: transport.publish(item)]
         for wait in waits:
             transport._reader = deaf
             task = asyncio.ensure_future(wait())
@@ -86,7 +86,7 @@ def test_one_cancellation_ends_a_wait_whatever_the_client_makes_of_it(error, mon
             done, _ = await asyncio.wait({task}, timeout=10)
             assert done and task.cancelled()
 
-    one = [Output(1, "", "final", b"{}")]
+    item = [Output(1, "", "final", b"{}")]
     asyncio.run(work())
 
 
@@ -168,12 +168,12 @@ def test_a_session_keeps_what_was_not_acknowledged(server: Server):
         await first.close()
         await asyncio.to_thread(published, where, numbered(200, 300))
         second = Mqtt(where)
-        found = set[
+        result = set[
             bytes
         ]()  # this server sends what is new first, the rest after a second, and again on a busy machine
-        while len(found) < 200:
-            found |= set(await received(second, 1))
-        assert found == set(numbered(100, 300))
+        while len(result) < 200:
+            result |= set(await received(second, 1))
+        assert result == set(numbered(100, 300))
         await second.close()
 
     asyncio.run(work())
@@ -214,27 +214,27 @@ def test_a_connection_is_encrypted_and_says_who_it_is(kind, tmp_path, monkeypatc
     where = f"{scheme}://127.0.0.1:{getattr(server, kind)}/safe"
     outputs = [Output(i, "", "final", str(i).encode()) for i in range(3)]
 
-    async def told(url: str, environment: dict[str, str]) -> bool:
+    async def report(url: str, environment: dict[str, str]) -> bool:
         """Whether the broker took it, or did not let us in twice."""
         transport, before = make(address(url, environment)), caplog.text.count("trying again")
         work = asyncio.create_task(transport.publish(outputs))
         async with asyncio.timeout(20):
             while not work.done() and caplog.text.count("trying again") < before + 2:
                 await asyncio.sleep(0.01)
-        found = work.done()
+        result = work.done()
         work.cancel()
         await asyncio.wait([work])
         await transport.close()
-        return found
+        return result
 
     who = {"HELIOGRAPH_BROKER_USER": "me", "HELIOGRAPH_BROKER_PASSWORD": "s3cret word"}
     try:
         with caplog.at_level(logging.DEBUG):
-            assert asyncio.run(told(where, who))
-            assert asyncio.run(told(where.replace("://", "://me:s3cret%20word@"), {}))
-            assert not asyncio.run(told(where, who | {"HELIOGRAPH_BROKER_PASSWORD": "s3cret"}))
+            assert asyncio.run(report(where, who))
+            assert asyncio.run(report(where.replace("://", "://me:s3cret%20word@"), {}))
+            assert not asyncio.run(report(where, who | {"HELIOGRAPH_BROKER_PASSWORD": "s3cret"}))
             monkeypatch.delenv("SSL_CERT_FILE")  # nobody vouches for it now
-            assert not asyncio.run(told(where, who))
+            assert not asyncio.run(report(where, who))
     finally:
         server.kill()
     assert "trying again" in caplog.text and "s3cret" not in caplog.text

@@ -13,12 +13,12 @@ import nats.js.errors
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.contract import check_transport
-from heliograph.serving.mqtt import Mqtt
-from heliograph.serving.nats import Nats
+from heliograph.serving.brokers.contract import check_transport
+from heliograph.serving.brokers.mqtt import Mqtt
+from heliograph.serving.brokers.nats import Nats
+from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.url import Address
 from heliograph.serving.output import Output
-from heliograph.serving.transport import Transport
-from heliograph.serving.url import Address
 from heliograph_studies.live.server import Server
 from tests.serving.brokers import KINDS, at, published, running, sent, silent
 
@@ -43,24 +43,24 @@ class OverNats:
         except nats.js.errors.NoStreamResponseError:  # no service was there yet
             return
 
-    async def told(self) -> list[bytes]:
+    async def known(self) -> list[bytes]:
         client = await nats.connect(self.url)
         reader = await client.jetstream().subscribe("contract.out.*.*", ordered_consumer=True)
-        found = []
+        results = []
         with contextlib.suppress(nats.errors.TimeoutError):
             while True:
-                found.append((await reader.next_msg(0.5)).data)
+                results.append((await reader.next_msg(0.5)).data)
         await client.close()
-        return found
+        return results
 
 
 class OverMqtt:
     """The same through MQTT."""
 
     def __init__(self, server: Server):
-        self.where, self.heard = at(server, "mqtt", "contract"), list[bytes]()
+        self.where, self.received = at(server, "mqtt", "contract"), list[bytes]()
         self.reader = Client(CallbackAPIVersion.VERSION2)
-        self.reader.on_message = lambda client, data, message: self.heard.append(message.payload)
+        self.reader.on_message = lambda client, data, message: self.received.append(message.payload)
         self.reader.connect(self.where.host, self.where.port)
         self.reader.subscribe("contract/out/#", 1)
         self.reader.loop_start()
@@ -71,8 +71,8 @@ class OverMqtt:
     async def send(self, bodies: Sequence[bytes]) -> None:
         await asyncio.to_thread(published, self.where, list(bodies))
 
-    async def told(self) -> list[bytes]:
-        return list(self.heard)
+    async def known(self) -> list[bytes]:
+        return list(self.received)
 
 
 @pytest.mark.real("NATS")
@@ -93,22 +93,22 @@ def test_outputs_are_on_the_broker_when_publish_returns(server: Server, kind: st
     make: Callable[[Address], Transport] = Nats if kind == "nats" else Mqtt
     outputs = [Output(i, "a.b", "final", str(i).encode()) for i in range(300)]
 
-    async def heard(work: Callable[[], Awaitable[None]]) -> list[bytes]:
+    async def observe(work: Callable[[], Awaitable[None]]) -> list[bytes]:
         """What both kinds of clients find, since a topic is a subject."""
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
         subscription = await client.subscribe(f"out{kind}.out.*.a%2Eb")
         await client.flush()
         await work()
-        found = [(await subscription.next_msg(5)).data for _ in range(len(outputs) + 1)]
+        results = [(await subscription.next_msg(5)).data for _ in range(len(outputs) + 1)]
         await client.close()
-        return found
+        return results
 
     async def work() -> None:
         transport = make(at(server, kind, f"out{kind}"))
         if isinstance(transport, Nats):
             assert await silent(transport)
-        found = await heard(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
-        assert found == [b"now", *[one.body for one in outputs]]
+        result = await observe(lambda: transport.publish([Output(None, "a.b", "provisional", b"now"), *outputs]))
+        assert result == [b"now", *[output.body for output in outputs]]
         if isinstance(transport, Nats):
             await transport.publish(outputs)  # told again, as after a restart
             info = await transport._client.jetstream().stream_info("outnats-out")

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from heliograph.numerics.check import InputError
-from heliograph.serving.keeping import Damage
-from heliograph.serving.running import told_damage
+from heliograph.serving.running import report_damage
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
-from heliograph.serving.tables import LAYOUT
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.store import Store
+from heliograph.serving.storage.store_protocol import Damage
+from heliograph.serving.storage.tables import LAYOUT
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 SENT = lines(messages(2, 24, seed=11, whole=True))
@@ -41,9 +41,9 @@ def whole(tmp_path_factory, mine):
 def changed(place, what, *values):
     """One statement of SQL in a store that nobody has open."""
     with closing(sqlite3.connect(place)) as connection:
-        found = connection.execute(what, values).fetchall()
+        result = connection.execute(what, values).fetchall()
         connection.commit()
-    return found
+    return result
 
 
 def copy(whole, tmp_path):
@@ -60,15 +60,15 @@ def gone_on(place, mine):
         outputs = [*service.unpublished(), *service.take(SENT[HALF:])]
     finally:
         store.close()
-    told = [json.loads(each.body) for each in outputs]
-    estimates = {name: [each for each in told if each["plant"] == name and each["kind"] != "refused"] for name in
+    published = [json.loads(output.body) for output in outputs]
+    estimates = {name: [item for item in published if item["plant"] == name and item["kind"] != "refused"] for name in
                  ("p0", "p1")}  # fmt: skip
-    return estimates, [each for each in told if each["kind"] == "refused"]
+    return estimates, [item for item in published if item["kind"] == "refused"]
 
 
 def without_numbers(estimates):
     """A refusal takes a number too, so that those of others move on."""
-    return [{key: value for key, value in each.items() if key != "id"} for each in estimates]
+    return [{key: value for key, value in estimate.items() if key != "id"} for estimate in estimates]
 
 
 def test_no_byte_of_a_body_changes_unseen(whole, tmp_path, mine):
@@ -82,9 +82,9 @@ def test_no_byte_of_a_body_changes_unseen(whole, tmp_path, mine):
             other = bytearray(body)
             other[at] ^= 1 << at % 8
             connection.execute("update plants set body = ? where name = 'p1'", (bytes(other),))
-            kept = store.load(["p0", "p1"])
-            assert kept["p0"].damage == "" and kept["p1"].body == b""
-            assert "a.db, plant 'p1': expected the state that was written, got a damaged one" in kept["p1"].damage
+            stored = store.load(["p0", "p1"])
+            assert stored["p0"].damage == "" and stored["p1"].body == b""
+            assert "a.db, plant 'p1': expected the state that was written, got a damaged one" in stored["p1"].damage
     store.close()
 
 
@@ -108,10 +108,10 @@ def test_a_damaged_plant_is_refused_by_name_and_the_others_go_on(whole, tmp_path
     changed(place, f"update plants {how} where name = 'p1'")
     estimates, refused = gone_on(place, mine)
     assert without_numbers(estimates["p0"]) == without_numbers(right["p0"]) != []
-    assert all(each in right["p1"] for each in estimates["p1"])  # what was told before
-    assert {each["reason"] for each in refused if each["plant"] == "p1"} == {"damaged"}
-    assert all(f"{place}, plant 'p1': expected" in each["detail"] for each in refused if each["plant"] == "p1")
-    assert all("--anew p1 begins it anew" in each["detail"] for each in refused if each["plant"] == "p1")
+    assert all(estimate in right["p1"] for estimate in estimates["p1"])  # what was told before
+    assert {item["reason"] for item in refused if item["plant"] == "p1"} == {"damaged"}
+    assert all(f"{place}, plant 'p1': expected" in item["detail"] for item in refused if item["plant"] == "p1")
+    assert all("--anew p1 begins it anew" in item["detail"] for item in refused if item["plant"] == "p1")
 
 
 def test_a_plant_begins_anew_where_the_user_says_so(whole, tmp_path, mine):
@@ -125,7 +125,7 @@ def test_a_plant_begins_anew_where_the_user_says_so(whole, tmp_path, mine):
     assert store.damaged == {} and store.count() == 1
     store.close()
     _, refused = gone_on(place, mine)
-    assert "damaged" not in {each["reason"] for each in refused}
+    assert "damaged" not in {item["reason"] for item in refused}
 
 
 @pytest.mark.parametrize("name", ["'q1'", "cast(x'70ff' as text)", "x'70'"])
@@ -134,8 +134,8 @@ def test_nothing_begins_anew_where_a_name_is_damaged(whole, tmp_path, mine, name
     place = copy(whole, tmp_path)
     changed(place, f"update plants set name = {name} where name = 'p1'")
     _, refused = gone_on(place, mine)
-    assert {each["reason"] for each in refused if each["plant"] == "p1"} == {"damaged"}
-    assert all("may have had it" in each["detail"] for each in refused if each["plant"] == "p1")
+    assert {item["reason"] for item in refused if item["plant"] == "p1"} == {"damaged"}
+    assert all("may have had it" in item["detail"] for item in refused if item["plant"] == "p1")
     store = Store(str(place), mine)
     store.begin_anew(list(store.damaged))
     assert store.damaged == {} and store.count() == 1
@@ -144,9 +144,9 @@ def test_nothing_begins_anew_where_a_name_is_damaged(whole, tmp_path, mine, name
 
 def test_damage_is_one_line_with_what_to_do():
     named = Damage(True, 0)
-    assert told_damage({"a": named, "": named}).endswith("(--anew a --anew '')")
-    assert "lost its name" in told_damage({"a": named, "b": Damage(False, 0)})
-    assert told_damage({f"p{i}": named for i in range(13)}).endswith("--anew p9 and 3 more)")
+    assert report_damage({"a": named, "": named}).endswith("(--anew a --anew '')")
+    assert "lost its name" in report_damage({"a": named, "b": Damage(False, 0)})
+    assert report_damage({f"p{i}": named for i in range(13)}).endswith("--anew p9 and 3 more)")
 
 
 @pytest.mark.parametrize(
@@ -178,9 +178,9 @@ def test_plants_go_on_in_a_new_store_where_the_journal_is_damaged(whole, tmp_pat
     assert list(new.damaged) == ["p1"]
     new.close()
     estimates, refused = gone_on(tmp_path / "new.db", mine)
-    told = without_numbers(estimates["p0"])
-    assert told == without_numbers(right["p0"])[-len(told) :] != []
-    assert {each["reason"] for each in refused if each["plant"] == "p1"} == {"damaged"}
+    known = without_numbers(estimates["p0"])
+    assert known == without_numbers(right["p0"])[-len(known) :] != []
+    assert {item["reason"] for item in refused if item["plant"] == "p1"} == {"damaged"}
 
 
 def test_a_store_of_the_layout_before_is_refused_by_its_number(tmp_path, mine):
@@ -218,14 +218,14 @@ def test_no_byte_of_the_file_changes_what_is_told(whole, tmp_path, mine):
             assert str(error).startswith(f"store {place}") and "\n" not in str(error)
             outcomes["refused"] += 1
             continue
-        hurt = {each["plant"] for each in refused if each["reason"] == "damaged"}
+        hurt = {item["plant"] for item in refused if item["reason"] == "damaged"}
         outcomes["damaged" if hurt else "same"] += 1
         if not hurt:
             assert (estimates, refused) == (right, others), at
         for name in {"p0", "p1"} - hurt:
             assert without_numbers(estimates[name]) == without_numbers(right[name]), at
         for name in hurt:
-            assert all(each in right[name] for each in estimates[name]), at
+            assert all(estimate in right[name] for estimate in estimates[name]), at
     assert min(outcomes.values()) > 0, outcomes
 
 

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import heliograph as hg
-from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.service import Service
+from heliograph.serving.storage.in_memory_store import InMemoryStore
 from tests.serving.test_service import finals, served
 from tests.serving.worlds import HOP, SENSOR, fleet, lines, messages, moving, stepping
 
@@ -20,8 +20,8 @@ from absurd_soak import stained
 
 def refused_good(outputs):
     """Which messages that are not absurd were refused, and why."""
-    refused = [one for one in outputs if one["kind"] == "refused" and one["sequence"] < 1_000_000]
-    return sorted((one["plant"], one["node"], one["sequence"], one["reason"]) for one in refused)
+    refused = [output for output in outputs if output["kind"] == "refused" and output["sequence"] < 1_000_000]
+    return sorted((item["plant"], item["node"], item["sequence"], item["reason"]) for item in refused)
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -30,25 +30,25 @@ def test_absurd_messages_leave_no_trace(whole, size):
     network = stepping() if whole else moving()
     good = messages(3, 60, seed=5, whole=whole)
     bad, _ = stained(good, 0.1, np.random.default_rng(1))
-    _, wanted = served(network, lines(good), size)
-    service, told = served(network, lines(bad), size)
-    refused = Counter(one["reason"] for one in told if one["kind"] == "refused")
+    _, expected = served(network, lines(good), size)
+    service, known = served(network, lines(bad), size)
+    refused = Counter(item["reason"] for item in known if item["kind"] == "refused")
     assert refused["implausible"] > 10 and service.malformed == 0
-    assert refused_good(told) == refused_good(wanted)
+    assert refused_good(known) == refused_good(expected)
     for plant in ("p0", "p1", "p2"):
-        assert finals(told, plant) == finals(wanted, plant) != []
+        assert finals(known, plant) == finals(expected, plant) != []
     counted = [link.implausible for plant in service.plants.values() for link in plant.links.values()]
-    began = [one for one in told if one["kind"] == "refused" and one["reason"] == "implausible"]
+    began = [item for item in known if item["kind"] == "refused" and item["reason"] == "implausible"]
     assert len(began) - 6 <= sum(counted) <= len(began)  # a message that would have begun a plant has no link
 
 
 def test_a_plant_does_not_begin_with_an_absurd_value():
     first = {"plant": "p", "node": "a", "sequence": 0, "time": 1.0, "values": [1e20]}
-    service, told = served(moving(), lines([first]), 1)
-    assert [one["reason"] for one in told] == ["implausible"] and not service.plants
-    assert "1e6 deviations" in told[0]["detail"]
-    service, told = served(moving(), lines([first, first | {"sequence": 1, "time": 0.5, "values": [0.3]}]), 2)
-    assert [one["time"] for one in told if one["kind"] == "final"] == [0.5]
+    service, known = served(moving(), lines([first]), 1)
+    assert [item["reason"] for item in known] == ["implausible"] and not service.plants
+    assert "1e6 deviations" in known[0]["detail"]
+    service, known = served(moving(), lines([first, first | {"sequence": 1, "time": 0.5, "values": [0.3]}]), 2)
+    assert [item["time"] for item in known if item["kind"] == "final"] == [0.5]
 
 
 def test_of_a_message_its_inputs_or_its_values_are_refused_alone():
@@ -60,10 +60,10 @@ def test_of_a_message_its_inputs_or_its_values_are_refused_alone():
     }
     last = push | {"sequence": 2, "time": 2}
     for which, (bad, like) in cases.items():
-        service, told = served(stepping(), lines([push, bad, last]), 3)
-        _, wanted = served(stepping(), lines([push, like, last]), 3)
-        assert finals(told, "p")[-1] == finals(wanted, "p")[-1]
-        (refused,) = [one for one in told if one["kind"] == "refused"]
+        service, known = served(stepping(), lines([push, bad, last]), 3)
+        _, expected = served(stepping(), lines([push, like, last]), 3)
+        assert finals(known, "p")[-1] == finals(expected, "p")[-1]
+        (refused,) = [item for item in known if item["kind"] == "refused"]
         assert refused["reason"] == "implausible" and refused["sequence"] == 1
         assert ("; the rest is used" in refused["detail"]) == (which == "inputs")
         assert service.plants["p"].links["inputs" if which == "inputs" else "a"].implausible == 1
@@ -77,10 +77,10 @@ def test_limits_hold_here_too_and_it_is_said_once():
     from heliograph.serving.fleet import Fleet, Options
     from heliograph.serving.lanes import Lanes
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), Nowhere(), said.append)
+    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore(), said.append)
     sent = [{"node": "a", "sequence": k, "time": k, "values": [v]} for k, v in enumerate([0.3, -999, 6.0, 1e20, 0.4])]
-    told = [json.loads(one.body) for one in service.take(lines(sent))]
-    details = [one["detail"] for one in told if one["kind"] == "refused"]
+    outputs = [json.loads(single.body) for single in service.take(lines(sent))]
+    details = [single["detail"] for single in outputs if single["kind"] == "refused"]
     assert details == ["y0 -999 is a code", "y0 6 is outside -5 to 5", "y0 1e+20 is outside -5 to 5"]
     link = service.plants[""].links["a"]
     assert (link.used, link.implausible, link.dropped, link.lost) == (2, 3, 3, 0)
@@ -99,8 +99,8 @@ def test_a_filter_that_alone_leaves_a_value_out_says_so():
     from heliograph.serving.fleet import Fleet, Options
     from heliograph.serving.lanes import Lanes
 
-    service = Service(Fleet(Lanes(network), Options(5.0)), Nowhere())
-    (told,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))
-    found = json.loads(told.body)["estimates"]["a"]
-    assert found["lost"]["mean"] == [0.0] and found["lost"]["nis"] is None and found["lost"]["heard"] == 0
-    assert "1e6 deviations" in found["lost"]["implausible"] and "implausible" not in found["fine"]
+    service = Service(Fleet(Lanes(network), Options(5.0)), InMemoryStore())
+    (known,) = service.take(lines([{"node": "a", "sequence": 0, "time": 0, "values": [1.0]}]))
+    result = json.loads(known.body)["estimates"]["a"]
+    assert result["lost"]["mean"] == [0.0] and result["lost"]["nis"] is None and result["lost"]["heard"] == 0
+    assert "1e6 deviations" in result["lost"]["implausible"] and "implausible" not in result["fine"]

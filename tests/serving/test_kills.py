@@ -13,7 +13,7 @@ def test_a_killed_service_loses_nothing_and_counts_nothing_twice(tmp_path, monke
     monkeypatch.syspath_prepend(FOLDER)
     import kills
 
-    found = kills.killed(1, 1, tmp_path)
-    assert kills.sound(found), found
+    result = kills.killed(1, 1, tmp_path)
+    assert kills.sound(result), result
     for name, wrong in (("lost", 1), ("finals_identical", False), ("exit_code", 2)):
-        assert not kills.sound(found | {name: wrong})
+        assert not kills.sound(result | {name: wrong})

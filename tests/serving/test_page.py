@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 pytest.importorskip("uvicorn")
 from heliograph.serving.page import Door, door, shown
-from heliograph.serving.surprise import DOUBT, MEMORY, Surprise
+from heliograph.serving.running_nis import DOUBT, MEMORY, RunningNis
 from heliograph.serving.watch import Watch
 from tests.serving.watched import Scripted
 from tests.widths import program
@@ -60,13 +60,13 @@ def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
     rng = np.random.default_rng(0)
     inside = []
     for _ in range(300):
-        one = Surprise("exact")
-        for squared, heard in zip(rng.chisquare(2, 600), [2] * 600, strict=True):
-            one.add(squared, heard)
-        low, high = one.band()
-        inside.append(low <= one.ratio <= high)
+        item = RunningNis("exact")
+        for squared, single in zip(rng.chisquare(2, 600), [2] * 600, strict=True):
+            item.add(squared, single)
+        low, high = item.band()
+        inside.append(low <= item.ratio <= high)
     assert np.mean(inside) > 1 - 10 * DOUBT  # 300 tries of probability 0.001: more than 2 failures once in 4,000
-    fresh = Surprise("exact", mean=10.0, variance=20.0)  # ten numbers, all of weight 1: chi-squared itself
+    fresh = RunningNis("exact", mean=10.0, variance=20.0)  # ten numbers, all of weight 1: chi-squared itself
     assert np.allclose(fresh.band(), chi2.ppf([DOUBT / 2, 1 - DOUBT / 2], 10) / 10, rtol=1e-12)
     for scale, claim, doubted in [
         (2.0, "exact", True),
@@ -74,10 +74,10 @@ def test_an_honest_filter_stays_in_its_band_and_a_wrong_one_does_not():
         (0.5, "upper", False),
         (1.0, "exact", False),
     ]:
-        one = Surprise(claim)
+        item = RunningNis(claim)
         for squared in scale * rng.chisquare(2, 3 * MEMORY):
-            one.add(squared, 2)
-        assert (one.doubt() is not None) == doubted
+            item.add(squared, 2)
+        assert (item.doubt() is not None) == doubted
 
 
 def test_a_door_that_others_reach_needs_a_token():
@@ -97,9 +97,9 @@ def test_the_page_shows_what_was_told_and_brings_all_it_needs():
         assert "default-src 'none'" in headers["content-security-policy"]
         outside = re.findall(r'(?:src|href)="([^"]*)"', text)
         assert sorted(outside) == ["page.css", "page.js"] and "http" not in (await got(f"{url}/page.css"))[1]
-        found = re.search(r'id="first">(.*?)</script>', text)
-        assert found is not None and "<" not in found[1]  # a name does not end the element
-        view = json.loads(found[1])
+        match = re.search(r'id="first">(.*?)</script>', text)
+        assert match is not None and "<" not in match[1]  # a name does not end the element
+        view = json.loads(match[1])
         assert view == await first_event(f"{url}/events")
         assert view["states"][0] == "<i>x</i>" and view["plants"] == ["</script><b>x"] and len(view["points"]) == 600
         point = view["points"][-1]["estimates"]["<b>node"]["cubature"]
@@ -113,13 +113,13 @@ def test_the_page_shows_what_was_told_and_brings_all_it_needs():
 def test_metrics_are_those_of_the_service():
     async def look(url: str) -> None:
         text = (await got(f"{url}/metrics"))[1]
-        found = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
-        assert found['heliograph_messages_total{node="<b>node",verdict="used"}'] == "300.0"
+        result = dict(line.rsplit(" ", 1) for line in text.splitlines() if not line.startswith("#"))
+        assert result['heliograph_messages_total{node="<b>node",verdict="used"}'] == "300.0"
         label = '{filter="cubature",node="<b>node"}'
-        low, ratio, high = (float(found[f"heliograph_nis{name}{label}"]) for name in ("_low", "", "_high"))
+        low, ratio, high = (float(result[f"heliograph_nis{name}{label}"]) for name in ("_low", "", "_high"))
         assert 0.7 < low < ratio < high < 1.4
-        assert found["heliograph_commit_seconds_count"] == "1.0" and found["heliograph_plants"] == "1.0"
-        assert found["heliograph_lag_seconds_sum"] == "40.0"
+        assert result["heliograph_commit_seconds_count"] == "1.0" and result["heliograph_plants"] == "1.0"
+        assert result["heliograph_lag_seconds_sum"] == "40.0"
 
     looked(look, Scripted())
 

@@ -4,13 +4,13 @@ from pathlib import Path
 
 import pytest
 
-from heliograph.serving.database import engine_at
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.store import Store
 from tests.postgres import Postgres
 from tests.serving import test_sharing
-from tests.serving.test_store import by_plant, journal, states
+from tests.serving.storage.test_store import by_plant, journal, states
 from tests.serving.worlds import fleet, lines, messages, stepping
 
 pytestmark = pytest.mark.real("PostgreSQL")
@@ -39,17 +39,17 @@ def test_processes_share_a_store_in_postgresql(tmp_path, database):
     mine, sent = identity(fleet(network)), lines(messages(3, 20, seed=6, whole=True))
     alone = Service(fleet(network), Store(str(tmp_path / "alone.db"), mine))
     alone.take(sent)
-    many = [Service(fleet(network), Store(database, mine, name)) for name in "ab"]
+    count = [Service(fleet(network), Store(database, mine, name)) for name in "ab"]
     for i, begin in enumerate(range(0, len(sent), 6)):
-        told = many[i % 2].take(sent[begin : begin + 6])
-        many[i % 2].published(told)
-        many[i % 2].finish(ended=False)
-        assert many[i % 2].unpublished() == []
-    assert states(many[0]) == states(alone)
-    assert by_plant(journal(many[0].store)) == by_plant(journal(alone.store))
+        known = count[i % 2].take(sent[begin : begin + 6])
+        count[i % 2].published(known)
+        count[i % 2].finish(ended=False)
+        assert count[i % 2].unpublished() == []
+    assert states(count[0]) == states(alone)
+    assert by_plant(journal(count[0].store)) == by_plant(journal(alone.store))
     with pytest.raises(ValueError, match=r"window: 5\.0"):
         Store(database, identity(fleet(network, window=6.0)))
-    for service in many:
+    for service in count:
         service.store.close()
 
 

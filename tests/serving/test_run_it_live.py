@@ -30,13 +30,13 @@ network = hg.Network(plant, {"a": node, "b": node}, {"both": hg.Fusion("linear",
 @contextmanager
 def standard(number, path, flags):
     """A standard file that is another one for a while."""
-    kept, other = os.dup(number), os.open(path, flags, 0o600)
+    stored, other = os.dup(number), os.open(path, flags, 0o600)
     os.dup2(other, number)
     try:
         yield
     finally:
-        os.dup2(kept, number)
-        os.close(kept)
+        os.dup2(stored, number)
+        os.close(stored)
         os.close(other)
 
 
@@ -65,18 +65,20 @@ def test_the_pipe_of_the_readme_gives_final_estimates(tmp_path, monkeypatch, cap
     assert cli.main(["new", "cart.py"]) == 0
     rows = [f"{k / 10},0.0,0.1,{k / 10 + 0.01 * (k % 7)},{10 - k / 10}" for k in range(200)]
     Path("data.csv").write_text("\n".join(["time,acceleration,dt,left,right", *rows]))
-    told = piped(command.replace("--speed 10", "--speed 1000"), capfd)
+    known = piped(command.replace("--speed 10", "--speed 1000"), capfd)
     reader = TypeAdapter(AnyOutput)
-    for one in told:
-        reader.validate_python(one)
-    finals = [one["time"] for one in told if one["kind"] == "final"]
+    for item in known:
+        reader.validate_python(item)
+    finals = [item["time"] for item in known if item["kind"] == "final"]
     assert finals == sorted(finals)
     assert 50 < len(finals) < 150  # of 20 s of which the last 10 may still change
-    assert {one["reason"] for one in told if one["kind"] == "refused"} == {"duplicate"}
+    assert {item["reason"] for item in known if item["kind"] == "refused"} == {"duplicate"}
     (tmp_path / "messages.jsonl").write_text((tmp_path / "piped0").read_text())
     again = piped(page[1], capfd)
-    kept = [one["estimates"] for one in again if one["kind"] == "final"]  # of the rest may still change
-    assert kept == [one["estimates"] for one in told if one["kind"] == "final"][: len(kept)] and len(kept) > 50
+    stored = [item["estimates"] for item in again if item["kind"] == "final"]  # of the rest may still change
+    assert (
+        stored == [item["estimates"] for item in known if item["kind"] == "final"][: len(stored)] and len(stored) > 50
+    )
 
 
 def test_the_state_is_kept_beside_the_network_unless_it_is_told_otherwise(tmp_path, monkeypatch, capfd):
@@ -85,9 +87,9 @@ def test_the_state_is_kept_beside_the_network_unless_it_is_told_otherwise(tmp_pa
     Path("sent").write_bytes(b"\n".join(lines(messages(1, 40, 0, whole=True, longest=0.0))))
 
     def served(options=""):
-        told = piped(f"heliograph serve net.py --window 5{options} < sent", capfd)
-        finals = [one for one in told if one["kind"] == "final"]
-        return len(finals), {one["reason"] for one in told if one["kind"] == "refused"}, SAID.read_text()
+        known = piped(f"heliograph serve net.py --window 5{options} < sent", capfd)
+        finals = [item for item in known if item["kind"] == "final"]
+        return len(finals), {item["reason"] for item in known if item["kind"] == "refused"}, SAID.read_text()
 
     count, refused, said = served()
     assert count == 14 and not refused  # of steps 0 to 19 those before 14
@@ -130,8 +132,8 @@ def test_what_serve_and_replay_refuse_is_one_line(tmp_path, monkeypatch, capsys)
         (["replay", "events.csv", "--network", "net.py", "--trace", "link.csv"], "delay"),
     ):
         assert cli.main(words) == 2
-        told = capsys.readouterr().err
-        assert told.startswith("heliograph: ") and what in told and told.count("\n") == 1, told
+        known = capsys.readouterr().err
+        assert known.startswith("heliograph: ") and what in known and known.count("\n") == 1, known
 
 
 def test_the_schema_is_that_of_messages_and_outputs(capsys):

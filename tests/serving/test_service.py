@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 import heliograph as hg
-from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.output import AnyOutput
 from heliograph.serving.plant import Link
 from heliograph.serving.service import Service
+from heliograph.serving.storage.in_memory_store import InMemoryStore
 from tests.serving.worlds import WINDOW, fleet, lines, messages, moving, stepping
 
 READER = TypeAdapter(AnyOutput)
@@ -22,19 +22,21 @@ READER = TypeAdapter(AnyOutput)
 
 def served(network, sent, size, **options):
     """All that is told, as JSON, of messages in batches of this size."""
-    service = Service(fleet(network, **options), Nowhere())
-    told = []
+    service = Service(fleet(network, **options), InMemoryStore())
+    outputs = []
     for begin in range(0, len(sent), size):
-        told += service.take(sent[begin : begin + size])
-    told += service.finish(ended=True)
-    for one in told:
-        READER.validate_json(one.body)
-    return service, [json.loads(one.body) for one in told]
+        outputs += service.take(sent[begin : begin + size])
+    outputs += service.finish(ended=True)
+    for item in outputs:
+        READER.validate_json(item.body)
+    return service, [json.loads(item.body) for item in outputs]
 
 
-def finals(told, plant):
+def finals(known, plant):
     return [
-        {k: v for k, v in one.items() if k != "id"} for one in told if one["kind"] == "final" and one["plant"] == plant
+        {k: v for k, v in item.items() if k != "id"}
+        for item in known
+        if item["kind"] == "final" and item["plant"] == plant
     ]
 
 
@@ -42,53 +44,55 @@ def finals(told, plant):
 def test_verdicts_and_estimates_are_those_of_a_timeline(whole):
     """Within 1e-12: two programs that are compiled apart; the estimates are of order one."""
     network = stepping() if whole else moving()
-    found = messages(3, 60, seed=1, whole=whole, longest=9.0)  # some later than the window
-    found += found[-20:]
-    service, told = served(network, lines(found), 17)
+    result = messages(3, 60, seed=1, whole=whole, longest=9.0)  # some later than the window
+    result += result[-20:]
+    service, known = served(network, lines(result), 17)
     for plant in ("p0", "p1", "p2"):
-        mine = [one for one in found if one["plant"] == plant]
+        mine = [item for item in result if item["plant"] == plant]
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             timeline = hg.Timeline(network, WINDOW, start=0.0 if whole else mine[0]["time"])
-        for one in mine:
-            if "inputs" in one:
-                timeline.push("inputs", one["sequence"], one["time"], one["inputs"], one["arrival"])
-            values = [np.nan if z is None else z for z in one["values"]]
-            timeline.push(one["node"], one["sequence"], one["time"], values, one["arrival"])
+        for item in mine:
+            if "inputs" in item:
+                timeline.push("inputs", item["sequence"], item["time"], item["inputs"], item["arrival"])
+            values = [np.nan if z is None else z for z in item["values"]]
+            timeline.push(item["node"], item["sequence"], item["time"], values, item["arrival"])
         links = service.plants[plant].links
         for node in "ab":
             assert {v: getattr(links[node], v) for v in timeline.counts[node]} == timeline.counts[node]
         assert sum(links[node].late for node in "ab") > 0
         assert sum(links[node].duplicate for node in "ab") > 0
         timeline.advance(1e3)
-        record, mine = timeline.final(), finals(told, plant)
-        np.testing.assert_array_equal(record.time, [one["time"] for one in mine])
+        record, mine = timeline.final(), finals(known, plant)
+        np.testing.assert_array_equal(record.time, [item["time"] for item in mine])
         for node, filters in record.estimates.items():
             for name, estimate in filters.items():
-                got = [one["estimates"][node][name] for one in mine]
-                np.testing.assert_allclose([one["mean"] for one in got], estimate.mean, atol=1e-12, rtol=0)
-                np.testing.assert_allclose([one["covariance"] for one in got], estimate.covariance, atol=1e-12, rtol=0)
-                assert {one["claim"] for one in got} == {estimate.claim}
+                got = [item["estimates"][node][name] for item in mine]
+                np.testing.assert_allclose([item["mean"] for item in got], estimate.mean, atol=1e-12, rtol=0)
+                np.testing.assert_allclose(
+                    [item["covariance"] for item in got], estimate.covariance, atol=1e-12, rtol=0
+                )
+                assert {item["claim"] for item in got} == {estimate.claim}
 
 
 @pytest.mark.parametrize("whole", [True, False])
 def test_no_bit_depends_on_batches_or_on_other_plants(whole):
     network = stepping() if whole else moving()
-    found = messages(5, 30, seed=2, whole=whole)
-    _, together = served(network, lines(found), len(found))
-    _, one_by_one = served(network, lines(found), 1)
-    alone = served(network, lines([one for one in found if one["plant"] == "p3"]), 7)[1]
+    result = messages(5, 30, seed=2, whole=whole)
+    _, together = served(network, lines(result), len(result))
+    _, one_by_one = served(network, lines(result), 1)
+    alone = served(network, lines([item for item in result if item["plant"] == "p3"]), 7)[1]
     for i in range(5):
         assert finals(together, f"p{i}") == finals(one_by_one, f"p{i}") != []
     assert finals(together, "p3") == finals(alone, "p3")
 
 
 def test_any_order_and_twice_is_the_same(tmp_path):
-    found = messages(2, 30, seed=3, whole=True)
-    again = [found[i] for i in np.random.default_rng(0).permutation(len(found))]
-    one, two = (served(stepping(), lines(each), 8, window=100.0)[1] for each in (found, again + found))
+    result = messages(2, 30, seed=3, whole=True)
+    again = [result[i] for i in np.random.default_rng(0).permutation(len(result))]
+    item, two = (served(stepping(), lines(item), 8, window=100.0)[1] for item in (result, again + result))
     for plant in ("p0", "p1"):
-        assert finals(one, plant) == finals(two, plant)
+        assert finals(item, plant) == finals(two, plant)
 
 
 def test_surprise_is_that_of_the_innovation():
@@ -97,14 +101,14 @@ def test_surprise_is_that_of_the_innovation():
     alone = network.nodes["a"].filters["linear"]
     z = [0.3, 1.9, None, 0.7, -0.4]
     sent = [{"node": "a", "sequence": k, "time": k, "values": [value]} for k, value in enumerate(z)]
-    _, told = served(network, lines(sent), 2)
-    mine = [one["estimates"]["a"]["linear"] for one in told if one["kind"] == "final"]
-    assert [one["heard"] for one in mine] == [1, 1, 0, 1, 1] and mine[2]["nis"] is None
+    _, known = served(network, lines(sent), 2)
+    mine = [item["estimates"]["a"]["linear"] for item in known if item["kind"] == "final"]
+    assert [item["heard"] for item in mine] == [1, 1, 0, 1, 1] and mine[2]["nis"] is None
     state = alone.init()
-    for k, (value, one) in enumerate(zip(z, mine, strict=True)):
+    for k, (value, item) in enumerate(zip(z, mine, strict=True)):
         state, said = alone.correct(alone.predict(state, [0.0], k), [np.nan if value is None else value], k)
         if value is not None:
-            np.testing.assert_allclose(one["nis"], said.value[0] ** 2 / said.covariance[0, 0], rtol=1e-12)
+            np.testing.assert_allclose(item["nis"], said.value[0] ** 2 / said.covariance[0, 0], rtol=1e-12)
 
 
 BAD = {
@@ -142,44 +146,44 @@ BAD = {
 def test_what_is_bad_is_told_and_changes_nothing():
     good = lines(messages(1, len(BAD) + 1, seed=4, whole=True))
     bad = {payload.replace(b'{"node"', b'{"plant": "p0", "node"'): reason for payload, reason in BAD.items()}
-    mixed = [good[0], *(line for i, one in enumerate(good[1:]) for line in (one, list(bad)[i % len(bad)]))]
+    mixed = [good[0], *(line for i, item in enumerate(good[1:]) for line in (item, list(bad)[i % len(bad)]))]
     _, clean = served(stepping(), good, 6)
-    service, told = served(stepping(), mixed, 6)
-    assert finals(told, "p0") == finals(clean, "p0") and service.malformed == len(bad) - 1
+    service, known = served(stepping(), mixed, 6)
+    assert finals(known, "p0") == finals(clean, "p0") and service.malformed == len(bad) - 1
     for payload, reason in bad.items():
-        _, told = served(stepping(), [good[0], payload], 2)
-        refused = [one for one in told if one["kind"] == "refused"]
-        assert len(refused) == 1 and reason in refused[0]["reason"] + refused[0]["detail"], (payload, told)
+        _, known = served(stepping(), [good[0], payload], 2)
+        refused = [item for item in known if item["kind"] == "refused"]
+        assert len(refused) == 1 and reason in refused[0]["reason"] + refused[0]["detail"], (payload, known)
 
 
 def test_a_clock_keeps_its_kind_and_the_refusal_says_how_to_mend_it():
     date = {"plant": "p q", "node": "a", "sequence": 0, "time": "2026-11-21T10:00:00Z", "values": [1.0]}
     number = date | {"sequence": 1, "time": 0.2}
-    _, told = served(moving(), lines([date, number]), 2)
-    (refused,) = (one for one in told if one["kind"] == "refused")
+    _, known = served(moving(), lines([date, number]), 2)
+    (refused,) = (item for item in known if item["kind"] == "refused")
     assert "a date, as this plant's times are, got 0.2; if its first" in refused["detail"]
     assert "serve --anew 'p q' begins it anew" in refused["detail"]
-    _, told = served(moving(), lines([number, date]), 2)
-    (refused,) = (one for one in told if one["kind"] == "refused")
+    _, known = served(moving(), lines([number, date]), 2)
+    (refused,) = (item for item in known if item["kind"] == "refused")
     assert "a number, as this plant's times are, got 2026-11-21T10:00:00+00:00; if its" in refused["detail"]
 
 
 def test_a_number_in_quotes_begins_no_clock():
     quoted = {"node": "a", "sequence": 0, "time": "0.1", "values": [1.0]}
     right = quoted | {"sequence": 1, "time": 0.2}
-    service, told = served(moving(), lines([quoted, right]), 1)
-    assert service.malformed == 1 and [one["time"] for one in told if one["kind"] == "final"] == [0.2]
+    service, known = served(moving(), lines([quoted, right]), 1)
+    assert service.malformed == 1 and [item["time"] for item in known if item["kind"] == "final"] == [0.2]
 
 
 def test_no_plant_begins_with_a_wrong_clock():
     """Its time would start there, and all that is right would be late."""
     wrong = {"plant": "p", "node": "a", "sequence": 0, "time": 1e9, "values": [1.0], "arrival": 1.0}
     right = {"plant": "p", "node": "a", "sequence": 1, "time": 1.0, "values": [1.0], "arrival": 1.0}
-    service, told = served(moving(), lines([wrong, right]), 2)
-    assert [one["reason"] for one in told if one["kind"] == "refused"] == ["future"]
-    assert len(finals(told, "p")) == 1 and service.plants["p"].links["a"].used == 1
-    _, told = served(moving(), lines([right, right | {"time": 500.0, "sequence": 2, "arrival": 500.0}]), 1, leap=60.0)
-    assert [one["reason"] for one in told if one["kind"] == "refused"] == ["future"]
+    service, known = served(moving(), lines([wrong, right]), 2)
+    assert [item["reason"] for item in known if item["kind"] == "refused"] == ["future"]
+    assert len(finals(known, "p")) == 1 and service.plants["p"].links["a"].used == 1
+    _, known = served(moving(), lines([right, right | {"time": 500.0, "sequence": 2, "arrival": 500.0}]), 1, leap=60.0)
+    assert [item["reason"] for item in known if item["kind"] == "refused"] == ["future"]
 
 
 @given(st.randoms(use_true_random=False), st.floats(0, 0.6))
@@ -187,13 +191,13 @@ def test_lost_is_what_never_came_in_whatever_order_the_rest_did(chance, loss):
     """Between the first and the last that were heard; then the node is started again, and counts from 0."""
     link, lost = Link(), 0
     for boot in range(2):
-        heard = [k for k in range(1, 20) if chance.random() > loss]
-        chance.shuffle(heard)
+        received = [k for k in range(1, 20) if chance.random() > loss]
+        chance.shuffle(received)
         if boot and link.newest > 0:
-            heard.insert(0, 0)
-        for k in heard:
+            received.insert(0, 0)
+        for k in received:
             link.count("used", k, float(100 * boot + k))
-        lost += max(heard) - min(heard) + 1 - len(heard) if heard and (link.first in heard) else 0
+        lost += max(received) - min(received) + 1 - len(received) if received and (link.first in received) else 0
     assert link.lost == lost
 
 
@@ -208,7 +212,7 @@ def test_a_wrong_clock_or_a_copy_loses_nothing():
 
 
 def test_lag_is_by_the_clock_on_the_wall_where_messages_carry_dates():
-    service = Service(fleet(moving()), Nowhere())
+    service = Service(fleet(moving()), InMemoryStore())
     time = datetime.now(UTC) - timedelta(seconds=1000)
     service.take(lines([{"plant": "dated", "node": "a", "sequence": 0, "time": time.isoformat(), "values": [1.0]}]))
     assert 1000 < service.last.lag < 1600  # of a busy machine
@@ -218,7 +222,7 @@ def test_lag_is_by_the_clock_on_the_wall_where_messages_carry_dates():
 
 def test_memory_is_bounded_by_the_window():
     """One plant for 2,000 rows at a time: those of the window and of the batch are held, and no more."""
-    service = Service(fleet(moving()), Nowhere())
+    service = Service(fleet(moving()), InMemoryStore())
     z = np.random.default_rng(0).normal(size=2000)
     sent = lines([{"node": "a", "sequence": k, "time": 0.1 * k, "values": [float(z[k])]} for k in range(2000)])
     for begin in range(0, 2000, 50):

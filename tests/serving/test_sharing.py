@@ -19,12 +19,12 @@ import nats
 from sqlalchemy import Engine, update
 
 import heliograph
-from heliograph.serving import leases
-from heliograph.serving.database import engine_at
-from heliograph.serving.leases import Leases
-from heliograph.serving.nowhere import Nowhere
-from heliograph.serving.partition import word
+from heliograph.serving.brokers.partition import word
 from heliograph.serving.service import Service
+from heliograph.serving.storage import leases
+from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.leases import Leases
 from heliograph_studies.live.server import Server
 from tests.serving.worlds import WINDOW, fleet, lines, messages, stepping
 
@@ -39,30 +39,30 @@ def test_processes_share_evenly_and_take_over_what_nobody_renews(tmp_path):
 
 def shared(engine: Engine) -> None:
     """Three processes join, leave and die."""
-    one, two, three = (Leases(engine, name, 5, term=600.0) for name in ("one", "two", "three"))
-    assert one.renew() == {0, 1, 2, 3, 4}
-    assert two.renew() == set() and one.renew() == {0, 1, 2}  # one still works at 3 and 4, until it says that it left
+    item, two, three = (Leases(engine, name, 5, term=600.0) for name in ("one", "two", "three"))
+    assert item.renew() == {0, 1, 2, 3, 4}
+    assert two.renew() == set() and item.renew() == {0, 1, 2}  # one still works at 3 and 4, until it says that it left
     assert two.renew() == set()
-    one.release(3)
-    one.release(4)
-    assert two.renew() == {3, 4} and three.renew() == set() and one.renew() == {0, 1}
-    one.release(2)
-    assert three.renew() == {2} and one.renew() == {0, 1}
+    item.release(3)
+    item.release(4)
+    assert two.renew() == {3, 4} and three.renew() == set() and item.renew() == {0, 1}
+    item.release(2)
+    assert three.renew() == {2} and item.renew() == {0, 1}
     two.leave()
     with engine.begin() as connection:  # one and three died, and it is longer ago than a lease lasts
         for table in (leases.PROCESSES, leases.PARTS):
             connection.execute(update(table).values(until=table.c.until - 601.0))
     two.release(0)  # what is not one's own stays
-    assert two.renew() == {0, 1, 2, 3, 4} and one.renew() == set()
+    assert two.renew() == {0, 1, 2, 3, 4} and item.renew() == set()
     engine.dispose()
 
 
 @pytest.fixture
 def server(tmp_path: Path) -> Iterator[Server]:
-    one = Server(tmp_path)
-    one.start()
-    yield one
-    one.kill()
+    item = Server(tmp_path)
+    item.start()
+    yield item
+    item.kill()
 
 
 class Process:
@@ -96,28 +96,28 @@ class Process:
 
 @pytest.mark.real("NATS")
 def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Server, tmp_path: Path):
-    found = messages(plants=12, count=60, seed=3, whole=True)
-    expected = finals(output.body for output in Service(fleet(stepping()), Nowhere()).take(lines(found)))
-    count = sum(len(told) for told in expected.values())
+    result = messages(plants=12, count=60, seed=3, whole=True)
+    expected = finals(output.body for output in Service(fleet(stepping()), InMemoryStore()).take(lines(result)))
+    count = sum(len(item) for item in expected.values())
     processes = [Process(tmp_path, name, server) for name in ("one", "two", "three")]
 
     async def work() -> dict[str, list[str]]:
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
         stream = client.jetstream(timeout=60)
         await until(lambda: owners(tmp_path) == {"one": 2, "two": 2, "three": 2})
-        for message in found[: len(found) // 2]:
+        for message in result[: len(result) // 2]:
             await stream.publish(f"fleet.in.{word(str(message['plant']))}", json.dumps(message).encode())
-        await until_told(client, count // 4)
+        await until_stopped(client, count // 4)
         processes[0].process.kill()
-        for message in found[len(found) // 2 :]:
+        for message in result[len(result) // 2 :]:
             await stream.publish(f"fleet.in.{word(str(message['plant']))}", json.dumps(message).encode())
-        await until_told(client, count)
-        told = finals(await everything(client))
+        await until_stopped(client, count)
+        known = finals(await everything(client))
         await client.close()
-        return told
+        return known
 
     try:
-        told = asyncio.run(work())
+        record = asyncio.run(work())
         owned = owners(tmp_path)
         for process in processes[1:]:
             process.process.send_signal(signal.SIGTERM)
@@ -127,20 +127,20 @@ def test_three_processes_of_which_one_is_killed_tell_what_one_would(server: Serv
             process.process.kill()
             process.process.wait()
             process.log.close()
-    assert told == expected  # the same text, digit by digit
+    assert record == expected  # the same text, digit by digit
     assert owned == {"two": 3, "three": 3} and owners(tmp_path) == {}
 
 
 def finals(bodies) -> dict[str, list[str]]:
     """Final estimates of each plant in the order of time, without their numbers; told again they count once."""
-    told: dict[str, dict[float, str]] = {}
+    known: dict[str, dict[float, str]] = {}
     for body in bodies:
-        one = json.loads(body)
-        if one["kind"] == "final":
-            del one["id"]
-            again = told.setdefault(one["plant"], {}).setdefault(one["time"], json.dumps(one))
-            assert again == json.dumps(one)
-    return {plant: [text for _, text in sorted(of.items())] for plant, of in told.items()}
+        content = json.loads(body)
+        if content["kind"] == "final":
+            del content["id"]
+            again = known.setdefault(content["plant"], {}).setdefault(content["time"], json.dumps(content))
+            assert again == json.dumps(content)
+    return {plant: [text for _, text in sorted(of.items())] for plant, of in known.items()}
 
 
 async def everything(client: nats.NATS) -> list[bytes]:
@@ -151,7 +151,7 @@ async def everything(client: nats.NATS) -> list[bytes]:
     return [(await reader.next_msg(5)).data for _ in range(count)]
 
 
-async def until_told(client: nats.NATS, count: int) -> None:
+async def until_stopped(client: nats.NATS, count: int) -> None:
     for _ in range(1200):
         if (await client.jetstream(timeout=60).stream_info("fleet-out")).state.messages >= count:
             return

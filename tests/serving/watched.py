@@ -42,15 +42,15 @@ class Scripted:
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
         link = self.plants.setdefault(self.plant, OnePlant()).links.setdefault("<b>node", Link())
-        found = []
+        results = []
         for payload in payloads:
             i = int(payload)
             link.used += 1
             nis = self.scale * float(np.random.default_rng(i).chisquare(2))
             covariance = [[0.04 * (1 + 4 / (1 + i)), 0.0], [0.0, 0.01]]
-            told = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
-            told |= {"claim": "nominal", "nis": nis, "heard": 2}
-            body = {"id": i, "plant": self.plant, "time": i / 10, "estimates": {"<b>node": {"cubature": told}}}
-            found.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
-            found.append(Output(None, self.plant, "provisional", to_json(body | {"kind": "provisional"})))
-        return found
+            message = {"mean": [np.sin(i / 20), np.cos(i / 20)], "covariance": covariance}
+            message |= {"claim": "nominal", "nis": nis, "heard": 2}
+            body = {"id": i, "plant": self.plant, "time": i / 10, "estimates": {"<b>node": {"cubature": message}}}
+            results.append(Output(i, self.plant, "final", to_json(body | {"kind": "final"})))
+            results.append(Output(None, self.plant, "provisional", to_json(body | {"kind": "provisional"})))
+        return results

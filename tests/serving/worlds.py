@@ -43,22 +43,22 @@ def _lanes(which: int) -> Lanes:
 
 def messages(plants: int, count: int, seed: int, whole: bool, longest: float = 3.0) -> list[dict[str, object]]:
     """Of each plant some from both nodes, a third late by up to `longest`, in the order of their arrival."""
-    generator, found = np.random.default_rng(seed), []
+    generator, results = np.random.default_rng(seed), []
     for plant in range(plants):
         for i in range(count):
             time = float(i // 2) if whole else round(float(i * 0.4 + generator.uniform(0, 0.3)), 3)
             delay = generator.uniform(0, longest) if generator.random() < 1 / 3 else 0.0
-            one: dict[str, object] = {
+            item: dict[str, object] = {
                 "plant": f"p{plant}", "node": "ab"[i % 2], "sequence": i // 2, "time": time,
                 "values": [None if generator.random() < 0.1 else float(generator.normal(1.0, 0.5))],
                 "arrival": time + delay,
             }  # fmt: skip
             if i % 6 == 0:
-                one["inputs"] = [float(generator.normal(0, 0.1))]
-            found.append(one)
-    return sorted(found, key=lambda one: one["arrival"])
+                item["inputs"] = [float(generator.normal(0, 0.1))]
+            results.append(item)
+    return sorted(results, key=lambda item: item["arrival"])
 
 
-def lines(found: list[dict[str, object]]) -> list[bytes]:
+def lines(result: list[dict[str, object]]) -> list[bytes]:
     """Messages as they travel."""
-    return [json.dumps(one).encode() for one in found]
+    return [json.dumps(item).encode() for item in result]

@@ -30,30 +30,30 @@ def lossy(arrival):
     ("arrival", "verdict"), [(0.3, "impossible"), (0.359, "impossible"), (0.361, "certified"), (0.6, "certified")]
 )
 def test_a_scalar_plant_has_one_threshold(arrival, verdict):
-    found = scalar(lossy(arrival))
-    assert found.verdict == verdict
-    assert (found.radius < 1) == (verdict == "certified")
-    assert (found.growth >= 1) == (verdict == "impossible")
+    result = scalar(lossy(arrival))
+    assert result.verdict == verdict
+    assert (result.radius < 1) == (verdict == "certified")
+    assert (result.growth >= 1) == (verdict == "impossible")
 
 
 def test_the_bound_and_the_gain_are_those_of_the_published_example():
-    found = scalar(lossy(0.6))
-    np.testing.assert_allclose(found.bound, 7.32659, rtol=1e-6)
-    np.testing.assert_allclose(found.gains[True,], -0.93199, rtol=1e-5)
-    np.testing.assert_array_equal(found.gains[False,], 0.0)
+    result = scalar(lossy(0.6))
+    np.testing.assert_allclose(result.bound, 7.32659, rtol=1e-6)
+    np.testing.assert_allclose(result.gains[True,], -0.93199, rtol=1e-5)
+    np.testing.assert_array_equal(result.gains[False,], 0.0)
 
 
 def test_the_gains_have_the_radius_that_is_said():
     """Two links that amplify: K acts on what is received, whatever units it has."""
     a, c = np.array([[1.2, 0.3], [0.0, 1.1]]), np.eye(2)
     links = hg.parallel([hg.erasure(hg.hop(5.0, 0.1), 0.9), hg.erasure(hg.hop(0.01, 0.1), 0.7)])
-    found = judged(plant(a), (hg.LinearSensor(c, np.eye(2)), links))
-    assert found.verdict == "certified" and len(found.gains) == 4
+    result = judged(plant(a), (hg.LinearSensor(c, np.eye(2)), links))
+    assert result.verdict == "certified" and len(result.gains) == 4
     total = 0.0
-    for (one, two), gain in found.gains.items():
+    for (item, two), gain in result.gains.items():
         loop = a - gain @ np.diag([5.0, 0.01]) @ c
-        total = total + (0.9 if one else 0.1) * (0.7 if two else 0.3) * np.kron(loop, loop)
-    np.testing.assert_allclose(np.abs(np.linalg.eigvals(total)).max(), found.radius, rtol=1e-9)
+        total = total + (0.9 if item else 0.1) * (0.7 if two else 0.3) * np.kron(loop, loop)
+    np.testing.assert_allclose(np.abs(np.linalg.eigvals(total)).max(), result.radius, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -75,13 +75,13 @@ def test_components_that_are_lost_on_their_own(first, second, verdict, why):
         (hg.LinearSensor([[1.0, 0.0]], 1.0), lossy(first)),
         (hg.LinearSensor([[0.0, 1.0]], 1.0), lossy(second)),
     )
-    one = judged(
+    item = judged(
         plant(np.diag([2.5, 1.5])),
         (hg.LinearSensor(np.eye(2), 1.0 * np.eye(2)), hg.parallel([lossy(first), lossy(second)])),
     )
-    for found in (both, one):
-        assert found.verdict == verdict and why in found.reason
-    np.testing.assert_allclose(both.radius, one.radius, rtol=1e-9)
+    for single in (both, item):
+        assert single.verdict == verdict and why in single.reason
+    np.testing.assert_allclose(both.radius, item.radius, rtol=1e-9)
 
 
 def test_more_sensors_help():
@@ -93,16 +93,16 @@ def test_more_sensors_help():
 
 def test_losses_on_two_hops_are_losses():
     chain = hg.amplify_and_forward([hg.erasure(hg.hop(1.0, 0.1), 0.8), hg.erasure(hg.hop(1.0, 0.1), 0.8)])
-    found = scalar(chain, noise=1.0)
-    np.testing.assert_allclose(found.bound, scalar(hg.erasure(hg.hop(1.0, 0.2), 0.64), noise=1.0).bound, rtol=1e-9)
+    result = scalar(chain, noise=1.0)
+    np.testing.assert_allclose(result.bound, scalar(hg.erasure(hg.hop(1.0, 0.2), 0.64), noise=1.0).bound, rtol=1e-9)
 
 
 @pytest.mark.parametrize("channel", [hg.hop(hg.Rayleigh(1.0), 0.1), hg.dropout(hg.perfect(), 0.99)])
 @pytest.mark.parametrize("a", [-1.25, 1.0])
 def test_random_gains_that_are_not_told_bound_no_unstable_mode(channel, a):
-    found = scalar(channel, a=[[a]])
-    assert found.verdict == "impossible"
-    assert "only through random gains that are not told" in found.reason
+    result = scalar(channel, a=[[a]])
+    assert result.verdict == "impossible"
+    assert "only through random gains that are not told" in result.reason
 
 
 def test_the_exact_filter_diverges_where_that_is_said():
@@ -117,9 +117,9 @@ def test_the_exact_filter_diverges_where_that_is_said():
 
 
 def test_a_stable_plant_is_bounded_by_its_own_covariance():
-    found = scalar(hg.hop(hg.Rayleigh(1.0), 0.1), a=[[0.9]])
-    assert found.verdict == "certified" and "the plant is stable" in found.reason
-    np.testing.assert_allclose(found.bound, 1 / (1 - 0.81))
+    result = scalar(hg.hop(hg.Rayleigh(1.0), 0.1), a=[[0.9]])
+    assert result.verdict == "certified" and "the plant is stable" in result.reason
+    np.testing.assert_allclose(result.bound, 1 / (1 - 0.81))
 
 
 def test_rows_of_certain_gain_are_enough():
@@ -137,22 +137,22 @@ def test_a_sum_of_random_rows_may_be_certain():
         [hg.random_affine.known([[v], [2 - v]]) for v in np.asarray(law.values)], law.probabilities
     )
     channel = hg.amplify_and_forward([rows, hg.hop(1.0, 0.1, dimension=2)])
-    found = scalar(channel)
-    assert found.verdict == "certified"
-    np.testing.assert_allclose(found.bound, scalar(hg.hop(2.0, 0.2)).bound, rtol=1e-9)
+    result = scalar(channel)
+    assert result.verdict == "certified"
+    np.testing.assert_allclose(result.bound, scalar(hg.hop(2.0, 0.2)).bound, rtol=1e-9)
 
 
 def test_a_gain_that_is_random_on_what_decays_only():
     """z = x1 + g x2 + n with x2 stable: certain where it matters, without a number for the bound."""
     channel = hg.random_affine.Mixture([hg.random_affine.known([[1.0, g]]) for g in (0.0, 1.0)], [0.5, 0.5])
     noisy = hg.amplify_and_forward([channel, hg.hop(1.0, 0.1)])
-    found = judged(plant(np.diag([1.2, 0.9])), (hg.LinearSensor(np.eye(2), np.eye(2)), noisy))
-    assert found.verdict == "certified" and found.bound is None
+    result = judged(plant(np.diag([1.2, 0.9])), (hg.LinearSensor(np.eye(2), np.eye(2)), noisy))
+    assert result.verdict == "certified" and result.bound is None
 
 
 def test_what_is_not_seen_is_said_to_be_not_seen():
-    found = judged(plant([[1.2]]), (hg.LinearSensor([[0.0]], 1.0), hg.perfect()))
-    assert found.verdict == "impossible" and "is not seen at all" in found.reason
+    result = judged(plant([[1.2]]), (hg.LinearSensor([[0.0]], 1.0), hg.perfect()))
+    assert result.verdict == "impossible" and "is not seen at all" in result.reason
 
 
 def test_a_rotation_is_undecided_between():
@@ -165,8 +165,8 @@ def test_a_rotation_is_undecided_between():
 
 def test_what_nothing_disturbs_may_stay_at_rest():
     still = hg.LinearPlant([[1.2]], 0.0, [1.0], 0.0)
-    found = judged(still, (hg.LinearSensor([[1.0]], 1.0), lossy(0.1)))
-    assert found.verdict == "undecided" and "may stay zero" in found.reason
+    result = judged(still, (hg.LinearSensor([[1.0]], 1.0), lossy(0.1)))
+    assert result.verdict == "undecided" and "may stay zero" in result.reason
     seen = judged(still, (hg.LinearSensor([[1.0]], 1.0), lossy(0.9)))
     assert seen.verdict == "certified"
     np.testing.assert_allclose(seen.gains[True,], 1.2 - 1 / 1.2, atol=0.05)  # that of no losses leaves 1 / a
@@ -194,9 +194,9 @@ def test_bounds_under_bursts(fail, recover, bound):
 def test_links_in_one_shadow_fail_together():
     """Two sensors: on chains of their own both are silent for long with rho 0.5^2, in one shadow with rho 0.5."""
     sensor = hg.LinearSensor([[1.0]], 1.0)
-    own = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))
+    local = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5)), (sensor, bursts(0.2, 0.5)))
     shared = judged(plant([[1.6]]), (sensor, bursts(0.2, 0.5, "hill")), (sensor, bursts(0.2, 0.5, "hill")))
-    assert own.verdict == "certified"
+    assert local.verdict == "certified"
     assert shared.verdict == "impossible"
     np.testing.assert_allclose(shared.growth, 0.5 * 1.6**2)
 
@@ -205,8 +205,8 @@ def test_modes_that_are_hidden_are_random_gains():
     """Gains of 0.2 and 1 that nobody tells; losses told beside them help nothing; a drifting gain is as random."""
     hidden = hg.markov_fading([0.2, 1.0], [[0.95, 0.05], [0.03, 0.97]], noise=0.05)
     for channel in (hidden, hg.erasure(hidden, 0.9), hg.autoregressive_fading(1.0, 0.3, 0.95, 0.1)):
-        found = scalar(channel)
-        assert found.verdict == "impossible" and "random gains" in found.reason
+        result = scalar(channel)
+        assert result.verdict == "impossible" and "random gains" in result.reason
     steady = hg.autoregressive_fading(1.0, 0.0, 0.95, 0.1)
     np.testing.assert_allclose(scalar(steady).bound, scalar(hg.hop(1.0, 0.1)).bound, rtol=1e-9)
 
@@ -214,9 +214,9 @@ def test_modes_that_are_hidden_are_random_gains():
 def test_a_mode_that_shows_itself_by_its_losses_only_in_probability():
     """Losses with 0.1 or 0.9 by a hidden mode: the receiver knows the losses, and the bound holds for what it knows."""
     soft = hg.gilbert_elliott(hg.erasure(hg.perfect(), 0.9), hg.erasure(hg.perfect(), 0.1), 0.1, 0.5)
-    found = scalar(soft)
-    assert found.verdict == "certified" and len(found.gains) == 2
-    assert mean_error_of_hidden_modes(0.1, 0.5, (0.9, 0.1)) < found.bound
+    result = scalar(soft)
+    assert result.verdict == "certified" and len(result.gains) == 2
+    assert mean_error_of_hidden_modes(0.1, 0.5, (0.9, 0.1)) < result.bound
     clear = hg.gilbert_elliott(hg.erasure(hg.perfect(), 1.0), hg.erasure(hg.perfect(), 0.0), 0.1, 0.5)
     np.testing.assert_allclose(scalar(clear).bound, scalar(bursts(0.1, 0.5)).bound, rtol=1e-12)
 

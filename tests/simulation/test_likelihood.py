@@ -55,8 +55,8 @@ def test_nodes_one_after_another_are_the_nodes_together():
     rows = [hg.LinearSensor(C[[i]], R[i, i]) for i in range(2)]
     apart = hg.filters.sequential_filter([hg.kalman_filter(PLANT, row) for row in rows])
     together = hg.kalman_filter(PLANT, SENSOR)
-    found, expected = (hg.log_likelihood(item, data(True), INPUTS) for item in (apart, together))
-    assert found == pytest.approx(expected, rel=1e-12)
+    result, expected = (hg.log_likelihood(item, data(True), INPUTS) for item in (apart, together))
+    assert result == pytest.approx(expected, rel=1e-12)
 
 
 def test_a_mixtures_likelihood_is_that_of_its_sum():
@@ -64,8 +64,8 @@ def test_a_mixtures_likelihood_is_that_of_its_sum():
     channel = hg.hop(hg.Discrete([0.5, 1.0], [0.3, 0.7]), 0.2)
     z, variance = 1.3, 4 * 0.8 + 0.1
     parts = [p * stats.norm.pdf(z, g * 0.8, np.sqrt(g**2 * variance + 0.2)) for p, g in ((0.3, 0.5), (0.7, 1.0))]
-    found = hg.log_likelihood(hg.mixture_filter(plant, sensor, channel), [z])
-    assert found == pytest.approx(np.log(sum(parts)), rel=1e-12)
+    likelihood = hg.log_likelihood(hg.mixture_filter(plant, sensor, channel), [z])
+    assert likelihood == pytest.approx(np.log(sum(parts)), rel=1e-12)
 
 
 BEHIND = hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.channel import hop
 from heliograph.model.plant import LinearPlant
 from heliograph.model.relays import RelayNetwork
@@ -11,13 +11,13 @@ from heliograph.model.sensor import LinearSensor
 from heliograph.relays.design import relay_schedules
 from heliograph.relays.own_error import own_error_design
 from heliograph.relays.receiver import receiver_behind_relays
-from heliograph.simulation.lanes import BLOCK, LANES
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
+from heliograph.simulation.results.statistics import BATCHES
+from heliograph.simulation.results.sums import Statistics, error_statistics
+from heliograph.simulation.runs.lanes import BLOCK, LANES
 from heliograph.simulation.simulate import monte_carlo
-from heliograph.simulation.statistics import BATCHES
-from heliograph.simulation.sums import Statistics, error_statistics
 from tests.relays.relay_problems import example, unusual
 
 pytestmark = pytest.mark.slow
@@ -93,30 +93,30 @@ def test_runs_do_not_depend_on_chunks_or_on_other_receivers(designed, recorded):
     assert np.array_equal(recorded.truth[:70, :4], other.truth)
     for name in net.filters:
         np.testing.assert_array_equal(recorded.measurements[name][:70, :4], other.measurements[name])
-    heard = recorded.measurements
-    assert np.all(np.isnan(heard["relay_1"][:, 0])) and not np.any(np.isnan(heard["receiver"]))
+    received = recorded.measurements
+    assert np.all(np.isnan(received["relay_1"][:, 0])) and not np.any(np.isnan(received["receiver"]))
 
 
 def test_what_holds_for_every_network_holds_for_relays(designed, recorded):
     """A first run, chunks of statistics, and a record's statistics."""
     network = relays(example(), designed)
     whole, part = monte_carlo(network, 20, 96, 1), monte_carlo(network, 20, 32, 1, first_run=64)
-    for found, runs in ((whole, slice(96)), (part, slice(64, 96))):
+    for item, runs in ((whole, slice(96)), (part, slice(64, 96))):
         np.testing.assert_array_equal(
-            recorded.estimates["receiver"]["best"].mean[runs], found.estimates["receiver"]["best"].mean
+            recorded.estimates["receiver"]["best"].mean[runs], item.estimates["receiver"]["best"].mean
         )
     assert recorded.failures() == []
-    told = []
+    outputs = []
     sums = [
-        monte_carlo(network, 20, 96, 1, Statistics(), chunk=c, progress=lambda *n: told.append(n)) for c in (32, 96)
+        monte_carlo(network, 20, 96, 1, Statistics(), chunk=c, progress=lambda *n: outputs.append(n)) for c in (32, 96)
     ]
-    assert told == [(32, 96), (64, 96), (96, 96), (96, 96)]
-    one, other = (s["relay_2"]["own"] for s in sums)
-    np.testing.assert_array_equal(one.outer, other.outer)
-    kept = error_statistics(whole, "relay_2", "own")
-    np.testing.assert_allclose(kept.outer, one.outer, rtol=1e-12)
-    np.testing.assert_allclose(kept.covariance, one.covariance, rtol=1e-12)
-    np.testing.assert_allclose(kept.nees, one.nees, rtol=1e-9)
+    assert outputs == [(32, 96), (64, 96), (96, 96), (96, 96)]
+    single, other = (s["relay_2"]["own"] for s in sums)
+    np.testing.assert_array_equal(single.outer, other.outer)
+    stored = error_statistics(whole, "relay_2", "own")
+    np.testing.assert_allclose(stored.outer, single.outer, rtol=1e-12)
+    np.testing.assert_allclose(stored.covariance, single.covariance, rtol=1e-12)
+    np.testing.assert_allclose(stored.nees, single.nees, rtol=1e-9)
 
 
 def quiet():
@@ -150,15 +150,15 @@ def test_single_precision_tells_the_same_story_behind_relays(silences):
 
 def test_a_planned_silence_is_no_gap_and_a_loss_is_one(silences):
     network, record = silences
-    heard = record.measurements["receiver"]
-    assert np.all(np.isnan(heard[:, ::2])) and np.all(np.isfinite(heard[:, 1::2]))
+    received = record.measurements["receiver"]
+    assert np.all(np.isnan(received[:, ::2])) and np.all(np.isfinite(received[:, 1::2]))
     assert record.failures() == []
     for name in ("own", "best"):
         claimed = record.estimates["receiver"][name].covariance
         assert np.all(np.isfinite(claimed)) and np.array_equal(claimed[0], claimed[-1])
     largest, limit = worst(record, "receiver", "own")
     assert largest < limit
-    lost = heard[3].copy()
+    lost = received[3].copy()
     lost[5] = np.nan
     bound = run(network, {"receiver": lost}).estimates["receiver"]["own"].covariance
     assert np.all(np.isfinite(bound[:5])) and np.all(np.isnan(bound[5:]))
@@ -169,8 +169,8 @@ def test_a_recording_needs_what_the_receiver_heard_alone(silences):
     z = {name: values[0] for name, values in record.measurements.items()}
     alone, whole = run(network, {"receiver": z["receiver"]}), run(network, z)
     assert list(alone.estimates) == ["receiver"] and list(whole.estimates) == ["a", "receiver"]
-    for node, found in (("receiver", alone), ("receiver", whole), ("a", whole)):
-        for name, estimate in found.estimates[node].items():
+    for node, item in (("receiver", alone), ("receiver", whole), ("a", whole)):
+        for name, estimate in item.estimates[node].items():
             np.testing.assert_allclose(estimate.mean, record.estimates[node][name].mean[0], rtol=1e-12)
             np.testing.assert_allclose(estimate.covariance, record.estimates[node][name].covariance[0], rtol=1e-12)
     with pytest.raises(ValueError, match=r"arrays for the nodes \['a', 'receiver'\], got a mismatch in \['receiver'\]"):

@@ -41,7 +41,7 @@ def runs() -> hg.Record:
 
 
 @pytest.fixture(scope="module")
-def found() -> StatisticsByName:
+def result() -> StatisticsByName:
     return hg.monte_carlo(NETWORK, STEPS, RUNS, key=0, keep=hg.Statistics()).with_units(UNITS)
 
 
@@ -83,7 +83,7 @@ def records(draw) -> hg.Record:
     )
 
 
-def identical(one: hg.Record, other: hg.Record) -> bool:
+def identical(item: hg.Record, other: hg.Record) -> bool:
     """Equal, and every number of the same bits, the sign of a zero too."""
 
     def bits(record: hg.Record) -> list[bytes]:
@@ -92,7 +92,7 @@ def identical(one: hg.Record, other: hg.Record) -> bool:
         numbers = [a for a in arrays if a is not None and a.dtype.kind == "f"]
         return [np.where(np.isnan(a), np.nan, a).tobytes() for a in numbers]
 
-    return one == other and bits(one) == bits(other)
+    return item == other and bits(item) == bits(other)
 
 
 @settings(max_examples=25, derandomize=True)
@@ -128,55 +128,55 @@ def test_names_in_files_can_be_read_and_undone(name):
 def test_statistics_come_back(names, numbers, failed, uplink, tmp_path):
     values = np.resize(numbers, (50, 3, 3))
 
-    def one(claim: str, sent: Uplink | None = None) -> ErrorStatistics:
+    def single(claim: str, sent: Uplink | None = None) -> ErrorStatistics:
         by_step = np.arange(3.0) if failed else None
         return ErrorStatistics(np.full(50, 2.0), values, values[::-1], values[..., 0], claim, sent, by_step, 2 * failed)
 
     sent = Uplink((names[0],), values[0][:, None, :2], values[0][:, None, :2]) if uplink else None
-    by_name = {names[0]: {n: one("upper") for n in names}, "fused": {names[1]: one("none", sent)}}
-    found = StatisticsByName(by_name, ("a", names[0] + "b"))
+    by_name = {names[0]: {n: single("upper") for n in names}, "fused": {names[1]: single("none", sent)}}
+    result = StatisticsByName(by_name, ("a", names[0] + "b"))
     with np.errstate(all="ignore"):
-        assert StatisticsByName.from_xarray(found.to_xarray()) == found
-        found.save(tmp_path / "found.nc")
-    assert StatisticsByName.open(tmp_path / "found.nc") == found and pickle.loads(pickle.dumps(found)) == found
+        assert StatisticsByName.from_xarray(result.to_xarray()) == result
+        result.save(tmp_path / "found.nc")
+    assert StatisticsByName.open(tmp_path / "found.nc") == result and pickle.loads(pickle.dumps(result)) == result
 
 
-def test_labels_select_what_they_say(runs, found):
+def test_labels_select_what_they_say(runs, result):
     data = runs.to_xarray()
-    one = data["mean"].sel(node="cart", filter="aware", state="velocity")
-    np.testing.assert_array_equal(one, runs.estimates["cart"]["aware"].mean[..., 1])
+    item = data["mean"].sel(node="cart", filter="aware", state="velocity")
+    np.testing.assert_array_equal(item, runs.estimates["cart"]["aware"].mean[..., 1])
     assert data.attrs["claims"] == "cart/aware: nominal, cart/trusting: nominal"
     assert data.attrs["states"] == "position, velocity" and list(data["unit"].values) == ["m", "m/s"]
     part = hg.Record.from_xarray(data.isel(run=slice(3, 5)).sel(filter=["aware"]))
     np.testing.assert_array_equal(part.truth, runs.truth[3:5])
     assert list(part.estimates["cart"]) == ["aware"]
     frame = runs.to_pandas()
-    np.testing.assert_array_equal(frame["cart", "aware", "mean", "velocity", ""], one.to_numpy().reshape(-1))
+    np.testing.assert_array_equal(frame["cart", "aware", "mean", "velocity", ""], item.to_numpy().reshape(-1))
     np.testing.assert_array_equal(frame.loc[7]["", "", "truth"].to_numpy(), runs.truth[7])
-    of = found.to_xarray()["rmse"].sel(node="cart", filter="trusting")
+    of = result.to_xarray()["rmse"].sel(node="cart", filter="trusting")
     squares = runs.errors("cart", "trusting") ** 2
     np.testing.assert_allclose(of, np.sqrt(squares.mean(axis=0)), rtol=1e-12)  # sums in another order
 
 
-def test_every_state_has_its_own_rmse(runs, found):
+def test_every_state_has_its_own_rmse(runs, result):
     squares = (runs.errors("cart", "aware") ** 2).mean(axis=(0, 1))
     assert runs.rmse("cart", "aware") == dict(zip(runs.states, np.sqrt(squares), strict=True))
-    own, error = found["cart"]["aware"].rmse_by_state()
-    np.testing.assert_allclose(own, np.sqrt(squares), rtol=1e-12)  # sums in another order
-    total, total_error = found["cart"]["aware"].rmse()
-    assert np.isclose(total**2, (own**2).sum(), rtol=1e-12) and (error > 0).all() and total_error < error.sum()
-    table = found.to_pandas().loc["cart", "aware"]
-    assert table["rmse of velocity"] == own[1] and table["rmse error of velocity"] == error[1]
+    local, error = result["cart"]["aware"].rmse_by_state()
+    np.testing.assert_allclose(local, np.sqrt(squares), rtol=1e-12)  # sums in another order
+    total, total_error = result["cart"]["aware"].rmse()
+    assert np.isclose(total**2, (local**2).sum(), rtol=1e-12) and (error > 0).all() and total_error < error.sum()
+    table = result.to_pandas().loc["cart", "aware"]
+    assert table["rmse of velocity"] == local[1] and table["rmse error of velocity"] == error[1]
     assert table["claim"] == "nominal" and table["nees low"] < table["nees"] < table["nees high"]
     claimed = np.diagonal(runs.estimates["cart"]["aware"].covariance, axis1=-2, axis2=-1).mean(axis=(0, 1))
     assert np.isclose(table["claimed of position"] ** 2, claimed[0], rtol=1e-12)
 
 
-def test_bad_places_and_files(runs, found, tmp_path):
+def test_bad_places_and_files(runs, result, tmp_path):
     def refused(call, *words):
-        with pytest.raises(ValueError) as told:
+        with pytest.raises(ValueError) as raised:
             call()
-        assert all(word in str(told.value) for word in words) and "\n" not in str(told.value), told.value
+        assert all(word in str(raised.value) for word in words) and "\n" not in str(raised.value), raised.value
 
     refused(lambda: runs.save(tmp_path / "runs.h5"), "ends in .nc or .zarr", "'.h5'")
     refused(lambda: runs.save(tmp_path / "no" / "runs.nc"), "an existing folder")
@@ -186,16 +186,16 @@ def test_bad_places_and_files(runs, found, tmp_path):
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "a file of results", "nothing of that name")
     (tmp_path / "no.nc").write_text("no")
     refused(lambda: hg.Record.open(tmp_path / "no.nc"), "can be read")
-    found.save(tmp_path / "found.nc")
+    result.save(tmp_path / "found.nc")
     refused(lambda: hg.Record.open(tmp_path / "found.nc"), "title is 'heliograph record'", "heliograph statistics")
     refused(lambda: hg.Record.from_xarray(runs.to_xarray().sel(node="cart")), "the dimension 'node'")
-    refused(lambda: hg.Record.from_pandas(found.to_pandas()), "Record.to_pandas")
+    refused(lambda: hg.Record.from_pandas(result.to_pandas()), "Record.to_pandas")
     refused(lambda: runs.with_units({"speed": "m/s"}), "names of states ['position', 'velocity']", "'speed'")
     refused(lambda: runs.errors("cart", "awar"), "one of cart/aware, cart/trusting", "cart/awar")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["found.nc", "mine.zarr", "no.nc"]
 
 
-def test_plots_draw_on_what_they_are_given(runs, found, tmp_path):
+def test_plots_draw_on_what_they_are_given(runs, result, tmp_path):
     figure = plt.Figure()
     both = figure.subplots(2, 1)
     assert runs.plot(axes=both, run=3) == list(both)
@@ -205,8 +205,8 @@ def test_plots_draw_on_what_they_are_given(runs, found, tmp_path):
     band = both[1].collections[0].get_paths()[0].vertices[:, 1]
     deviation = np.sqrt(runs.estimates["cart"]["aware"].covariance[3, :, 1, 1])
     assert np.isclose(band.max(), (lines["aware"] + 2 * deviation).max()) and both[1].get_ylabel() == "velocity (m/s)"
-    (one,) = found.plot(states="position", filters=["aware"], axes=figure.add_subplot())
-    np.testing.assert_allclose(one.lines[0].get_ydata(), found["cart"]["aware"].rmse_by_state()[0][0], rtol=0.5)
+    (item,) = result.plot(states="position", filters=["aware"], axes=figure.add_subplot())
+    np.testing.assert_allclose(item.lines[0].get_ydata(), result["cart"]["aware"].rmse_by_state()[0][0], rtol=0.5)
     recording = hg.run(NETWORK, {"cart": runs.measurements["cart"][0]})
     new = recording.plot(states=["velocity"])
     new[0].figure.savefig(tmp_path / "plot.png")

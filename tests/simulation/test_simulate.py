@@ -141,8 +141,8 @@ def test_a_recording_is_run_step_by_step_and_through_the_same_links(record):
 
 @pytest.mark.slow
 def test_the_true_channel_makes_the_data_and_the_filter_believes_another(statistics):
-    (hearing, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
-    assert hearing < deaf - 4 * np.hypot(error, other)
+    (observation, error), (deaf, other) = statistics["b"]["linear"].rmse(), statistics["silence"]["deaf"].rmse()
+    assert observation < deaf - 4 * np.hypot(error, other)
 
 
 def test_a_lost_covariance_is_reported_with_its_step():
@@ -218,20 +218,20 @@ def test_statistics_count_what_the_record_shows_whatever_the_chunks(record):
     for name in record.uplinks:
         a, b = (s["fused"][name].uplink for s in some)
         assert np.array_equal(a.saturated, b.saturated) and np.array_equal(a.symbols, b.symbols)
-    found = some[0]["fused"]
-    assert found["plain"].uplink is None
+    result = some[0]["fused"]
+    assert result["plain"].uplink is None
     for name in record.uplinks:
-        kept, counted = hg.simulation.error_statistics(record, "fused", name).uplink, found[name].uplink
-        assert kept.nodes == counted.nodes
-        np.testing.assert_allclose(counted.saturated, kept.saturated, rtol=1e-14)
-        np.testing.assert_allclose(counted.symbols, kept.symbols, rtol=1e-14)
+        stored, counted = hg.simulation.error_statistics(record, "fused", name).uplink, result[name].uplink
+        assert stored.nodes == counted.nodes
+        np.testing.assert_allclose(counted.saturated, stored.saturated, rtol=1e-14)
+        np.testing.assert_allclose(counted.symbols, stored.symbols, rtol=1e-14)
 
 
 def test_quantizers_over_time_and_the_claim_of_a_static_one(statistics):
     """An upper claim through a static quantizer holds; levels that double at a step halve the errors from there on."""
-    found = statistics["fused"]["over time"]
-    assert found.claim == "upper" and found.uplink.saturated.max() == 0 and found.worst_direction().z < 4
-    trace = np.trace(found.claimed(), axis1=1, axis2=2)
+    result = statistics["fused"]["over time"]
+    assert result.claim == "upper" and result.uplink.saturated.max() == 0 and result.worst_direction().z < 4
+    trace = np.trace(result.claimed(), axis1=1, axis2=2)
     assert trace[3] < 0.6 * trace[2]  # the quantizers' share, (r + s)^2 with s halved, outweighs what filters do
     with pytest.raises(ValueError, match="at most 7 steps"):
         hg.monte_carlo(NETWORK, HORIZON + 1, 2, 3, inputs=INPUTS)

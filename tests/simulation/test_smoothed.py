@@ -29,25 +29,25 @@ def record():
 
 @pytest.mark.slow
 def test_a_network_is_smoothed_as_each_of_its_filters_alone(record):
-    found = record.smoothed
-    assert found.failures() == [] and np.array_equal(found.truth, record.truth)
+    result = record.smoothed
+    assert result.failures() == [] and np.array_equal(result.truth, record.truth)
     for node in GAPS.names:
         for name, item in FILTERS.items():
-            told = found.estimates[node][name]
-            assert told.claim == CLAIMS[name]
+            known = result.estimates[node][name]
+            assert known.claim == CLAIMS[name]
             for run in (0, RUNS - 1):
-                _, steps = hg.smoothing.retained_steps(item, record.measurements[node][run])
+                _, steps = hg.smoothing.smoother_steps(item, record.measurements[node][run])
                 alone = hg.smoothing.FixedLag(LAG).estimates(steps)
-                np.testing.assert_allclose(told.mean[run], alone.mean, rtol=0, atol=1e-14)  # rounding of another order
-                np.testing.assert_allclose(told.covariance[run], alone.covariance, rtol=0, atol=1e-14)
+                np.testing.assert_allclose(known.mean[run], alone.mean, rtol=0, atol=1e-14)  # rounding of another order
+                np.testing.assert_allclose(known.covariance[run], alone.covariance, rtol=0, atol=1e-14)
 
 
 def test_fusion_intersects_smoothed_estimates_of_the_same_time(record):
-    found = record.smoothed.estimates
-    parts = [found[node]["linear"] for node in GAPS.names]
+    result = record.smoothed.estimates
+    parts = [result[node]["linear"] for node in GAPS.names]
     fused = hg.fusion.fuse(hg.CovarianceIntersection(), parts)
-    assert found["fused"]["both"].claim == fused.claim == "upper"
-    np.testing.assert_allclose(found["fused"]["both"].mean, fused.mean, rtol=0, atol=1e-12)
+    assert result["fused"]["both"].claim == fused.claim == "upper"
+    np.testing.assert_allclose(result["fused"]["both"].mean, fused.mean, rtol=0, atol=1e-12)
     assert np.all(np.trace(fused.covariance, axis1=2, axis2=3)[:, :-1] < 0.5)  # of about 1 without measurements
 
 
@@ -69,13 +69,13 @@ def test_statistics_of_the_record_and_its_smoothed_part(record):
 def test_in_bounded_memory_with_gains_known_before_data():
     smooth = hg.smoothing.FixedInterval()
     statistics = hg.monte_carlo(WHOLE, HORIZON, 4 * RUNS, 3, keep=hg.Statistics(), smooth=smooth)
-    found = statistics.smoothed["node"]["linear"]
-    _, steps = hg.smoothing.retained_steps(FILTERS["linear"], np.zeros((HORIZON, 1)))
+    result = statistics.smoothed["node"]["linear"]
+    _, steps = hg.smoothing.smoother_steps(FILTERS["linear"], np.zeros((HORIZON, 1)))
     claimed = smooth.estimates(steps).covariance  # no data change it
-    np.testing.assert_allclose(found.claimed(), claimed, rtol=0, atol=1e-13)
-    _, low, high = found.nees_per_dimension(0.9999)
-    assert found.claim == "exact" and low < 1 < high
-    assert found.rmse()[0] < 0.97 * statistics["node"]["linear"].rmse()[0]
+    np.testing.assert_allclose(result.claimed(), claimed, rtol=0, atol=1e-13)
+    _, low, high = result.nees_per_dimension(0.9999)
+    assert result.claim == "exact" and low < 1 < high
+    assert result.rmse()[0] < 0.97 * statistics["node"]["linear"].rmse()[0]
 
 
 def test_a_smoothed_estimate_that_is_no_number_is_a_failure_of_its_record(record):
@@ -92,12 +92,12 @@ def test_a_smoothed_estimate_that_is_no_number_is_a_failure_of_its_record(record
 
 def test_a_recording_is_smoothed_from_a_fixed_point_on():
     z = np.sin(np.arange(HORIZON))
-    found = hg.run(WHOLE, {"node": z}, time=np.arange(HORIZON) / 10, smooth=hg.smoothing.FixedPoint(4)).smoothed
-    assert np.array_equal(found.time, np.arange(4, HORIZON) / 10)
-    assert np.array_equal(found.measurements["node"][:, 0], z[4:])
-    _, steps = hg.smoothing.retained_steps(FILTERS["linear"], z[:, None])
+    result = hg.run(WHOLE, {"node": z}, time=np.arange(HORIZON) / 10, smooth=hg.smoothing.FixedPoint(4)).smoothed
+    assert np.array_equal(result.time, np.arange(4, HORIZON) / 10)
+    assert np.array_equal(result.measurements["node"][:, 0], z[4:])
+    _, steps = hg.smoothing.smoother_steps(FILTERS["linear"], z[:, None])
     alone = hg.smoothing.FixedPoint(4).estimates(steps)
-    np.testing.assert_allclose(found.estimates["node"]["linear"].mean, alone.mean, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(result.estimates["node"]["linear"].mean, alone.mean, rtol=0, atol=1e-13)
 
 
 def test_what_cannot_be_smoothed_is_refused_in_one_line():

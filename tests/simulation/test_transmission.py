@@ -24,9 +24,9 @@ def test_moments_are_the_channels():
 
 
 def test_the_seed_is_the_draw_and_tables_are_signals():
-    one = hg.transmit(SIGNAL[:50], LINK, seed=1)
-    np.testing.assert_array_equal(one, hg.transmit(pd.DataFrame(SIGNAL[:50]), LINK, seed=1))
-    assert np.any(one != hg.transmit(SIGNAL[:50], LINK, seed=2))
+    item = hg.transmit(SIGNAL[:50], LINK, seed=1)
+    np.testing.assert_array_equal(item, hg.transmit(pd.DataFrame(SIGNAL[:50]), LINK, seed=1))
+    assert np.any(item != hg.transmit(SIGNAL[:50], LINK, seed=2))
     np.testing.assert_array_equal(hg.transmit(SIGNAL[:50, 0], HOP, 1), hg.transmit(SIGNAL[:50, :1], HOP, 1))
 
 

@@ -28,12 +28,12 @@ def test_behind_a_link_that_remembers_it_is_the_best_linear_estimate():
     plant, sensor = hg.LinearPlant(a, q, mean, p0), hg.LinearSensor([[1.0, 0.5]], 0.1)
     gains, chain, start = np.array([0.2, 1.1]), np.array([[0.8, 0.2], [0.3, 0.7]]), np.array([0.4, 0.6])
     link = hg.markov_fading(gains, hg.random_affine.MarkovChain(chain, start), 0.2)
-    time, one, empty = 5, np.eye(1), np.zeros(1)
+    time, item, empty = 5, np.eye(1), np.zeros(1)
 
     def given(modes):
         steps = [
-            Step(a, np.zeros(2), q, np.array([[1.0, 0.5]]), empty, 0.1 * one, gains[[m], None, None] * one, np.ones(1),
-                 empty, 0.2 * one) for m in modes
+            Step(a, np.zeros(2), q, np.array([[1.0, 0.5]]), empty, 0.1 * item, gains[[m], None, None] * item, np.ones(1),
+                 empty, 0.2 * item) for m in modes
         ]  # fmt: skip
         return stacked(mean, p0, steps)
 
@@ -41,11 +41,11 @@ def test_behind_a_link_that_remembers_it_is_the_best_linear_estimate():
     chances = [start[p[0]] * np.prod([chain[i, j] for i, j in pairwise(p)]) for p in paths]
     z = np.array([[0.4], [-0.2], [np.nan], [0.7], [0.1]])
     known = estimate(mixed([given(path) for path in paths], np.array(chances)), z, time)
-    _, steps = hg.smoothing.retained_steps(hg.linear_filter(plant, sensor, link), z)
-    found = INTERVAL.estimates(steps)
-    assert found.claim == "exact"
-    np.testing.assert_allclose(found.mean, known[0], rtol=0, atol=CLOSE)
-    np.testing.assert_allclose(found.covariance, known[1], rtol=0, atol=CLOSE)
+    _, steps = hg.smoothing.smoother_steps(hg.linear_filter(plant, sensor, link), z)
+    smoothed = INTERVAL.estimates(steps)
+    assert smoothed.claim == "exact"
+    np.testing.assert_allclose(smoothed.mean, known[0], rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(smoothed.covariance, known[1], rtol=0, atol=CLOSE)
 
 
 def test_a_quadratic_smoother_is_the_best_in_z_and_its_squares():
@@ -58,13 +58,13 @@ def test_a_quadratic_smoother_is_the_best_in_z_and_its_squares():
     for start, *draws in product(
         [(0.2, 2 / 3), (1.1, 1 / 3)], *[two, two, list(zip(gains, chances, strict=True))] * time
     ):
-        x, states, heard, weight = start[0], [], [], start[1]
+        x, states, received, weight = start[0], [], [], start[1]
         for w, v, g in zip(draws[::3], draws[1::3], draws[2::3], strict=True):
             x = 0.8 * x + w[0]
             states.append(x)
-            heard.append(g[0] * (x + v[0]))
+            received.append(g[0] * (x + v[0]))
             weight *= w[1] * v[1] * g[1]
-        rows.append([*states, *heard, *np.square(heard)])
+        rows.append([*states, *received, *np.square(received)])
         weights.append(weight)
     table, weights = np.array(rows), np.array(weights)
     center = weights @ table
@@ -72,13 +72,13 @@ def test_a_quadratic_smoother_is_the_best_in_z_and_its_squares():
     gain = np.linalg.solve(joint[3:, 3:], joint[3:, :3]).T
     z = np.array([0.3, 0.9, -0.2])
     item = hg.polynomial_filter(plant, sensor, link, time, degree=2)
-    _, steps = hg.smoothing.retained_steps(item, z[:, None])
-    found = INTERVAL.estimates(steps)
-    assert found.claim == "exact"
+    _, steps = hg.smoothing.smoother_steps(item, z[:, None])
+    smoothed = INTERVAL.estimates(steps)
+    assert smoothed.claim == "exact"
     expected = center[:3] + gain @ (np.concatenate([z, z**2]) - center[3:])
-    np.testing.assert_allclose(found.mean[:, 0], expected, rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(smoothed.mean[:, 0], expected, rtol=0, atol=CLOSE)
     left = np.diag(joint[:3, :3] - gain @ joint[3:, :3])
-    np.testing.assert_allclose(found.covariance[:, 0, 0], left, rtol=0, atol=CLOSE)
+    np.testing.assert_allclose(smoothed.covariance[:, 0, 0], left, rtol=0, atol=CLOSE)
 
 
 @pytest.mark.slow
@@ -87,7 +87,7 @@ def test_a_receiver_behind_relays_smooths_the_relays_states_too():
     gains = hg.relays.own_error_design(network, time).gains
     system = hg.relays.receiver_system(network, gains)
     receiver = hg.filters.LinearSystemFilter(system)
-    s, want = system.steps, system.want
+    s, projection = system.steps, system.projection
     n, none = s.drift.shape[1], np.zeros(1)
     steps = [
         Step(s.transition[k], s.drift[k], s.process[k], np.eye(n), np.zeros(n), np.zeros((n, n)), s.output[[k]],
@@ -96,16 +96,18 @@ def test_a_receiver_behind_relays_smooths_the_relays_states_too():
     whole = stacked(system.mean, system.covariance, steps)
     z = (whole.z + np.sqrt(np.diag(whole.zz)) * np.array([0.2, np.nan, -0.1, 0.3, 0.2, 0.1]))[:, None]
     mean, covariance = estimate(whole, z, time)
-    _, retained = hg.smoothing.retained_steps(receiver, z)
-    found = INTERVAL.estimates(retained)
+    _, steps_ = hg.smoothing.smoother_steps(receiver, z)
+    smoothed = INTERVAL.estimates(steps_)
     scale = np.sqrt(np.abs(whole.xx).max())
-    np.testing.assert_allclose(found.mean, mean @ want.T, rtol=0, atol=CLOSE * scale)
-    np.testing.assert_allclose(found.covariance, want @ covariance @ want.T, rtol=0, atol=CLOSE * scale**2)
+    np.testing.assert_allclose(smoothed.mean, mean @ projection.T, rtol=0, atol=CLOSE * scale)
+    np.testing.assert_allclose(
+        smoothed.covariance, projection @ covariance @ projection.T, rtol=0, atol=CLOSE * scale**2
+    )
     schedule = hg.filters.ScheduledFilter(hg.relays.receiver_behind_relays(network, gains))
     with pytest.raises(
         ValueError, match=r"smoothing: expected a filter that keeps its covariance .*, got ScheduledFilter"
     ):
-        hg.smoothing.retained_steps(schedule, z)
+        hg.smoothing.smoother_steps(schedule, z)
 
 
 @pytest.mark.slow
@@ -117,12 +119,12 @@ def test_a_bound_holds_under_every_law_where_the_mean_gain_is_known():
     assert planned.estimate.claim == "upper"
     base = hg.simulation.over_runs(planned.means, np.concatenate([np.zeros((1, time, 1)), np.eye(time)[:, :, None]]))
     gain, offset = (base[1:, :, 0] - base[0, :, 0]).T, base[0, :, 0]
-    one = np.eye(1)
+    item = np.eye(1)
     for loud_share in (0.1, 0.3, 0.5):  # the laws within the radius, and in the middle
         noise = (1 - loud_share) * 0.05 + loud_share * 0.8
-        step = Step(0.9 * one, np.zeros(1), 0.2 * one, one, np.zeros(1), 0.1 * one, one[None], np.ones(1), np.zeros(1),
-                    noise * one)  # fmt: skip
-        s = stacked([1.0], 0.5 * one, [step] * time)
+        step = Step(0.9 * item, np.zeros(1), 0.2 * item, item, np.zeros(1), 0.1 * item, item[None], np.ones(1), np.zeros(1),
+                    noise * item)  # fmt: skip
+        s = stacked([1.0], 0.5 * item, [step] * time)
         true = s.xx - gain @ s.xz.T - s.xz @ gain.T + gain @ s.zz @ gain.T
         np.testing.assert_allclose(s.x[:, 0] - offset - gain @ s.z, 0.0, atol=1e-12)  # no bias
         ratio = np.diag(true) / planned.estimate.covariance[:, 0, 0]

@@ -40,7 +40,7 @@ def problem(seed):
 @pytest.mark.parametrize("seed", range(6))
 def test_smoothers_are_the_stacked_linear_estimate(seed):
     item, whole, z = problem(seed)
-    _, steps = hg.smoothing.retained_steps(item, z)
+    _, steps = hg.smoothing.smoother_steps(item, z)
     given = {upto: estimate(whole, z, upto) for upto in range(1, TIME + 1)}
     interval = hg.smoothing.FixedInterval().estimates(steps)
     lagged = hg.smoothing.FixedLag(LAG).estimates(steps)
@@ -48,10 +48,10 @@ def test_smoothers_are_the_stacked_linear_estimate(seed):
     assert {e.claim for e in (interval, lagged, point)} == {"exact"}
     for k in range(TIME):
         compared = [(interval, k, k, TIME), (lagged, k, k, min(k + 1 + LAG, TIME))]
-        for found, at, about, upto in [*compared, (point, k - POINT, POINT, k + 1)][: 2 + (k >= POINT)]:
+        for single, at, about, upto in [*compared, (point, k - POINT, POINT, k + 1)][: 2 + (k >= POINT)]:
             mean, covariance = given[upto]
-            np.testing.assert_allclose(found.mean[at], mean[about], atol=CLOSE, rtol=0)
-            np.testing.assert_allclose(found.covariance[at], covariance[about], atol=CLOSE, rtol=0)
+            np.testing.assert_allclose(single.mean[at], mean[about], atol=CLOSE, rtol=0)
+            np.testing.assert_allclose(single.covariance[at], covariance[about], atol=CLOSE, rtol=0)
 
 
 @pytest.mark.slow
@@ -60,7 +60,7 @@ def test_planned_before_data_it_maps_data_to_the_same_means():
     z = 0.1 * np.nan_to_num(z)  # larger data would not be such as the filter expects, and warn
     for smoothing in (hg.smoothing.FixedInterval(), hg.smoothing.FixedLag(LAG)):
         planned = hg.smoothing.planned_smoother(item, TIME, smoothing)
-        _, steps = hg.smoothing.retained_steps(item, z)
+        _, steps = hg.smoothing.smoother_steps(item, z)
         known = smoothing.estimates(steps)
         means = hg.simulation.over_runs(planned.means, np.stack([z, 2 * z]))
         np.testing.assert_allclose(means[0], known.mean, atol=CLOSE, rtol=0)
@@ -79,9 +79,9 @@ def test_what_a_precise_future_leaves_keeps_its_digits():
     precise, steps = 1e-6, 6
     plant = hg.LinearPlant([[1, 1], [0, 1]], 0.0, [0.0, 0.0], [[1e4, 0.0], [0.0, 1e4]])
     item = hg.kalman_filter(plant, hg.LinearSensor([[1, 0]], [[precise]]))
-    _, retained = hg.smoothing.retained_steps(item, np.zeros((steps, 1)))
-    found = hg.smoothing.FixedInterval().estimates(retained).covariance
+    _, steps_ = hg.smoothing.smoother_steps(item, np.zeros((steps, 1)))
+    result = hg.smoothing.FixedInterval().estimates(steps_).covariance
     velocity = precise * 12 / (steps**3 - steps)
     ends = precise * (4 * steps - 2) / (steps**2 + steps)
-    np.testing.assert_allclose(found[:, 1, 1], velocity, rtol=1e-4)  # of a prior correlated by 1 - 1e-10: 1e-6 remain
-    np.testing.assert_allclose(found[[0, -1], 0, 0], ends, rtol=1e-4)
+    np.testing.assert_allclose(result[:, 1, 1], velocity, rtol=1e-4)  # of a prior correlated by 1 - 1e-10: 1e-6 remain
+    np.testing.assert_allclose(result[[0, -1], 0, 0], ends, rtol=1e-4)

@@ -18,10 +18,10 @@ def test_a_central_filter_without_random_gains_smooths_as_one_that_hears_all_at_
     joint = hg.linear_filter(PLANT, both, hg.parallel(links))
     z = 0.5 * np.sin(np.arange(2.0 * HORIZON)).reshape(HORIZON, 2)
     z[3, 0] = z[5] = np.nan
-    found, known = (INTERVAL.estimates(hg.smoothing.retained_steps(item, z)[1]) for item in (central, joint))
-    assert found.claim == known.claim == "exact"
-    np.testing.assert_allclose(found.mean, known.mean, rtol=0, atol=1e-12)
-    np.testing.assert_allclose(found.covariance, known.covariance, rtol=0, atol=1e-12)
+    result, known = (INTERVAL.estimates(hg.smoothing.smoother_steps(item, z)[1]) for item in (central, joint))
+    assert result.claim == known.claim == "exact"
+    np.testing.assert_allclose(result.mean, known.mean, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(result.covariance, known.covariance, rtol=0, atol=1e-12)
 
 
 @pytest.fixture(scope="module")

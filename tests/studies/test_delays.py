@@ -31,12 +31,12 @@ def test_the_filters_are_those_that_are_shown():
 
 
 def test_the_summary(outcome):
-    found = json.loads(json.dumps(delays.example.summary(delays.Setting(), outcome, {})))
-    assert set(found["delays"]) == set(figures.LATE)
-    assert found["delays"]["untold"]["true_before_data"] == pytest.approx(np.linspace(0.4, 0.2, 60)[30:].mean())
-    assert set(found["clocks"]) == {"moving", "at_rest", "no_true_clock"}
-    assert found["clocks"]["moving"]["guarded"]["offset"] == {"true": 1.0, "claimed": 1.0}
-    assert found["past_states_claim"] == 0.6
+    summary = json.loads(json.dumps(delays.example.summary(delays.Setting(), outcome, {})))
+    assert set(summary["delays"]) == set(figures.LATE)
+    assert summary["delays"]["untold"]["true_before_data"] == pytest.approx(np.linspace(0.4, 0.2, 60)[30:].mean())
+    assert set(summary["clocks"]) == {"moving", "at_rest", "no_true_clock"}
+    assert summary["clocks"]["moving"]["guarded"]["offset"] == {"true": 1.0, "claimed": 1.0}
+    assert summary["past_states_claim"] == 0.6
 
 
 def test_the_page_shows_every_figure_and_filter(outcome, fits):

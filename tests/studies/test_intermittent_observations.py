@@ -29,7 +29,7 @@ def reproduced(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def found(reproduced):
+def result(reproduced):
     return reproduced[0]
 
 
@@ -50,8 +50,8 @@ def test_the_quadrature_has_converged(fail, recover):
 
 def test_the_quadrature_is_the_limit_over_all_patterns():
     """Losses that end soon: after 14 steps 0.3 * 1.5625 has been forgotten to 3e-5 of the excess."""
-    found = over_patterns(setting.SCALAR, 0.7, 14)
-    np.testing.assert_allclose(found[-1], mean_error(setting.SCALAR, 0.3, 0.7), rtol=2e-4)
+    result = over_patterns(setting.SCALAR, 0.7, 14)
+    np.testing.assert_allclose(result[-1], mean_error(setting.SCALAR, 0.3, 0.7), rtol=2e-4)
 
 
 def test_patterns_are_those_of_the_riccati_recursion():
@@ -70,9 +70,9 @@ def test_means_from_runs_need_no_losses_to_be_seen():
     """Filtered covariances that are constant: E P is that of losses in between, whatever was drawn."""
     filtered = np.full((2, 5, 1, 1), 2.0)
     arrived = np.ones((2, 5), dtype=bool)
-    heard = 1.25**2 * 2.0 + 1.0  # h, with weight 1 as if all arrived
+    received = 1.25**2 * 2.0 + 1.0  # h, with weight 1 as if all arrived
     simulated = from_runs(setting.SCALAR, 0.0, 1.0, filtered, arrived)
-    np.testing.assert_allclose(simulated.mean, heard)
+    np.testing.assert_allclose(simulated.mean, received)
     assert simulated.error == 0
 
 
@@ -84,10 +84,10 @@ def test_the_printed_form_loses_its_symmetry_at_the_rate_of_the_determinant():
 
 
 def test_summary_has_the_numbers_of_each_test(numbers):
-    one, two, three, six = (numbers[name] for name in ("T1", "T2", "T3", "T6"))
+    item, two, three, six = (numbers[name] for name in ("T1", "T2", "T3", "T6"))
     digits = {"rtol": 5e-6}
-    np.testing.assert_allclose([one["threshold"], one["bound"], one["gain"]], [0.36, 7.32659, -0.93199], **digits)
-    np.testing.assert_allclose([one["mean_error"], one["constant_gain_threshold"]], [6.8095, 0.4461], atol=5e-5)
+    np.testing.assert_allclose([item["threshold"], item["bound"], item["gain"]], [0.36, 7.32659, -0.93199], **digits)
+    np.testing.assert_allclose([item["mean_error"], item["constant_gain_threshold"]], [6.8095, 0.4461], atol=5e-5)
     np.testing.assert_allclose(
         [two["threshold"], two["necessary"], two["bound"], two["lower"]], [0.471074, 0.36, 703.246, 234.499], **digits
     )
@@ -103,9 +103,9 @@ def test_summary_has_the_numbers_of_each_test(numbers):
     np.testing.assert_allclose(six["bound"], [BOUND[pair] for pair in pairs], atol=5e-5)
 
 
-def test_filters_that_ran_have_the_mean_that_is_known(found):
+def test_filters_that_ran_have_the_mean_that_is_known(result):
     """400 runs of 50 steps: within 4 standard errors."""
-    for link in [found.scalar, *found.bursts]:
+    for link in [result.scalar, *result.bursts]:
         assert abs(link.simulated.mean - link.mean_error) < 4 * link.simulated.error
 
 
@@ -115,25 +115,25 @@ EXPECTED = {  # what the statements say of the truth
 }
 
 
-def test_verdicts(found):
-    verdicts = [s.verdict for s in statements(found)["papers"]]
+def test_verdicts(result):
+    verdicts = [s.verdict for s in statements(result)["papers"]]
     assert {v: verdicts.count(v) for v in set(verdicts)} == EXPECTED
 
 
-def changed(found, **changes):
+def changed(result, **changes):
     """Verdicts that differ where the evidence is changed."""
-    pairs = zip(statements(found)["papers"], statements(replace(found, **changes))["papers"], strict=True)
+    pairs = zip(statements(result)["papers"], statements(replace(result, **changes))["papers"], strict=True)
     return {before.text.split(":")[0][:40] for before, after in pairs if before.verdict != after.verdict}
 
 
-def test_verdicts_follow_the_evidence(found):
+def test_verdicts_follow_the_evidence(result):
     """Each statement changes its verdict where its evidence does."""
-    critical, link = found.critical, found.scalar
-    meeting = {name: each._replace(upper=each.lower) for name, each in critical.items()}
-    apart = {name: each._replace(upper=each.lower + 0.05) for name, each in critical.items()}
-    other = {name: each._replace(lower=0.3, upper=0.3) for name, each in critical.items()}
+    critical, link = result.critical, result.scalar
+    meeting = {name: item._replace(upper=item.lower) for name, item in critical.items()}
+    apart = {name: item._replace(upper=item.lower + 0.05) for name, item in critical.items()}
+    other = {name: item._replace(lower=0.3, upper=0.3) for name, item in critical.items()}
     low = link._replace(mean_error=1.0)
-    told = {name: each._replace(verdict="undecided") for name, each in found.untold.items()}
+    known = {name: item._replace(verdict="undecided") for name, item in result.unpublished.items()}
     cases = [
         ({"critical": meeting}, {"With one output", "The conditions always meet"}),
         (
@@ -141,29 +141,29 @@ def test_verdicts_follow_the_evidence(found):
             {"An unstable plant", "The two conditions meet", "The conditions meet where", "With one output"},
         ),
         ({"critical": other}, {"An unstable plant", "With one output", "The conditions always meet"}),
-        ({"verdicts": {**found.verdicts, "above": "undecided"}}, {"An unstable plant"}),
-        ({"verdicts": {**found.verdicts, "first_below": "certified"}}, {"Components lost"}),
+        ({"verdicts": {**result.verdicts, "above": "undecided"}}, {"An unstable plant"}),
+        ({"verdicts": {**result.verdicts, "first_below": "certified"}}, {"Components lost"}),
         ({"components": (0.8, 0.5556)}, {"Components lost"}),
         ({"scalar": low}, {"S ≤ lim", "A chain whose rows"}),
-        ({"bursts": [low, *found.bursts[1:]]}, {"The bounds by mode"}),
+        ({"bursts": [low, *result.bursts[1:]]}, {"The bounds by mode"}),
         ({"recovery": {0.1: 0.4}}, {"In bursts"}),
-        ({"between": found.below}, {"With distinct moduli"}),
+        ({"between": result.below}, {"With distinct moduli"}),
         ({"turning": 1 - 0.5 ** np.arange(18.0)}, {"The lower condition"}),
-        ({"iterated": found.iterated._replace(subtracted=found.iterated.joseph)}, {"A V A'"}),
+        ({"iterated": result.iterated._replace(subtracted=result.iterated.joseph)}, {"A V A'"}),
         ({"constant": critical["scalar"]}, {"The steady gain"}),
-        ({"untold": told}, {"Losses that the receiver"}),
+        ({"untold": known}, {"Losses that the receiver"}),
         ({"typical": 1e9}, {"Where E P diverges"}),
     ]
     seen = set()
     for changes, expected in cases:
-        different = changed(found, **changes)
+        different = changed(result, **changes)
         assert {any(text.startswith(e) for e in expected) for text in different} == {True}, (changes, different)
         assert all(any(text.startswith(e) for text in different) for e in expected), (expected, different)
         seen |= different
-    assert len(seen) == len(statements(found)["papers"])
+    assert len(seen) == len(statements(result)["papers"])
 
 
-def test_every_file_is_there(folder, found, fits):
+def test_every_file_is_there(folder, result, fits):
     names = {path.name for path in folder.iterdir()}
     figures = ("scalar", "coupled", "bursts", "patterns", "rounding")
     assert names == {"summary.json", "report.html", "curves.npz"} | {

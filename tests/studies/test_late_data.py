@@ -24,8 +24,8 @@ pytestmark = pytest.mark.slow
 
 def row(node, sequence, sent, received, clock="0:00:01.000000"):
     """As the testbed writes it: flag, slots and number with their lowest byte first, flag, hops."""
-    found = [7, *received.to_bytes(5, "little"), *sent.to_bytes(5, "little"), *sequence.to_bytes(2, "little"), 0]
-    return f"{[*found, node, 3, 26, 55, 11, 2, 15, 84, *[0] * 16]}\t{clock}"
+    results = [7, *received.to_bytes(5, "little"), *sent.to_bytes(5, "little"), *sequence.to_bytes(2, "little"), 0]
+    return f"{[*results, node, 3, 26, 55, 11, 2, 15, 84, *[0] * 16]}\t{clock}"
 
 
 def written(path, rows):
@@ -49,7 +49,7 @@ def test_a_log_is_read_as_the_testbed_wrote_it(tmp_path):
     assert odd == 4 and packets.node.tolist() == [2, 3, 2, 2] and packets.sequence.tolist() == [300, 65_535, 301, 300]
     np.testing.assert_allclose(packets.sent, np.array([0, 20, 100, 0]) * SLOT)
     np.testing.assert_allclose(packets.received[1], (2**32 + 5 - 70_000) * SLOT)
-    assert packets.first_heard().tolist() == [True, True, True, False]
+    assert packets.first_received().tolist() == [True, True, True, False]
 
 
 def test_losses_are_gaps_within_a_boot_sorted_by_the_time_of_sending(tmp_path):
@@ -58,11 +58,11 @@ def test_losses_are_gaps_within_a_boot_sorted_by_the_time_of_sending(tmp_path):
     again = [(1, 110), (4, 140)]
     rows = [row(2, n, slot, slot + 35 if n == 2 else slot + 5) for n, slot in first + again] + [row(9, 300, 60, 61)]
     packets, _ = read_trace(written(tmp_path / "log", rows))
-    found = statistics(packets)
-    assert (found.packets, found.nodes, found.boots) == (7, 2, 3)
-    assert found.lost == 3 / 10 and found.run_max == 2 and found.run_mean == 1.5
-    assert found.lost_after_lost == 1 / 3  # of the three lost ones one is followed by another
-    assert found.out_of_order == 2 / 6 and found.out_of_order_own == 1 / 5 and found.copies == 0
+    result = statistics(packets)
+    assert (result.packets, result.nodes, result.boots) == (7, 2, 3)
+    assert result.lost == 3 / 10 and result.run_max == 2 and result.run_mean == 1.5
+    assert result.lost_after_lost == 1 / 3  # of the three lost ones one is followed by another
+    assert result.out_of_order == 2 / 6 and result.out_of_order_own == 1 / 5 and result.copies == 0
     fates = [np.isnan(fate).tolist() for fate in packets.fates()]
     assert fates == [[False, False, True, False, False], [False, True, True, False], [False]]
     assert [len(part) for part in fates_by_node(packets)] == [9, 1]
@@ -101,22 +101,22 @@ def test_another_example_takes_no_trace(tmp_path, capsys):
 
 def test_the_synthetic_network_has_the_published_statistics():
     """Within what 20,000 packets leave to chance, three deviations and more."""
-    found = statistics(synthetic_packets(10_000.0, 1))
-    assert abs(found.lost - 0.099) < 0.01 and abs(found.lost_after_lost - 0.27) < 0.03
-    assert abs(found.copies - 0.15) < 0.01 and abs(found.delay_median - 0.38) < 0.02
-    assert abs(found.delay_95 - 2.2) < 0.2 and found.delay_max < 85.5 and abs(found.out_of_order - 0.24) < 0.05
+    result = statistics(synthetic_packets(10_000.0, 1))
+    assert abs(result.lost - 0.099) < 0.01 and abs(result.lost_after_lost - 0.27) < 0.03
+    assert abs(result.copies - 0.15) < 0.01 and abs(result.delay_median - 0.38) < 0.02
+    assert abs(result.delay_95 - 2.2) < 0.2 and result.delay_max < 85.5 and abs(result.out_of_order - 0.24) < 0.05
 
 
 def test_rewinding_is_honest_and_taking_data_as_current_is_not():
     """One path of two minutes: 120 moments whose errors are correlated over a few, so NEES within 0.3 of 1."""
     setting = Setting(runs=1, duration=120.0)
-    found = through_moving(synthetic_packets(500.0, 0), setting, Stages("late-data", no_progress))
-    rmse = found.rmse
+    result = through_moving(synthetic_packets(500.0, 0), setting, Stages("late-data", no_progress))
+    rmse = result.rmse
     assert rmse["lag_10s"] <= rmse["lag_2s"] < rmse["rewound"] <= rmse["late_dropped"] < rmse["used_as_current"]
     assert rmse["no_delay"] < rmse["rewound"]
-    for name, nees in found.nees.items():
+    for name, nees in result.nees.items():
         assert (abs(nees - 1) < 0.3) == (name != "used_as_current"), name
-    assert found.counts["used"] > 150 and found.counts["duplicate"] > 0
+    assert result.counts["used"] > 150 and result.counts["duplicate"] > 0
 
 
 @pytest.fixture(scope="module")
@@ -149,8 +149,8 @@ def test_the_mower_through_a_network(mower, tmp_path, fits):
 
 def test_the_whole_drive_is_what_readme_says(mower):
     """To its three digits, which another order of rounding does not reach."""
-    told = "late_dropped", "rewound", "lag_2s"
-    found = through_plaza(mower, synthetic_packets(Setting().network_s, 0), told).through
-    dropped, rewound, later = (f"{found.rmse[name]:.3f} m" for name in told)
+    known = "late_dropped", "rewound", "lag_2s"
+    result = through_plaza(mower, synthetic_packets(Setting().network_s, 0), known).through
+    dropped, rewound, later = (f"{result.rmse[name]:.3f} m" for name in known)
     row = f"| {dropped}: late ones dropped | {rewound}; {later} two seconds later | `heliograph example late-data --out"
     assert row in (Path(__file__).parents[2] / "README.md").read_text()

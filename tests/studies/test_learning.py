@@ -21,8 +21,8 @@ def test_the_laws_have_the_moments_that_are_to_be_learned():
 
 def test_what_is_learned_starts_at_the_truth():
     for row in ROWS:
-        found = hg.learning.describe(lambda row=row: learned(row)).parameters
-        assert {one.name: float(one.start) for one in found.every} == pytest.approx(true_values(row))
+        result = hg.learning.describe(lambda row=row: learned(row)).parameters
+        assert {item.name: float(item.start) for item in result.every} == pytest.approx(true_values(row))
         assert world(row).nodes["node"].received == (1 if row.law == "untold" else 2)
 
 
@@ -39,10 +39,10 @@ def test_a_batch_is_counted_once_and_kept(tmp_path, monkeypatch):
 
     monkeypatch.setattr(compute, "counts", again)
     assert compute.compute(tmp_path, 0, 1, lambda what: None) == first
-    (found,) = first.values()
-    assert found.recordings == 32 and found.left_out < 0.5
-    assert min(found.covered["cosines"].values()) > 75  # 95 less four standard errors of 32
-    assert set(found.covered) == set(METHODS)
+    (result,) = first.values()
+    assert result.recordings == 32 and result.left_out < 0.5
+    assert min(result.covered["cosines"].values()) > 75  # 95 less four standard errors of 32
+    assert set(result.covered) == set(METHODS)
 
 
 @pytest.fixture
@@ -60,11 +60,11 @@ def coverage():
 
 
 def test_the_summary(coverage):
-    found = json.loads(json.dumps(run.summary(coverage)))
-    assert set(found["coverage"]) == {row.name for row in ROWS}
-    assert set(found["coverage"]["rare"]) == {"linear", "conditional"}
-    assert set(found["coverage"]["untold"]["conditional"]["cosines"]) == {"plant_noise", "hop_noise", "arrival"}
-    assert found["recordings"]["rare"]["linear"] == {"recordings": 640, "left_out": 0.01}
+    summary = json.loads(json.dumps(run.summary(coverage)))
+    assert set(summary["coverage"]) == {row.name for row in ROWS}
+    assert set(summary["coverage"]["rare"]) == {"linear", "conditional"}
+    assert set(summary["coverage"]["untold"]["conditional"]["cosines"]) == {"plant_noise", "hop_noise", "arrival"}
+    assert summary["recordings"]["rare"]["linear"] == {"recordings": 640, "left_out": 0.01}
 
 
 def test_the_page_shows_every_row(coverage):
@@ -76,16 +76,16 @@ def test_the_page_shows_every_row(coverage):
 
 
 def drive_numbers():
-    one = {"rmse": 0.3, "calibrated": 0.35, "second_half": 0.31, "second_half_calibrated": 0.34}
-    each = {"seed": [0, 1], "rmse": [0.8, 0.9], "calibrated": [1.2, 1.4]}
-    return {"direct": one, "relayed": each}
+    item = {"rmse": 0.3, "calibrated": 0.35, "second_half": 0.31, "second_half_calibrated": 0.34}
+    items = {"seed": [0, 1], "rmse": [0.8, 0.9], "calibrated": [1.2, 1.4]}
+    return {"direct": item, "relayed": items}
 
 
 def test_the_recorded_drive_stands_in_summary_and_page(coverage, fits):
     pytest.importorskip("jinja2")
-    told = run.results(run.Outcome(coverage, drive_numbers()))
-    assert told.summary["plaza"] == drive_numbers() and "coverage" in told.summary
-    html = told.page({name: b"<svg/>" for name in told.figures}).html()
+    known = run.results(run.Outcome(coverage, drive_numbers()))
+    assert known.summary["plaza"] == drive_numbers() and "coverage" in known.summary
+    html = known.page({name: b"<svg/>" for name in known.figures}).html()
     fits(html)
     for words in ("On a recorded drive", "relayed, mean", "0.85", "1.30", "0.310"):
         assert words in html

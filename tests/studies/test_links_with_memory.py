@@ -17,10 +17,10 @@ TOGETHER = {"shared", "separate_claimed", "separate_true"}
 
 
 def test_one_shadow():
-    found = compute.fading_together(Setting())
-    assert found["shared"] == pytest.approx(0.227110, abs=6e-7)
-    assert found["separate_claimed"] == pytest.approx(0.148447, abs=6e-7)
-    assert found["separate_true"] == pytest.approx(0.238690, abs=6e-7)
+    result = compute.fading_together(Setting())
+    assert result["shared"] == pytest.approx(0.227110, abs=6e-7)
+    assert result["separate_claimed"] == pytest.approx(0.148447, abs=6e-7)
+    assert result["separate_true"] == pytest.approx(0.238690, abs=6e-7)
 
 
 @pytest.mark.parametrize(("lag", "ratio"), [(0.0, 1.0), (0.5, 1.40), (0.9, 2.35)])
@@ -44,12 +44,12 @@ def outcome():
 
 
 def test_the_summary(outcome):
-    found = json.loads(json.dumps(links_with_memory.example.summary(Setting(), outcome, {})))
-    assert set(found["e1"]) == set(found["e2"]) == FILTERS == set(figures.ROWS)
-    assert set(found["e1"]["imm"]) == {"claim", "claimed", "true", "true_se"}
-    assert found["e1"]["exact"]["true_before_data"] == 0.1
-    assert found["runs"] == {"e1": 9, "e2": 9} and set(found["one_shadow"]) == TOGETHER
-    assert found["curve"] == {"lambda": [0.0, 0.5, 0.9], "ratio": [1.0, 1.5, 1.9]}
+    summary = json.loads(json.dumps(links_with_memory.example.summary(Setting(), outcome, {})))
+    assert set(summary["e1"]) == set(summary["e2"]) == FILTERS == set(figures.ROWS)
+    assert set(summary["e1"]["imm"]) == {"claim", "claimed", "true", "true_se"}
+    assert summary["e1"]["exact"]["true_before_data"] == 0.1
+    assert summary["runs"] == {"e1": 9, "e2": 9} and set(summary["one_shadow"]) == TOGETHER
+    assert summary["curve"] == {"lambda": [0.0, 0.5, 0.9], "ratio": [1.0, 1.5, 1.9]}
 
 
 def test_the_page_shows_every_figure_and_filter(outcome, fits):

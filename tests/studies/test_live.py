@@ -12,30 +12,30 @@ pytest.importorskip("sqlalchemy")
 import nats
 from nats.js.errors import NoStreamResponseError
 
-from heliograph.serving.nats import Nats
-from heliograph.serving.url import address
+from heliograph.serving.brokers.nats import Nats
+from heliograph.serving.brokers.url import address
 from heliograph_studies.live.compute import Outcome
-from heliograph_studies.live.killed import TOPIC, _reads, _send, _told, killed, left_alone
+from heliograph_studies.live.killed import TOPIC, _finals_read, _reads, _send, killed, left_alone
 from heliograph_studies.live.mower import read_drive
 from heliograph_studies.live.server import Server
-from heliograph_studies.live.speed import PLANTS, many
+from heliograph_studies.live.speed import PLANTS, many_plants
 
 
 @pytest.mark.real("NATS")
 def test_what_is_told_is_the_same_if_it_is_killed(tmp_path: Path):
     drive = read_drive(0)
-    assert len(drive.lines) + drive.unheard == 3632 and 0 < drive.unheard < 300
+    assert len(drive.lines) + drive.unreceived == 3632 and 0 < drive.unreceived < 300
     lines = drive.lines[:400]
     alone = left_alone(tmp_path, lines)
     server = Server(tmp_path)
     server.start()
     try:
-        found = asyncio.run(killed(tmp_path, server, lines, len(alone), 1, 0, look=lambda url: {}))
+        record = asyncio.run(killed(tmp_path, server, lines, len(alone), 1, 0, look=lambda url: {}))
     finally:
         server.kill()
-    assert found.kills == 1 and len(alone) > 100 and found.finals == alone
-    told = [json.loads(line)["time"] for line in alone]
-    assert told == sorted(told)
+    assert record.kills == 1 and len(alone) > 100 and record.finals == alone
+    outputs = [json.loads(line)["time"] for line in alone]
+    assert outputs == sorted(outputs)
     outcome = Outcome(400, 0, 1, 0, alone, alone[1:], {"a": (5, 4), "b": (5, 7)}, 0, *[None] * 4, {}, {})  # type: ignore[arg-type]
     assert not outcome.identical and outcome.lost == 1 and outcome.counted_twice == 2
 
@@ -48,7 +48,7 @@ def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
         transport = Nats(address(f"nats://127.0.0.1:{server.nats}/{TOPIC}", {}))
         client = await nats.connect(f"nats://127.0.0.1:{server.nats}")
         await transport._open()
-        assert await _told(client, 0) and not await _reads(client)
+        assert await _finals_read(client, 0) and not await _reads(client)
         with pytest.raises(ExceptionGroup) as error:
             async with asyncio.timeout(5), asyncio.TaskGroup() as group:
                 group.create_task(_send(client, [b"{}"]))
@@ -68,7 +68,7 @@ def test_nothing_is_sent_before_there_is_a_stream_to_send_to(tmp_path: Path):
 
 
 def test_many_mowers_send_what_one_did():
-    lines = many(read_drive(0).lines, 300)
-    found = [json.loads(line) for line in lines]
-    assert len(found) == 300 and len({one["plant"] for one in found}) == PLANTS
-    assert [one["sequence"] for one in found if one["plant"] == "mower 7"] == [0, 1, 2]
+    lines = many_plants(read_drive(0).lines, 300)
+    results = [json.loads(line) for line in lines]
+    assert len(results) == 300 and len({item["plant"] for item in results}) == PLANTS
+    assert [item["sequence"] for item in results if item["plant"] == "mower 7"] == [0, 1, 2]

@@ -83,8 +83,8 @@ def test_steady_state_turns_without_changing_and_balances_power():
     turned = 2j * np.pi * frequency * np.array([current, flux])
     expected = np.array([turned[0].real, turned[0].imag, turned[1].real, turned[1].imag, 0.0, 0.0])
     with jax.enable_x64(True):
-        found = np.asarray(Machine().rates(x, np.array([amplitude, 0.0])))
-    assert found == pytest.approx(expected, rel=1e-9, abs=1e-8)  # rounding of terms up to 1e4 A/s
+        values = np.asarray(Machine().rates(x, np.array([amplitude, 0.0])))
+    assert values == pytest.approx(expected, rel=1e-9, abs=1e-8)  # rounding of terms up to 1e4 A/s
     slip = 2 * np.pi * frequency - POLE_PAIRS * speed
     electrical = 1.5 * amplitude * current.real
     copper = 1.5 * machine.STATOR_RESISTANCE * abs(current) ** 2
@@ -133,13 +133,13 @@ def test_scores_of_made_up_errors():
 
 def test_received_currents_have_the_channel_s_mean_and_nodes_differ():
     truth = np.tile(RUNNING[:5] / RATED[:5], (4000, 1))
-    found = listeners.received(truth, 0)
+    result = listeners.received(truth, 0)
     means = {"relay_1": 0.865 * 0.93, "relay_2": 0.79 * 0.93, "wired": 1.0}
     for node, gain in means.items():
-        error = found[node].std(axis=0) / np.sqrt(4000)
-        assert np.all(np.abs(found[node].mean(axis=0) - gain * RUNNING[:2]) < 4 * error), node
-    assert np.array_equal(found["relay_1"], listeners.received(truth, 0)["relay_1"])
-    assert not np.array_equal(found["relay_1"], listeners.received(truth, 1)["relay_1"])
+        error = result[node].std(axis=0) / np.sqrt(4000)
+        assert np.all(np.abs(result[node].mean(axis=0) - gain * RUNNING[:2]) < 4 * error), node
+    assert np.array_equal(result["relay_1"], listeners.received(truth, 0)["relay_1"])
+    assert not np.array_equal(result["relay_1"], listeners.received(truth, 1)["relay_1"])
 
 
 def test_a_missing_simulator_is_told_before_the_work_starts(tmp_path, monkeypatch):
@@ -158,7 +158,7 @@ def test_refuses_one_seed():
 @pytest.mark.slow
 @needs_simulator
 def test_the_model_is_the_simulator_s_machine():
-    found = drive.simulate_drive(loaded=False)
+    result = drive.simulate_drive(loaded=False)
 
     def fine(x, u):
         def part(_, x):
@@ -167,29 +167,29 @@ def test_the_model_is_the_simulator_s_machine():
         return jax.lax.fori_loop(0, 10, part, x)
 
     with jax.enable_x64(True):
-        ends = np.asarray(jax.jit(jax.vmap(fine))(found.truth[:-1, :5] * RATED[:5], found.voltages[1:])) / RATED[:5]
+        ends = np.asarray(jax.jit(jax.vmap(fine))(result.truth[:-1, :5] * RATED[:5], result.voltages[1:])) / RATED[:5]
     # The simulator's solver is asked for 1e-6 of each value; values are up to 1.3 per unit.
-    assert np.max(np.abs(ends - found.truth[1:, :5])) < 1.3e-6
+    assert np.max(np.abs(ends - result.truth[1:, :5])) < 1.3e-6
 
 
 @pytest.mark.slow
 @needs_simulator
 def test_the_simulator_s_speed_obeys_torque_and_load():
-    found = drive.simulate_drive().truth * RATED
-    rate = (machine.torque(found) - found[:, 5]) / machine.INERTIA
-    error = np.diff(found[:, 4]) - STEP * (rate[1:] + rate[:-1]) / 2
+    result = drive.simulate_drive().truth * RATED
+    rate = (machine.torque(result) - result[:, 5]) / machine.INERTIA
+    error = np.diff(result[:, 4]) - STEP * (rate[1:] + rate[:-1]) / 2
     error[round(drive.LOAD_STEP_AT / STEP) - 1] = 0.0  # the load jumps inside this step
     # Trapezoidal rule, (h lambda)^2 / 12 of h times the rate: 0.165^2 / 12 of 0.25 rad/s. At the start dry friction
     # settles within a step's time.
     assert np.max(np.abs(error[20:])) < 6e-4
-    assert np.max(np.abs(np.diff(found[:, 4]))) > 0.1
+    assert np.max(np.abs(np.diff(result[:, 4]))) > 0.1
 
 
 @pytest.mark.slow
 @needs_simulator
 def test_the_filter_that_knows_the_relay_is_cautious_and_the_other_too_sure():
-    found = drive.simulate_drive()
-    case = compute.Case("load", found.voltages, [found.truth[:, :5]] * 2, machine.plant(Machine()))
+    result = drive.simulate_drive()
+    case = compute.Case("load", result.voltages, [result.truth[:, :5]] * 2, machine.plant(Machine()))
     record = compute.run_case(case, range(2))
     assert record.failures() == []
     scores = {name: compute.score(record, *name.split("/")) for name in ("fused/zero_mean", "relay_1/mean_gain")}

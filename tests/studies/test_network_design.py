@@ -31,22 +31,22 @@ def results(tmp_path_factory, widths):
 
 
 def test_one_hop_is_the_convex_optimum(results):
-    found = results[0]["one_hop"]["2"]
-    assert found["equal"] == pytest.approx(0.91212826, abs=5e-9)
-    assert found["best"] == pytest.approx(0.87632288, abs=5e-9)
-    assert found["powers"] == pytest.approx([0.42275, 0.60692, 0, 0.44522, 0, 0.52510], abs=1e-5)
-    assert found["least_power"] == pytest.approx(1.62, abs=5e-5)
-    assert found["gap"] < 1e-9
+    result = results[0]["one_hop"]["2"]
+    assert result["equal"] == pytest.approx(0.91212826, abs=5e-9)
+    assert result["best"] == pytest.approx(0.87632288, abs=5e-9)
+    assert result["powers"] == pytest.approx([0.42275, 0.60692, 0, 0.44522, 0, 0.52510], abs=1e-5)
+    assert result["least_power"] == pytest.approx(1.62, abs=5e-5)
+    assert result["gap"] < 1e-9
 
 
 def test_two_hops_are_between_the_bound_and_the_best_known(results):
-    found = results[0]["two_hops"]["6"]
-    assert found["equal"] == pytest.approx(1.56566806, abs=5e-9)
-    assert found["bound"] <= found["best"] <= 1.36438856
-    assert found["bound"] > 1.3333
-    assert found["powers"] == pytest.approx([3.4644, 2.5356, 0, 0, 0, 0], abs=1e-3)
-    assert sum(found["hop_powers"]) == pytest.approx(6.0, rel=1e-9)
-    assert found["least_power_bound"] <= found["least_power"] <= found["least_power_same_paths"] < 3.5971
+    result = results[0]["two_hops"]["6"]
+    assert result["equal"] == pytest.approx(1.56566806, abs=5e-9)
+    assert result["bound"] <= result["best"] <= 1.36438856
+    assert result["bound"] > 1.3333
+    assert result["powers"] == pytest.approx([3.4644, 2.5356, 0, 0, 0, 0], abs=1e-3)
+    assert sum(result["hop_powers"]) == pytest.approx(6.0, rel=1e-9)
+    assert result["least_power_bound"] <= result["least_power"] <= result["least_power_same_paths"] < 3.5971
 
 
 def test_schedules_and_sites_are_the_known_ones(results):
@@ -82,11 +82,11 @@ def test_the_page_says_what_is_saved(results):
 @pytest.mark.parametrize(("times", "silent"), [(1.1, 52), (3.0, 61)])
 def test_a_relay_for_packets_saves_half_and_more(times, silent):
     """By plain iteration of the bound on the informed filter's mean error."""
-    found = packets(times)
-    assert found["silent"] == pytest.approx(silent, abs=0.5)
+    result = packets(times)
+    assert result["silent"] == pytest.approx(silent, abs=0.5)
     a, c = np.array(published.PLANT.matrix), np.array([[1.0, 1.0]])
     traces = []
-    for q in (1.0, found["arrival"]):
+    for q in (1.0, result["arrival"]):
         p = np.eye(2)
         for _ in range(3000):
             p = a @ (p - q * p @ c.T @ c @ p / ((c @ p @ c.T).item() + 1)) @ a.T + np.eye(2)

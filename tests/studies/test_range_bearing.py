@@ -28,14 +28,14 @@ def test_angles_are_as_good_across_the_cut_and_tails_come_from_close_by(tmp_path
     monkeypatch.setattr(compute, "passing", lambda *which, **how: few(passing(*which, **how)))
     monkeypatch.setattr(compute, "close_by", lambda setting: few(close_by(setting)))
     range_bearing.run(range_bearing.Setting(runs=64, fading_runs=192), tmp_path)
-    found = json.loads((tmp_path / "range-bearing" / "summary.json").read_text())
+    summary = json.loads((tmp_path / "range-bearing" / "summary.json").read_text())
     for name in ("quiet_cubature", "quiet_extended"):
-        elsewhere, across, line = (found[case][name] for case in compute.CASES)
-        for one in (elsewhere, across):
-            assert abs(one["nees"] - 1) < 4 * one["nees_se"]
+        elsewhere, across, line = (summary[case][name] for case in compute.CASES)
+        for item in (elsewhere, across):
+            assert abs(item["nees"] - 1) < 4 * item["nees_se"]
         assert across["largest"] < 6 and line["rmse"] > across["rmse"]
-    assert found["on_a_line"]["quiet_extended"]["largest"] > 20
-    closest = {name: one["rmse_by_closest_pass"] for name, one in found["fading"].items()}
+    assert summary["on_a_line"]["quiet_extended"]["largest"] > 20
+    closest = {name: item["rmse_by_closest_pass"] for name, item in summary["fading"].items()}
     for farther in zip(*(part[1:] for part in closest.values()), strict=True):
         assert max(farther) < 1.5 * min(farther)  # rules differ in the closest tenth alone
     assert closest["extended"][0] > 2 * closest["four_points"][0]

@@ -28,8 +28,8 @@ def summary(tmp_path_factory, widths):
 
 def test_claims_before_data_are_the_known_ones(summary):
     point = summary["constant_velocity"]
-    for found, known in ((point["filter"], FILTER), (point["smoother"], SMOOTHER)):
-        assert found == pytest.approx(known, abs=6e-5)  # half of the last digit
+    for item, known in ((point["filter"], FILTER), (point["smoother"], SMOOTHER)):
+        assert item == pytest.approx(known, abs=6e-5)  # half of the last digit
     assert point["lag"] == pytest.approx(LAG, abs=6e-4)
     lags = summary["successive_relays"]["lag"]
     assert set(lags) == set(RELAYS)
@@ -39,8 +39,8 @@ def test_claims_before_data_are_the_known_ones(summary):
 
 
 def test_simulation_agrees_and_innovations_tell_where_it_would_not(summary):
-    for found in summary["measured"].values():
-        assert 0.85 < found["nees"] < 1.15  # 400 runs whose steps are correlated: 0.04 is one standard error
+    for item in summary["measured"].values():
+        assert 0.85 < item["nees"] < 1.15  # 400 runs whose steps are correlated: 0.04 is one standard error
     assert summary["measured"]["smoother"]["rmse"] < 0.8 * summary["measured"]["filter"]["rmse"]
     tame, large = summary["pendulum"]["tame"], summary["pendulum"]["large"]
     assert tame["smoother_angle"] < 0.7 * tame["filter_angle"] and tame["smoother_nees"] < 1.3

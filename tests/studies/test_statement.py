@@ -11,8 +11,8 @@ from heliograph_studies.statement import Sampled, Statement, holds, if_met, vacu
     ("value", "at_most", "below"), [(1.31, False, False), (1.29, True, False), (0.71, True, False), (0.69, True, True)]
 )
 def test_what_is_sampled_is_compared_up_to_three_standard_errors(value, at_most, below):
-    found = Sampled(value, 0.1)
-    assert (found.at_most(1), found.below(1)) == (at_most, below)
+    result = Sampled(value, 0.1)
+    assert (result.at_most(1), result.below(1)) == (at_most, below)
 
 
 def test_what_is_no_number_supports_nothing():

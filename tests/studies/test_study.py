@@ -166,8 +166,8 @@ def test_what_tells_settings_apart():
 
 
 def test_the_summary_is_the_outcome():
-    found = summary(Outcome({"a": 1.0}, np.float64(2.0), np.zeros(2), Part(3.0)))
-    assert found == {"parts": {"a": 1.0}, "total": 2.0, "inner": 3.0} and type(found["total"]) is float
+    result = summary(Outcome({"a": 1.0}, np.float64(2.0), np.zeros(2), Part(3.0)))
+    assert result == {"parts": {"a": 1.0}, "total": 2.0, "inner": 3.0} and type(result["total"]) is float
     assert summary({0.5: (np.arange(2), None, True), 3: Part(np.float64(1))}) == {
         "0.5": [[0, 1], None, True],
         "3": {"inner": 1.0},
@@ -178,10 +178,10 @@ def test_it_is_written_and_said(study, tmp_path, capsys):
     outcome = study.run(Setting(noise=Noise(0.3)), tmp_path / "out")
     folder = tmp_path / "out" / "number"
     assert outcome.total == 1.3
-    found = json.loads((folder / "summary.json").read_text())
-    assert found["paper"] == "A paper on numbers" and found["total"] == 1.3 and found["inner"] == 3.0
-    assert found["changed"] == {"noise.mean": {"there": "0", "here": "0.3"}} and "raw" not in found
-    assert found["claims"][0]["verdict"] == "fails"
+    summary_ = json.loads((folder / "summary.json").read_text())
+    assert summary_["paper"] == "A paper on numbers" and summary_["total"] == 1.3 and summary_["inner"] == 3.0
+    assert summary_["changed"] == {"noise.mean": {"there": "0", "here": "0.3"}} and "raw" not in summary_
+    assert summary_["claims"][0]["verdict"] == "fails"
     html = (folder / "report.html").read_text().partition("<body>")[2]
     order = ["A study", "It is 1.30", "Lead of 0.3.", "What differs from the publication", "<code>noise.mean</code>",
              "A caption that goes on.", "0.65", "of 1 statements <strong>1 fails</strong>", "it is large",

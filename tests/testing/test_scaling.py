@@ -65,7 +65,7 @@ def test_links_that_remember_and_losses_that_are_told():
     filters = {
         "linear": hg.linear_filter(plant, sensor, channel),
         "first_degree": hg.polynomial_filter(plant, sensor, channel, 3, 1),
-        "told": hg.filters.told_filter(plant, sensor, hg.erasure(good, 0.7)),
+        "told": hg.filters.side_information_filter(plant, sensor, hg.erasure(good, 0.7)),
         "imm": hg.filters.imm_filter(plant, sensor, channel),
     }
     nodes = {"mine": hg.Node(sensor, channel, filters), "lossy": hg.Node(sensor, hg.erasure(good, 0.7), filters)}
@@ -75,7 +75,7 @@ def test_links_that_remember_and_losses_that_are_told():
 def test_a_flag_has_no_unit():
     plant, sensor = hg.LinearPlant([[0.9]], 0.1, [1.0], 1.0), hg.LinearSensor([[1.0]], 0.1)
     channel = hg.gilbert_elliott(hg.hop(0.8, 0.1), hg.hop(0.3, 0.2), 0.2, 0.4)
-    flagged = hg.filters.told_filter(plant, sensor, channel, np.eye(2))
+    flagged = hg.filters.side_information_filter(plant, sensor, channel, np.eye(2))
     node = hg.Node(sensor, hg.model.with_flag(channel), {"flagged": flagged})
     with pytest.raises(ValueError, match="filter to rescale"):
         check_scaling(hg.Network(plant, {"node": node}))

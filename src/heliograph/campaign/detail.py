@@ -38,14 +38,14 @@ def details(store: Path, campaign: Campaign, settings: Sequence[int], steps: Seq
     """Every state of every filter in these settings: over all steps, then at each of these."""
     group, labels = zarr.open_group(store, mode="r"), stored_labels(store)
     claims, done = np.asarray(group[CLAIM]), done_chunks(store, campaign)
-    found: list[Detail] = []
+    results: list[Detail] = []
     for setting in settings:
         chunks = [chunk for chunk in campaign.chunks(setting) if (setting, chunk.number) in done]
         parts = [_sums(group, setting, slice(c.start, c.stop), claims[setting], steps) for c in chunks]
         if parts:
             sums = [np.sum(part, axis=0) for part in zip(*parts, strict=True)]
-            found += _told(setting, labels, claims[setting], [0, *steps], sums)
-    return found
+            results += _described(setting, labels, claims[setting], [0, *steps], sums)
+    return results
 
 
 def _sums(
@@ -66,7 +66,7 @@ def _sums(
     return counted.sum(axis=0), at.sum(axis=1), (at**2).sum(axis=1)
 
 
-def _told(
+def _described(
     setting: int, labels: Labels, claims: np.ndarray, steps: Sequence[int], sums: Sequence[np.ndarray]
 ) -> list[Detail]:
     count, first, second = sums

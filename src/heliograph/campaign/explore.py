@@ -65,7 +65,7 @@ def explore_page(campaign: Campaign, scores: Sequence[Score], look: Look | None 
         kicker="Explore a campaign",
         title=finding(scores),
         lead=f"{Path(campaign.path).name}: {len(campaign.settings)} settings, {campaign.runs} runs each of "
-        f"{campaign.horizon} steps; {_told(settings, campaign, shown, scores)} A case is a node in a setting.",
+        f"{campaign.horizon} steps; {_described(settings, campaign, shown, scores)} A case is a node in a setting.",
         sections=[
             Section("Results", pictures(campaign, scores), STATIC),
             Section("All scores", [score_table(campaign, scores)], STATIC),
@@ -87,7 +87,7 @@ MEANING = (
 )
 
 
-def _told(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
+def _described(settings: int, campaign: Campaign, shown: Sequence[Score], scores: Sequence[Score]) -> str:
     if len(shown) == len(scores):
         return f"{len(shown)} rows, one for each setting, node and filter."
     return (
@@ -117,11 +117,11 @@ def _tables(campaign: Campaign, scores: Sequence[Score], look: Look | None) -> l
         return [_scored(campaign, scored)]
     settings = list(dict.fromkeys(score.setting for score in scores))
     steps = sorted({round(step) for step in np.linspace(1, campaign.horizon, min(STEPS, campaign.horizon))})
-    found = look(settings[:1], steps)
-    found += look(settings[1 : ROWS // max(len(found), 1)], steps)
-    if len({one.state for one in found}) > 1:
-        scored += [one for one in found if not one.step]
-    return [_scored(campaign, scored), _over_time(campaign, [one for one in found if one.step])]
+    result = look(settings[:1], steps)
+    result += look(settings[1 : ROWS // max(len(result), 1)], steps)
+    if len({item.state for item in result}) > 1:
+        scored += [item for item in result if not item.step]
+    return [_scored(campaign, scored), _over_time(campaign, [item for item in result if item.step])]
 
 
 def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
@@ -136,7 +136,7 @@ def _scored(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
 
 
 def _over_time(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
-    steps = {"time": [one.step for one in rows]}
+    steps = {"time": [row.step for row in rows]}
     columns = steps | _columns(campaign, rows, OVER_TIME)
     dimensions = ["time", "setting", *campaign.parameters, *NAMES]
     whole = ["filter", "setting", "state", "time"]
@@ -148,9 +148,9 @@ def _over_time(campaign: Campaign, rows: Sequence[Detail]) -> Explored:
 def _columns(campaign: Campaign, rows: Sequence[Detail], fields: Sequence[str]) -> dict[str, list[Value]]:
     parameters = {name: parameter_values(campaign, name).tolist() for name in campaign.parameters}
     return {
-        "setting": [one.setting for one in rows],
-        **{name: [_value(values[one.setting]) for one in rows] for name, values in parameters.items()},
-        **{name: [_value(getattr(one, name)) for one in rows] for name in (*NAMES, *fields)},
+        "setting": [row.setting for row in rows],
+        **{name: [_value(values[row.setting]) for row in rows] for name, values in parameters.items()},
+        **{name: [_value(getattr(row, name)) for row in rows] for name in (*NAMES, *fields)},
     }
 
 

@@ -76,10 +76,10 @@ def against(campaign: Campaign, scores: Sequence[Score], parameter: str, quantit
     colours = _colours(scores)
     for axes, (title, part) in zip(grid, shown.items(), strict=False):
         for name in dict.fromkeys(score.filter for score in part):
-            own = [score for score in part if score.filter == name]
-            own.sort(key=lambda score: float(values[score.setting]))
-            x = [values[score.setting] for score in own]
-            y, error = _columns(own, quantity)
+            local = [score for score in part if score.filter == name]
+            local.sort(key=lambda score: float(values[score.setting]))
+            x = [values[score.setting] for score in local]
+            y, error = _columns(local, quantity)
             label = in_figure(name)
             axes.errorbar(x, y, 2 * error, color=colours[name], marker="o", markersize=4, linewidth=1.4, label=label)
         axes.set_title(fill(in_figure(title), TITLE))
@@ -99,9 +99,9 @@ def by_setting(campaign: Campaign, scores: Sequence[Score], quantity: Quantity) 
     colours = _colours(scores)
     for axes, node in zip(grid, nodes, strict=False):
         for shift, name in zip(np.linspace(-0.2, 0.2, len(colours)), colours, strict=True):
-            own = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
-            y, error = _columns(own, quantity)
-            rows = [settings.index(score.setting) + shift for score in own]
+            local = [s for s in scores if s.filter == name and s.node == node and s.setting in settings]
+            y, error = _columns(local, quantity)
+            rows = [settings.index(score.setting) + shift for score in local]
             axes.errorbar(y, rows, xerr=2 * error, color=colours[name], fmt="o", markersize=4, label=in_figure(name))
         axes.set_yticks(range(len(settings)), [_named(campaign, setting) for setting in settings])
         axes.set_ylim(len(settings) - 0.5, -0.5)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from heliograph.campaign.plan import DIMENSIONS, Campaign, Setting, canonical, versions
 from heliograph.numerics.check import check_count, check_seed, fail, file_path
-from heliograph.simulation.lanes import BLOCK
+from heliograph.simulation.runs.lanes import BLOCK
 
 KEYS = ("network", "horizon", "runs", "seed", "chunk", "keep", "inputs", "timeout", "grid", "settings")
 KEEP = ("errors", "trajectories")

@@ -88,7 +88,7 @@ def _run(
     store = (out / STORE).absolute()
     clear_left(store)
     check_replaceable(out, f"{STORE}/zarr.json")
-    wanted = _wanted(campaign, only)
+    expected = _jobs(campaign, only)
     done: set[tuple[int, ...]] = set()
     damaged: list[Path] = []
     if store.is_dir():
@@ -96,8 +96,8 @@ def _run(
         damaged = remove_damaged(store, campaign)
         remove_partial(store)
         done = done_chunks(store, campaign)
-    missing = [job for job in wanted if (job.setting, job.chunk) not in done]
-    already = len(wanted) - len(missing)
+    missing = [job for job in expected if (job.setting, job.chunk) not in done]
+    already = len(expected) - len(missing)
     if not missing and not damaged and (out / SUMMARY).is_file():
         return CampaignRun(out, already, 0, [], [])
     failed: dict[Job, Reply] = {}
@@ -108,7 +108,7 @@ def _run(
             failed = _compute(engine, campaign, store, missing, already, tell)
     remove_partial(store)
     failures = [failure(campaign, job, reply) for job, reply in failed.items()]
-    write_failures(out, campaign, failures, tried=wanted)
+    write_failures(out, campaign, failures, tried=expected)
     write_summary(store, campaign, out / SUMMARY)
     lacking = sum(1 for job in missing if job in failed or Job(job.setting) in failed)
     return CampaignRun(out, already, len(missing) - lacking, failures, damaged)
@@ -126,7 +126,7 @@ def _compute(
     return dict(sorted(failed.items(), key=lambda item: (item[0].setting, item[0].chunk or 0)))
 
 
-def _wanted(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
+def _jobs(campaign: Campaign, only: Sequence[tuple[int, int]] | None) -> list[Job]:
     every = [Job(chunk.setting, chunk.number) for chunk in campaign.all_chunks()]
     if only is None:
         return every
@@ -152,23 +152,23 @@ def _describe(engine: Engine, campaign: Campaign, store: Path, settings: set[int
     known = set() if new else {setting for (setting,) in described(store)}
     lacking = range(len(campaign.settings)) if new else sorted((settings | begun) - known)
     jobs = [Job(setting) for setting in lacking]
-    found: dict[int, Description] = {}
+    results: dict[int, Description] = {}
 
     def accept(job: Job, value: Description | None, done: int) -> None:
         assert value is not None  # these jobs only describe
-        found[job.setting] = value
+        results[job.setting] = value
         tell("building", done, len(jobs))
 
     failed = _try(engine, jobs, accept)
-    if new and not found:
+    if new and not results:
         first = next(iter(failed.values()))
         raise fail("campaign", "a setting whose network can be built", f"none: setting 0 gave {first.error}")
-    labels = {setting: labels_from(found[setting]["labels"]) for setting in sorted(found)}
+    labels = {setting: labels_from(results[setting]["labels"]) for setting in sorted(results)}
     if new:
         create(store, campaign, join(labels))
-    for setting, own in labels.items():
-        check_within(own, stored_labels(store), setting)
-        write_claims(store, setting, found[setting]["claims"])
+    for setting, label in labels.items():
+        check_within(label, stored_labels(store), setting)
+        write_claims(store, setting, results[setting]["claims"])
     return failed
 
 

@@ -198,8 +198,8 @@ def remove_partial(path: Path) -> None:
 
 def stored_labels(path: Path) -> Labels:
     """The labels that the store was made for."""
-    found: Any = zarr.open_group(path, mode="r").attrs["labels"]
-    return labels_from(found)
+    result: Any = zarr.open_group(path, mode="r").attrs["labels"]
+    return labels_from(result)
 
 
 def stored_campaign(path: Path) -> Campaign:
@@ -229,13 +229,13 @@ def check_same(path: Path, campaign: Campaign) -> None:
 
 def _attributes(path: Path) -> Mapping[str, object]:
     try:
-        found = zarr.open_group(path, mode="r").attrs.asdict()
-        if not {"versions", "campaign", "network_source", "labels"} <= found.keys():
+        result = zarr.open_group(path, mode="r").attrs.asdict()
+        if not {"versions", "campaign", "network_source", "labels"} <= result.keys():
             raise ValueError("not all that it had")
     except (OSError, ValueError, KeyError, TypeError) as error:
-        wanted = "a store that can be read, or another folder"
-        raise fail(f"{path / 'zarr.json'}", wanted, f"a damaged one ({type(error).__name__})") from None
-    return found
+        expected = "a store that can be read, or another folder"
+        raise fail(f"{path / 'zarr.json'}", expected, f"a damaged one ({type(error).__name__})") from None
+    return result
 
 
 def _differences(stored: Campaign, campaign: Campaign) -> Iterable[str]:

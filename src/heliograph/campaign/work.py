@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from heliograph.campaign.keep import Errors
 from heliograph.campaign.labels import Description, Labels, check_within, describe, labels_from
 from heliograph.campaign.plan import Campaign, Chunk, from_json, versions
+from heliograph.campaign.reducer import Errors
 from heliograph.campaign.store import stored_labels, write_chunk
 from heliograph.model.over_time import alike
 from heliograph.numerics.check import fail
@@ -66,7 +66,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
         raise fail("results folder", f"a folder {store} that this machine sees", "nothing of that name")
     labels = stored_labels(store)
     check_within(labels_from(describe(network)["labels"]), labels, chunk.setting)
-    kept = monte_carlo(
+    recorded = monte_carlo(
         network,
         campaign.horizon,
         campaign.chunk,
@@ -76,7 +76,7 @@ def compute(campaign: Campaign, network: Network, chunk: Chunk, store: Path) -> 
         campaign.chunk,
         first_run=chunk.start,
     )
-    arrays = _arrays(kept, labels)
+    arrays = _arrays(recorded, labels)
     write_chunk(store, chunk, {name: values[: chunk.stop - chunk.start] for name, values in arrays.items()})
 
 
@@ -123,9 +123,9 @@ def _bound_memory(network: Network) -> None:
     _seen.append(network)
 
 
-def _arrays(kept: PyTree, labels: Labels) -> dict[str, np.ndarray]:
+def _arrays(recorded: PyTree, labels: Labels) -> dict[str, np.ndarray]:
     """What the reducer kept on the store's axes, (run, time, ...); NaN where a node lacks a filter."""
-    estimates = kept["estimates"]
+    estimates = recorded["estimates"]
     example = next(iter(next(iter(e for e in estimates.values() if e)).values()))
     runs, horizon = example["nees_per_dimension"].shape
     tail = (len(labels.nodes), len(labels.filters))
@@ -138,9 +138,9 @@ def _arrays(kept: PyTree, labels: Labels) -> dict[str, np.ndarray]:
             place = labels.nodes.index(node), labels.filters.index(name)
             for variable, array in result.items():
                 array[:, :, place[0], place[1]] = values[variable]
-    if "truth" in kept:
-        result["truth"] = kept["truth"]
+    if "truth" in recorded:
+        result["truth"] = recorded["truth"]
         result["measurement"] = np.full((runs, horizon, tail[0], labels.received), np.nan)
-        for node, z in kept["measurements"].items():
+        for node, z in recorded["measurements"].items():
             result["measurement"][:, :, labels.nodes.index(node), : z.shape[-1]] = z
     return result

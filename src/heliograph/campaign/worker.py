@@ -15,14 +15,14 @@ def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the parent decides
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what a user's module prints must not be taken for an answer
-    asked = os.fdopen(os.dup(0), encoding="utf-8")
+    requested = os.fdopen(os.dup(0), encoding="utf-8")
     nothing = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nothing, 0)  # nor may it read a job: it finds the end of its input
     os.close(nothing)
     from heliograph.campaign.work import perform
 
-    campaign, store = json.loads(asked.readline())
-    for line in asked:
+    campaign, store = json.loads(requested.readline())
+    for line in requested:
         answer = json.dumps(asdict(perform(campaign, store, *json.loads(line))))
         try:
             print(answer, file=answers, flush=True)

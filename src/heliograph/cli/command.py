@@ -20,14 +20,14 @@ from heliograph.cli.stopping import INTERRUPTED, stoppable
 from heliograph.cli.studies import demo, example, reproduce
 from heliograph.cli.sweep import sweep
 from heliograph.numerics.extras import EXTRAS, how_to_install
-from heliograph.simulation.compilation_cache import keep_compilations
+from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
 
 # In the order of the help.
 COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
-for one in COMMANDS:
-    app.command(one)
+for single in COMMANDS:
+    app.command(single)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -50,11 +50,11 @@ def fit(
     def work(advance: "Advance") -> "Learned":
         return learn(network, measurements, starts, seed, share, advance)
 
-    learned = write_results(out, 6, work, lambda found: results(found, out, network))
-    print(learned.found)
+    learned = write_results(out, 6, work, lambda result: results(result, out, network))
+    print(learned.result)
     for name in ("report.html", "fitted_network.py"):
         print(out / name)
-    if learned.found.stopped:
+    if learned.result.stopped:
         print("heliograph: warning: stopped before the end; this is the best so far", file=sys.stderr)
 
 
@@ -65,8 +65,8 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
     from heliograph.files.recording import Recording, read_recording
     from heliograph.learning.fitting import fit as learn_from
     from heliograph.learning.held_out import changes, uniformity
-    from heliograph.learning.losses import learn_losses_of
-    from heliograph.learning.stretches import fates_of_measurements
+    from heliograph.learning.losses.losses import learn_losses_of
+    from heliograph.learning.losses.stretches import fates_of_measurements
     from heliograph.report.fit_page import Learned
 
     build = NetworkAgain(network)
@@ -82,14 +82,14 @@ def learn(network: str, measurements: Path, starts: int, seed: int, held_out: fl
         step = re.match(r" step ([0-9]+)", rest)
         advance(f"learning from {cut} rows ({form})", int(step[1]) if step else STEPS, STEPS)
 
-    found = learn_from(build, early, starts=starts, seed=seed, progress=say)
+    result = learn_from(build, early, starts=starts, seed=seed, progress=say)
     advance("judging on held-out rows")
-    judged = changes(start, found.network, recording.measurements, recording.inputs, cut) if cut < rows else []
-    uniform = uniformity(found.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
+    judged = changes(start, result.network, recording.measurements, recording.inputs, cut) if cut < rows else []
+    uniform = uniformity(result.network, judged, recording.measurements, recording.inputs, cut) if cut < rows else []
     advance("looking at losses")
     fates = fates_of_measurements(recording.measurements)
-    losses = learn_losses_of({name: own for name, own in fates.items() if 0 < own[0].sum() < len(own[0])})
-    return Learned(network, str(measurements), found, cut, rows - cut, judged, uniform, losses)
+    losses = learn_losses_of({name: fate for name, fate in fates.items() if 0 < fate[0].sum() < len(fate[0])})
+    return Learned(network, str(measurements), result, cut, rows - cut, judged, uniform, losses)
 
 
 def results(learned: "Learned", out: Path, network: str) -> "Results":
@@ -98,7 +98,7 @@ def results(learned: "Learned", out: Path, network: str) -> "Results":
     from heliograph.report.fit_page import fit_figures, pages
     from heliograph.report.results import Results
 
-    content = as_json(learned.found, network=learned.network, measurements=learned.measurements, rows=learned.learned)
+    content = as_json(learned.result, network=learned.network, measurements=learned.measurements, rows=learned.learned)
 
     def write(folder: Path) -> None:
         write_fitted(content, network, learned.measurements, folder, out)
@@ -111,27 +111,29 @@ def _judgement(learned: "Learned") -> "dict[str, Json]":
     """Filters before and after, and losses, as JSON has them."""
     filters: list[Json] = [
         {
-            "node": one.node,
-            "filter": one.filter,
-            "gain": one.gain and one.gain.difference,
-            "gain_error": one.gain and one.gain.standard_error,
-            "size_before": None if one.before.test is None else one.before.test.power,
-            "size_after": None if one.after.test is None else one.after.test.power,
-            "p_before": None if one.before.test is None else one.before.test.p_value,
-            "p_after": None if one.after.test is None else one.after.test.p_value,
+            "node": change.node,
+            "filter": change.filter,
+            "gain": change.gain and change.gain.difference,
+            "gain_error": change.gain and change.gain.standard_error,
+            "size_before": None if change.before.test is None else change.before.test.power,
+            "size_after": None if change.after.test is None else change.after.test.power,
+            "p_before": None if change.before.test is None else change.before.test.p_value,
+            "p_after": None if change.after.test is None else change.after.test.p_value,
         }
-        for one in learned.changes
+        for change in learned.changes
     ]
     losses: dict[str, Json] = {
         name: {
-            "packets": one.packets,
-            "lost": one.lost,
-            "best": one.best,
-            "memory_p": one.memory.likelihood_p,
-            "laws": {law: {key: _share(s) for key, s in own.shares().items()} for law, own in one.laws.items()},
-            "gains": {law: said.gain for law, said in one.held_out.items()},
+            "packets": loss.packets,
+            "lost": loss.lost,
+            "best": loss.best,
+            "memory_p": loss.memory.likelihood_p,
+            "laws": {
+                law: {key: _share(s) for key, s in separate.shares().items()} for law, separate in loss.laws.items()
+            },
+            "gains": {law: said.gain for law, said in loss.held_out.items()},
         }
-        for name, one in learned.losses.items()
+        for name, loss in learned.losses.items()
     }
     return {"filters": filters, "losses": losses}
 

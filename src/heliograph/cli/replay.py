@@ -31,7 +31,7 @@ def replay(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import TINY, check_seed, fail, scalar
-    from heliograph.serving.replay import Link, along, lines, recorded, through
+    from heliograph.serving.brokers.replay import Link, along, lines, recorded, through
 
     if speed is not None:
         scalar("--speed", speed, TINY)
@@ -39,10 +39,10 @@ def replay(
     if trace is not None and link != Link():
         raise fail("--trace", "no --loss, --run, --delay and --duplicates beside it", "both")
     events, origin = recorded(recording, load_network(network))
-    heard = through(events, link, check_seed("--seed", seed)) if trace is None else along(events, trace)
+    received = through(events, link, check_seed("--seed", seed)) if trace is None else along(events, trace)
     begun, first = monotonic(), None
     try:
-        for arrival, line in lines(heard, plant, origin):
+        for arrival, line in lines(received, plant, origin):
             first = arrival if first is None else first
             while speed is not None and (ahead := begun + (arrival - first) / speed - monotonic()) > 0:
                 sleep(min(ahead, LONGEST))

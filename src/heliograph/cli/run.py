@@ -14,7 +14,7 @@ from heliograph.cli.app import place
 if TYPE_CHECKING:
     from heliograph.files.recording import Recording
     from heliograph.simulation.network import Network
-    from heliograph.simulation.record import Record
+    from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
 
 
@@ -49,7 +49,7 @@ def run(
     if out is None and report is None:
         raise fail("run", "a file for the estimates (--out FILE) or a folder for a report (--report DIR)", "neither")
     later, events = named_smoothing(smooth), holds_events(measurements)
-    _check_asked(measurements, out, report, later is not None, events, window is not None or lag is not None)
+    _check_requested(measurements, out, report, later is not None, events, window is not None or lag is not None)
     notes: list[str] = []
     doubtful: list[str] = []
     with progress(3) as advance:
@@ -79,7 +79,7 @@ def run(
         print(visible(line))
 
 
-def _check_asked(
+def _check_requested(
     measurements: Path, out: Path | None, report: Path | None, smooths: bool, events: bool, waits: bool
 ) -> None:
     """What goes together, and can be written, before the work starts."""

@@ -45,11 +45,11 @@ def serve(
 
     from heliograph.files.network_file import load_network
     from heliograph.numerics.check import fail
+    from heliograph.serving.brokers.url import address
     from heliograph.serving.fleet import Options
     from heliograph.serving.message import schema as message_schema
     from heliograph.serving.output import schema as output_schema
-    from heliograph.serving.running import Wanted, run, store_of
-    from heliograph.serving.url import address
+    from heliograph.serving.running import ServiceSettings, run, store_of
 
     if schema:
         print(json.dumps({"message": message_schema(), "output": output_schema()}, indent=1))
@@ -58,6 +58,8 @@ def serve(
         raise fail("serve", "a network, such as my_network.py", "none")
     where = None if broker is None else address(broker)
     options = Options(window, ahead, float("inf") if leap is None else leap)
-    kept = store_of(network, store, parts)
-    wanted = Wanted(load_network(network), options, kept, process, from_snapshot, where, parts, page, tuple(anew or ()))
-    asyncio.run(run(wanted))
+    store_ = store_of(network, store, parts)
+    settings = ServiceSettings(
+        load_network(network), options, store_, process, from_snapshot, where, parts, page, tuple(anew or ())
+    )
+    asyncio.run(run(settings))

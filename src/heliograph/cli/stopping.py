@@ -31,12 +31,12 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
             again.append(Timer(SOON, interrupt_main))  # not here: it would be swallowed once more
             again[-1].start()
         else:
-            told(what)
+            known(what)
 
     again: list[Timer] = []
-    told, terminate = sys.unraisablehook, signal.signal(signal.SIGTERM, _terminate)
-    heard = signal.getsignal(signal.SIGINT)
-    if heard is not signal.SIG_IGN:  # as in the background, where nobody's Ctrl-C is meant
+    known, terminate = sys.unraisablehook, signal.signal(signal.SIGTERM, _terminate)
+    received = signal.getsignal(signal.SIGINT)
+    if received is not signal.SIG_IGN:  # as in the background, where nobody's Ctrl-C is meant
         signal.signal(signal.SIGINT, interrupt)
     sys.unraisablehook = swallowed
     try:
@@ -44,9 +44,9 @@ def stoppable(stopped: list[int]) -> Iterator[None]:
     finally:
         for timer in again:
             timer.cancel()
-        sys.unraisablehook = told
+        sys.unraisablehook = known
         signal.signal(signal.SIGTERM, terminate)
-        signal.signal(signal.SIGINT, heard)
+        signal.signal(signal.SIGINT, received)
 
 
 def _terminate(_: int, __: FrameType | None) -> None:

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 
 from heliograph.codegen.folding import DTYPES
-from heliograph.codegen.llvm_module import LINE, Code, written
-from heliograph.codegen.machine import Machine, features
+from heliograph.codegen.llvm.machine import Machine, features
+from heliograph.codegen.llvm.module import LINE, Code, written
 from heliograph.codegen.program import Program, lower
 from heliograph.numerics.types import PyTree
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from heliograph.codegen.compiled import Compiled
 from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.llvm.machine import target
 from heliograph.codegen.lowering import like
-from heliograph.codegen.machine import target
 from heliograph.codegen.program import lower
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.types import PyTree
@@ -95,9 +95,9 @@ def attempted(make: Callable[[], Code]) -> Code | None:
         return None
     try:
         return make()
-    except Unsupported as found:
+    except Unsupported as error:
         if engine == "native":
-            raise fail("native code", "a program of operations that it takes", str(found)) from None
+            raise fail("native code", "a program of operations that it takes", str(error)) from None
         return None
 
 
@@ -146,13 +146,13 @@ def _made(form: Any, kinds: tuple[Any, ...]) -> tuple[Compiled | None, str]:
     arrays = [k for k in kinds if isinstance(k, _Array)]
 
     def call(*values: Any) -> PyTree:
-        each = iter(values)
-        leaves = [next(each) if isinstance(k, _Array) else k for k in kinds]
+        items = iter(values)
+        leaves = [next(items) if isinstance(k, _Array) else k for k in kinds]
         function, *arguments = jax.tree.unflatten(form, leaves)
         return function(*arguments)
 
     try:
         program = lower(call, *(like(k.shape, k.dtype) for k in arrays))
         return Compiled(program, [k.differs for k in arrays]), ""
-    except Unsupported as found:
-        return None, str(found)
+    except Unsupported as error:
+        return None, str(error)

@@ -10,7 +10,7 @@ from jax.extend.core import JaxprEqn
 from heliograph.codegen.folding import is_finite
 from heliograph.codegen.graph import Buffer, Graph, Node, Type
 from heliograph.codegen.lowering import RULES, Lowering, Value, type_of
-from heliograph.codegen.memory import MANY, InMemory
+from heliograph.codegen.memory import LARGE, InMemory
 
 # Finite where the arguments are, but for overflow and divisions by zero, which the finished step is checked for.
 PRESERVING = frozenset((
@@ -70,7 +70,7 @@ class DeviceLowering(Lowering):
     def equation(self, equation: JaxprEqn, inputs: list[Value]) -> Sequence[Value]:
         """Arithmetic is written out where the arrays that a loop would go through are not too long for that."""
         if equation.primitive.name in RULES and equation.primitive.name not in VIEWS:
-            inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= MANY else x for x in inputs]
+            inputs = [self.nodes(x) if isinstance(x, InMemory) and x.size <= LARGE else x for x in inputs]
         return super().equation(equation, inputs)
 
     def known(self, number: Any) -> Value:

@@ -53,8 +53,8 @@ class Lowering:
             if name not in RULES:
                 raise Unsupported(name)
             return RULES[name](self, equation, [self.nodes(x) for x in inputs])
-        except Unsupported as found:
-            raise (found if found.place else Unsupported(found.operation, place(equation))) from None
+        except Unsupported as error:
+            raise (error if error.place else Unsupported(error.operation, place(equation))) from None
 
     def nodes(self, value: Value) -> np.ndarray:
         """A value as a NumPy array of nodes."""

@@ -8,7 +8,7 @@ import numpy as np
 from heliograph.codegen.graph import Block, Buffer, Graph, Node, Type, Unsupported
 
 LONG = 64  # numbers: a known array that is longer is a table in memory
-MANY = 4096  # numbers: an array in memory that is longer is not loaded whole
+LARGE = 4096  # numbers: an array in memory that is longer is not loaded whole
 
 
 class InMemory:
@@ -63,7 +63,7 @@ class InMemory:
     def nodes(self, graph: Graph) -> np.ndarray:
         """All of its numbers, loaded."""
         if self.loaded is None or self.loaded[0] not in graph.current.inwards():
-            if self.size > MANY:
+            if self.size > LARGE:
                 raise Unsupported(f"an array of {self.size} numbers at once")
             self.loaded = graph.current, self._load(graph)
         return self.loaded[1]

@@ -10,8 +10,8 @@ def fusable(node: Node, products: set[Node]) -> Node | None:
     """The product that is computed with a sum or difference as one operation."""
     if node.op not in ("add", "sub") or node.type != "f64":
         return None
-    found = [a for a in node.args if a in products and a.value is node]
-    return found[0] if found else None
+    results = [a for a in node.args if a in products and a.value is node]
+    return results[0] if results else None
 
 
 def products_of(items: Iterable[Any]) -> set[Node]:
@@ -20,16 +20,16 @@ def products_of(items: Iterable[Any]) -> set[Node]:
     for item in items:
         for used in uses(item):
             users.setdefault(used, []).append(item)
-    found: set[Node] = set()
+    results: set[Node] = set()
     taken: set[Node] = set()
     for node in sorted((n for n in users if n.op == "mul" and n.type == "f64"), key=lambda n: -n.serial):
         user = users[node][0]
         single = len(users[node]) == 1 and isinstance(user, Node) and user.op in ("add", "sub")
         if single and user.args[0] is not user.args[1] and user.block is node.block and user not in taken:
             node.value = user
-            found.add(node)
+            results.add(node)
             taken.add(user)
-    return found
+    return results
 
 
 def uses(item: Any) -> list[Node]:

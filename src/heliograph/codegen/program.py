@@ -73,14 +73,14 @@ def scalars(value: Value) -> list[Node]:
 
 def needed(roots: Iterable[Node | Buffer], among: Callable[[Any], bool] = lambda item: True) -> set[Any]:
     """What these numbers need: nodes, and the loops, guards, buffers and stores that make them; only `among` some."""
-    found: set[Any] = set()
+    results: set[Any] = set()
     waiting: list[Any] = list(roots)
     while waiting:
         item = waiting.pop()
-        if item not in found and among(item):
-            found.add(item)
+        if item not in results and among(item):
+            results.add(item)
             waiting += _needs(item)
-    return found
+    return results
 
 
 def _needs(item: Any) -> list[Any]:

@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from heliograph.codegen.c_operations import Real
+from heliograph.codegen.c.operations import Real
 from heliograph.disk.output_file import check_output
 from heliograph.disk.whole_file import whole_files
 from heliograph.export.program import step_program
 from heliograph.export.text import CText, Form, c_text
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.factored import factored
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.gaussian.factored import factored
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail, instance, shown
 

@@ -109,8 +109,8 @@ def _lowered(program: Any, leaves: int, symmetric: set[int]) -> tuple[FiniteGrap
             values.append(value)
         with jax.enable_x64(True):
             outputs = [lowering.nodes(x) for x in lowering.inline(program, values)]
-    except Unsupported as found:
-        raise no_c(found.operation, found.place) from None
+    except Unsupported as error:
+        raise no_c(error.operation, error.place) from None
     return graph, inputs, outputs
 
 

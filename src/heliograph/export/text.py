@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 import heliograph
-from heliograph.codegen.c_operations import Real, c_type, literal
-from heliograph.codegen.c_source import CSource, Place
+from heliograph.codegen.c.operations import Real, c_type, literal
+from heliograph.codegen.c.source import CSource, Place
 from heliograph.codegen.graph import Node, Type, Unsupported
 from heliograph.disk.quoting import visible
 from heliograph.export.program import StepProgram, no_c, place_of
@@ -64,8 +64,8 @@ def c_text(program: StepProgram, form: Form) -> CText:
     source = CSource([*roots, *program.mean], places, real, prefix)
     try:
         body = source.statements(program.graph.top)
-    except Unsupported as found:
-        raise no_c(found.operation, place_of(found.operation, program.equations)) from None
+    except Unsupported as error:
+        raise no_c(error.operation, place_of(error.operation, program.equations)) from None
     counts = program.k in source.needed or program.filter.horizon is not None
     finish = _finish(members, program, source, counts)
     text = _SOURCE.format(

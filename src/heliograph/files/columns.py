@@ -46,25 +46,25 @@ def _values(values: Any, name: str) -> np.ndarray:
     missing = values.isna() if hasattr(values, "isna") else None
     if missing is not None and values.dtype.kind in "iufb":  # pandas's own kinds of number have a mask
         return np.asarray(values.to_numpy(dtype=np.float64, na_value=np.nan))
-    found = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
-    if found.dtype.kind == "M":
-        return np.asarray(found.astype("datetime64[ns]"))
-    if found.dtype.kind in "fiub":
-        return np.asarray(found, dtype=np.float64)
-    if found.dtype.kind in "OUT":
-        return _of_objects(found, name)
-    raise fail(name, "numbers or dates", f"{found.dtype}")
+    result = values.to_numpy() if hasattr(values, "to_numpy") else np.asarray(values)
+    if result.dtype.kind == "M":
+        return np.asarray(result.astype("datetime64[ns]"))
+    if result.dtype.kind in "fiub":
+        return np.asarray(result, dtype=np.float64)
+    if result.dtype.kind in "OUT":
+        return _of_objects(result, name)
+    raise fail(name, "numbers or dates", f"{result.dtype}")
 
 
-def _of_objects(found: np.ndarray, name: str) -> np.ndarray:
+def _of_objects(result: np.ndarray, name: str) -> np.ndarray:
     """Numbers with None among them, or dates; text that reads as a number is none."""
-    some = next((each for each in found if each is not None), None)
+    some = next((item for item in result if item is not None), None)
     if isinstance(some, str) or hasattr(some, "isoformat"):
-        return dates(found, name)
-    texts = [each for each in found if isinstance(each, str | bytes)]  # text is no number, though it may read as one
+        return dates(result, name)
+    texts = [item for item in result if isinstance(item, str | bytes)]  # text is no number, though it may read as one
     try:
         if texts:
             raise TypeError
-        return np.array([np.nan if each is None else float(each) for each in found])
+        return np.array([np.nan if item is None else float(item) for item in result])
     except (TypeError, ValueError, OverflowError):
         raise fail(name, "numbers or dates", shown(texts[0] if texts else some)) from None

@@ -14,7 +14,7 @@ from heliograph.live.recorded import play
 from heliograph.numerics.check import fail, shown
 from heliograph.numerics.dates import dates, looks_like_date
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 EXACT = 2.0**53  # up to here doubles hold every whole number
 NODE, SEQUENCE, TIME, ARRIVAL, VALUES = "node", "sequence", "time", "arrival", "values"
@@ -57,7 +57,7 @@ def read_events(path: str | Path, network: Network) -> tuple[list[Event], np.dat
         where = f"{path}, row {row + 1}"
         if node not in components:
             raise fail(f"{where}, column {NODE!r}", f"one of {', '.join(components)}", shown(node))
-        values = _heard({name: column[row] for name, column in columns.items()}, components[node], where)
+        values = _received({name: column[row] for name, column in columns.items()}, components[node], where)
         number = _whole(columns[SEQUENCE][row], f"{where}, column {SEQUENCE!r}")
         events.append(Event(node, number, float(time[row]), values, float(arrival[row])))
     return events, origin
@@ -74,18 +74,18 @@ def run_events(path: Path, network: Network, out: Path, window: float, lag: floa
     events, origin = read_events(path, network)
     continuous = TIME_STEP in network.inputs
     start = min(event.time for event in events) if continuous else 0.0  # the initial law is that of the first moment
-    found = play(network, events, window, lag, start)
-    lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in each.items() if count)
-             for node, each in found.counts.items() if any(each.values())]  # fmt: skip
-    if found.forced:
-        lines.append(f"{found.forced} rows became final before their time, for want of room")
+    result = play(network, events, window, lag, start)
+    lines = [f"{node}: " + ", ".join(f"{count} {verdict}" for verdict, count in element.items() if count)
+             for node, element in result.counts.items() if any(element.values())]  # fmt: skip
+    if result.forced:
+        lines.append(f"{result.forced} rows became final before their time, for want of room")
     if origin is not None:
         lines.append(f"times in seconds since {np.datetime_as_string(origin, timezone='UTC')}")
-    if found.lagged is not None:
-        beside = out.with_suffix(f".lagged{out.suffix}")
-        write_estimates(found.lagged, beside)
-        lines.append(f"{beside}: {len(found.lagged.time)} rows, each given what came {lag:g} later")
-    return found.final, lines
+    if result.lagged is not None:
+        lagged_path = out.with_suffix(f".lagged{out.suffix}")
+        write_estimates(result.lagged, lagged_path)
+        lines.append(f"{lagged_path}: {len(result.lagged.time)} rows, each given what came {lag:g} later")
+    return result.final, lines
 
 
 def _header(path: Path) -> list[str]:
@@ -109,12 +109,12 @@ def _columns(path: Path) -> Mapping[str, Sequence[Any]]:
         import pyarrow.parquet as pq
 
         table = pq.ParquetFile(path).read()
-        found = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
-        for name in found.keys() - {NODE, VALUES}:
-            for at, cell in enumerate(found[name], 1):
+        results = {name: column.to_pylist() for name, column in zip(table.column_names, table.columns, strict=True)}
+        for name in results.keys() - {NODE, VALUES}:
+            for at, cell in enumerate(results[name], 1):
                 if isinstance(cell, str) and not (name in (TIME, ARRIVAL) and looks_like_date(cell)):
                     raise fail(f"{path}, row {at}, column {name!r}", "a number", f"text, {shown(cell)}")
-        return found
+        return results
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             header, *rows = [[cell.strip() for cell in line] for line in csv.reader(file, strict=True) if line]
@@ -133,11 +133,11 @@ def _times(columns: Mapping[str, Sequence[object]], path: Path) -> tuple[np.ndar
     parts = [TIME, ARRIVAL] if ARRIVAL in columns else [TIME]
     first = columns[TIME][0]
     if hasattr(first, "isoformat") or looks_like_date(str(first)):
-        found = [dates(columns[part], f"{path}, column {part!r}") for part in parts]
-        for part, values in zip(parts, found, strict=True):
+        results = [dates(columns[part], f"{path}, column {part!r}") for part in parts]
+        for part, values in zip(parts, results, strict=True):
             _refuse_missing(np.isnat(values), f"{path}, column {part!r}")
-        origin: np.datetime64 = found[0].min()
-        seconds = [(values - origin).astype(np.int64) / 1e9 for values in found]  # exact before they are floats
+        origin: np.datetime64 = results[0].min()
+        seconds = [(values - origin).astype(np.int64) / 1e9 for values in results]  # exact before they are floats
         return seconds[0], seconds[-1], origin
     numbers = [
         np.array([_number(cell, f"{path}, row {row}, column {part!r}") for row, cell in enumerate(columns[part], 1)])
@@ -151,7 +151,7 @@ def _refuse_missing(missing: np.ndarray, name: str) -> None:
         raise fail(f"{name}, row {int(np.argmax(missing)) + 1}", "a date", "an empty cell")
 
 
-def _heard(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
+def _received(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarray:
     """The numbers of one event."""
     if row.get(VALUES) not in (None, ""):
         cell = row[VALUES]
@@ -165,12 +165,12 @@ def _heard(row: Mapping[str, Any], names: Sequence[str], where: str) -> np.ndarr
 def _whole(cell: Any, name: str) -> int:
     """A count, every digit of it; one written as a float if that holds it exactly."""
     try:
-        found = int(cell) if isinstance(cell, str) else cell
+        result = int(cell) if isinstance(cell, str) else cell
     except ValueError:
-        found = _number(cell, name)
-    if isinstance(found, float) and found.is_integer() and abs(found) < EXACT:
-        found = int(found)
-    return whole(name, found if isinstance(found, int) else cell)
+        result = _number(cell, name)
+    if isinstance(result, float) and result.is_integer() and abs(result) < EXACT:
+        result = int(result)
+    return whole(name, result if isinstance(result, int) else cell)
 
 
 def _number(cell: Any, name: str, empty: bool = False) -> float:
@@ -179,9 +179,9 @@ def _number(cell: Any, name: str, empty: bool = False) -> float:
     try:
         if isinstance(cell, str) and "_" in cell:  # Python's own way to write a number, and nobody else's
             raise ValueError
-        found = float(cell)
+        result = float(cell)
     except (TypeError, ValueError, OverflowError):
-        found = np.inf
-    if np.isinf(found) or (np.isnan(found) and not empty):
+        result = np.inf
+    if np.isinf(result) or (np.isnan(result) and not empty):
         raise fail(name, "a number or an empty cell" if empty else "a number", shown(cell))
-    return found
+    return result

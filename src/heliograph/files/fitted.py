@@ -46,17 +46,17 @@ class NetworkAgain:
         return load_network(self.reference)
 
 
-def as_json(found: Fit, **more: Any) -> dict[str, Any]:
+def as_json(fitted: Fit, **more: Any) -> dict[str, Any]:
     """Values by name, the table, the sentences and how the search went, as JSON has them; None for NaN."""
     return {
         **more,
-        "values": {name: np.asarray(value).tolist() for name, value in found.values.items()},
-        "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in found.table],
-        "sentences": list(found.sentences),
-        "log_likelihood": dict(found.log_likelihood),
-        "ends": [_plain(float(end)) for end in found.ends],
-        "converged": found.converged,
-        "stopped": found.stopped,
+        "values": {name: np.asarray(value).tolist() for name, value in fitted.values.items()},
+        "table": [{key: _plain(value) for key, value in row._asdict().items()} for row in fitted.table],
+        "sentences": list(fitted.sentences),
+        "log_likelihood": dict(fitted.log_likelihood),
+        "ends": [_plain(float(end)) for end in fitted.ends],
+        "converged": fitted.converged,
+        "stopped": fitted.stopped,
     }
 
 
@@ -68,12 +68,12 @@ def write_fitted(content: Mapping[str, object], reference: str, measurements: st
     (folder / FITTED).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     path, colon, name = _parts(reference)
     if path is None:
-        found = repr(reference)
+        result = repr(reference)
     else:
         way = Path(os.path.relpath(path.resolve(), place.resolve())).as_posix()
-        found = f'f"{{HERE}}/{way}{colon}{name}"'
+        result = f'f"{{HERE}}/{way}{colon}{name}"'
     text = SOURCE.format(network=_docstring(reference), measurements=_docstring(measurements), fitted=FITTED,
-                         file=NETWORK, reference=found)  # fmt: skip
+                         file=NETWORK, reference=result)  # fmt: skip
     (folder / NETWORK).write_text(text, encoding="utf-8")
 
 
@@ -91,7 +91,7 @@ def load_fitted(reference: str | Path, fitted: str | Path) -> Network:
         values = json.loads(path.read_text(encoding="utf-8"))["values"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise fail(f"fitted numbers {path}", "a file that `heliograph fit` wrote", type(error).__name__) from None
-    known = {one.name: one.start.shape for one in description.parameters.every}
+    known = {item.name: item.start.shape for item in description.parameters.every}
     if {name: np.shape(value) for name, value in values.items()} != known:
         raise fail(f"fitted numbers {path}", f"those that are free in the network, {list(known)}", list(values))
     return description.at({name: np.asarray(v) if np.ndim(v) else float(v) for name, v in values.items()})

@@ -15,7 +15,7 @@ from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record, is_sound
+from heliograph.simulation.results.record import Record, is_sound
 
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 
@@ -118,8 +118,8 @@ def estimate_columns(record: Record) -> dict[str, np.ndarray]:
             columns += [(prefix + key, values) for key, values in _claims(record.states, estimate)]
             later = {} if record.smoothed is None else record.smoothed.estimates.get(node, {})
             if name in later:
-                told = _claims(record.states, later[name])
-                columns += [(f"{prefix}smoothed.{key}", _at_the_end(values, len(record.time))) for key, values in told]
+                known = _claims(record.states, later[name])
+                columns += [(f"{prefix}smoothed.{key}", _at_the_end(values, len(record.time))) for key, values in known]
     twice = [name for name, count in Counter(name for name, _ in columns).items() if count > 1]
     if twice:
         raise fail("columns of the estimates", "distinct names", f"{twice[0]!r} more than once")

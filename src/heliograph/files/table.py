@@ -112,8 +112,8 @@ def _number(path: Path, name: str, number: int, cell: str) -> float:
             hint = ": several numbers: " + _rewriting(path, sep="\\s+")
         if cell.lower() in MISSING:
             hint = ": a cell is empty where nothing arrived"
-        wanted = "a number or an empty cell"
-        raise fail(f"{path}, row {number}, column {name!r}", wanted, f"{shown(cell)}{hint}") from None
+        expected = "a number or an empty cell"
+        raise fail(f"{path}, row {number}, column {name!r}", expected, f"{shown(cell)}{hint}") from None
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:

@@ -6,21 +6,21 @@ from .base import (
     in_float64 as in_float64,
     predicts as predicts,
 )
-from .clock import (
+from .wrappers.clock import (
     clock_filter as clock_filter,
 )
-from .correction import (
+from .gaussian.correction import (
     Scalars as Scalars,
 )
-from .delay import (
+from .wrappers.delay import (
     late_filter as late_filter,
     part_filter as part_filter,
 )
-from .fed_back import (
+from .wrappers.fed_back import (
     FedBackFilter as FedBackFilter,
     fed_back_filter as fed_back_filter,
 )
-from .gaussian import (
+from .gaussian.gaussian import (
     gaussian_filter as gaussian_filter,
 )
 from .h_infinity import (
@@ -31,56 +31,56 @@ from .innovation import (
     gaussian_innovation as gaussian_innovation,
     mixed_innovation as mixed_innovation,
 )
-from .linear import (
+from .linear.linear import (
     as_current_filter as as_current_filter,
     memoryless_filter as memoryless_filter,
 )
-from .open_loop import (
+from .linear.open_loop import (
     open_loop_filter as open_loop_filter,
 )
-from .multiple_model import (
+from .modes.multiple_model import (
     gpb1_filter as gpb1_filter,
     gpb2_filter as gpb2_filter,
     imm_filter as imm_filter,
 )
-from .particle import (
+from .modes.particle import (
     particle_filter as particle_filter,
 )
-from .polynomial import (
+from .linear.polynomial import (
     PolynomialFilter as PolynomialFilter,
     memory_filter as memory_filter,
     scheduled_polynomial_filter as scheduled_polynomial_filter,
 )
-from .prediction import (
+from .wrappers.prediction import (
     prediction_of as prediction_of,
 )
-from .revealed import (
+from .modes.mode_observed import (
     mode_known_filter as mode_known_filter,
     mode_late_filter as mode_late_filter,
 )
-from .scheduled import (
+from .linear.scheduled import (
     LinearSystemFilter as LinearSystemFilter,
     ScheduledFilter as ScheduledFilter,
 )
-from .sequential import (
+from .gaussian.sequential import (
     sequential_filter as sequential_filter,
 )
-from .told import (
-    told_filter as told_filter,
+from .modes.side_information import (
+    side_information_filter as side_information_filter,
 )
-from .transform import (
+from .gaussian.transform import (
     AbstractTransform as AbstractTransform,
     Cubature as Cubature,
     Linearization as Linearization,
     PolynomialMoments as PolynomialMoments,
 )
-from .update import (
+from .gaussian.update import (
     AbstractUpdate as AbstractUpdate,
     Interval as Interval,
     Polytope as Polytope,
     ZeroMean as ZeroMean,
 )
-from .truth import (
+from .linear.truth import (
     TrueError as TrueError,
     true_error as true_error,
 )

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.plausibility import Judgement, judge
-from heliograph.filters.retained import AbstractRetained
-from heliograph.filters.retaining import with_surprise
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import with_nis
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import fail, shown
@@ -82,20 +82,20 @@ class AbstractFilter(Module):
         z, u = measured(self, z), given(self, u)
         return _step_judged(self, state, z, u, step_number(self, k))
 
-    def step_retained(
+    def step_with_smoother(
         self, state: PyTree, z: ArrayLike, u: ArrayLike = (), k: Step = 0
-    ) -> tuple[PyTree, AbstractRetained]:
+    ) -> tuple[PyTree, AbstractSmootherStep]:
         """As `step`, with what a sweep back over it needs in place of the estimate.
 
         Raises:
             ValueError: what `step` refuses; a filter that cannot be smoothed.
         """
         z, u = measured(self, z), given(self, u)
-        return _step_retained(self, state, z, u, step_number(self, k))
+        return _step_with_smoother(self, state, z, u, step_number(self, k))
 
-    def retain(
-        self, before: PyTree, prior: PyTree, after: PyTree, heard: Innovation, z: ArrayLike, u: ArrayLike, k: Step
-    ) -> AbstractRetained:
+    def smoother_step(
+        self, before: PyTree, prior: PyTree, after: PyTree, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
         """What a sweep back over step k needs: states before it, after `predict` and `correct`, and the innovation.
 
         Raises:
@@ -111,7 +111,7 @@ class AbstractFilter(Module):
         """The same filter for these inputs and complete data, with all that does not depend on data computed before."""
         return self
 
-    def with_past(self, steps: AbstractRetained) -> "AbstractFilter":
+    def with_past(self, steps: AbstractSmootherStep) -> "AbstractFilter":
         """A planned filter that can be smoothed: `steps` retained by the filter that it was planned from, over time."""
         return self
 
@@ -137,19 +137,19 @@ def _step_judged(
     item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
 ) -> tuple[PyTree, Estimate, Judgement]:
     prior = item.predict(state, u, k)
-    after, heard = item.correct(prior, z, k)
+    after, innovation = item.correct(prior, z, k)
     estimate = item.after_step(after, k)
-    told = item.estimate(state), item.estimate(prior), estimate
-    return after, estimate, judge(item.claim, (state, prior, after), told, heard, z, item.of_atoms)
+    known = item.estimate(state), item.estimate(prior), estimate
+    return after, estimate, judge(item.claim, (state, prior, after), known, innovation, z, item.of_atoms)
 
 
 @compiled
-def _step_retained(
+def _step_with_smoother(
     item: AbstractFilter, state: PyTree, z: PyTree, u: PyTree, k: PyTree
-) -> tuple[PyTree, AbstractRetained]:
+) -> tuple[PyTree, AbstractSmootherStep]:
     prior = item.predict(state, u, k)
-    after, heard = item.correct(prior, z, k)
-    return after, with_surprise(item.retain(state, prior, after, heard, z, u, k), heard)
+    after, innovation = item.correct(prior, z, k)
+    return after, with_nis(item.smoother_step(state, prior, after, innovation, z, u, k), innovation)
 
 
 def predicts(predict: Callable[P, R]) -> Callable[P, R]:
@@ -180,10 +180,10 @@ def measured(item: AbstractFilter, z: ArrayLike) -> Float[Array, " received"]:
     Raises:
         ValueError: another shape, infinite values, or no real numbers.
     """
-    found = _numbers("measurement", z, item.received or None)
-    if isinstance(found, np.ndarray) and np.isinf(found).any():
-        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(found).tolist())
-    return found if item.received else found[:0]
+    result = _numbers("measurement", z, item.received or None)
+    if isinstance(result, np.ndarray) and np.isinf(result).any():
+        raise fail("measurement", "numbers, or NaN for what is missing", np.asarray(result).tolist())
+    return result if item.received else result[:0]
 
 
 def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
@@ -192,10 +192,10 @@ def given(item: AbstractFilter, u: ArrayLike) -> Float[Array, " inputs"]:
     Raises:
         ValueError: another shape, values that are not finite, or no real numbers.
     """
-    found = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
-    if isinstance(found, np.ndarray) and not np.isfinite(found).all():
-        raise fail("inputs", "finite numbers", np.asarray(found).tolist())
-    return found
+    result = _numbers(f"inputs {list(item.inputs)}" if item.inputs else "inputs", u, len(item.inputs))
+    if isinstance(result, np.ndarray) and not np.isfinite(result).all():
+        raise fail("inputs", "finite numbers", np.asarray(result).tolist())
+    return result
 
 
 def step_number(item: AbstractFilter, k: Step) -> Step:
@@ -212,28 +212,28 @@ def step_number(item: AbstractFilter, k: Step) -> Step:
         or np.asarray(k).dtype.kind not in "iu"
     ):
         raise fail("step", "a whole number from 0", shown(k))
-    found = np.asarray(k)
-    if found < 0:
+    values = np.asarray(k)
+    if values < 0:
         raise fail("step", "a whole number from 0", k)
-    if item.horizon is not None and found >= item.horizon:
+    if item.horizon is not None and values >= item.horizon:
         raise fail("step", f"one of the {item.horizon} that the filter covers, counted from 0", k)
-    return found
+    return values
 
 
 def _numbers(name: str, value: ArrayLike, length: int | None) -> Float[Array, " length"]:
     """Real numbers of one axis as an array of floats; a single number will do for a length of one."""
     expected = "numbers" if length is None else "1 number" if length == 1 else f"{length} numbers"
     try:
-        found: Array = np.asarray(value)
+        result: Array = np.asarray(value)
     except jax.errors.TracerArrayConversionError:
-        found = jnp.asarray(value, dtype=float)
+        result = jnp.asarray(value, dtype=float)
     except ValueError:  # rows of different lengths
         raise fail(name, expected, repr(value)[:60]) from None
-    if isinstance(found, np.ndarray):
-        if found.dtype.kind not in "fiub":
+    if isinstance(result, np.ndarray):
+        if result.dtype.kind not in "fiub":
             raise fail(name, expected, repr(value)[:60])
-        found = found.astype(np.float64)
-    found = found[None] if found.ndim == 0 and length in (1, None) else found
-    if found.ndim != 1 or length not in (len(found), None):
-        raise fail(name, expected, f"shape {found.shape}" if found.size else "none")
-    return found
+        result = result.astype(np.float64)
+    result = result[None] if result.ndim == 0 and length in (1, None) else result
+    if result.ndim != 1 or length not in (len(result), None):
+        raise fail(name, expected, f"shape {result.shape}" if result.size else "none")
+    return result

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.correction import Signal, homogeneous
+from heliograph.filters.gaussian.correction import Signal, homogeneous
 from heliograph.model.estimate import Innovation
 from heliograph.numerics.over_runs import runs_last, runs_last_of
 from heliograph.numerics.small_matrix import (
@@ -17,7 +17,7 @@ from heliograph.numerics.small_matrix import (
     rounding,
 )
 from heliograph.numerics.types import Array, Float
-from heliograph.random_affine.second_moments import SecondOrder
+from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
 def gaussian_innovation(

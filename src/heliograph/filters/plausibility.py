@@ -13,7 +13,14 @@ import numpy as np
 
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import NEGATIVE_TOLERANCE, add, own, rounding, squared_distance, squared_distances
+from heliograph.numerics.small_matrix import (
+    NEGATIVE_TOLERANCE,
+    add,
+    diagonal_of,
+    rounding,
+    squared_distance,
+    squared_distances,
+)
 from heliograph.numerics.types import Array, Float, PyTree
 
 LIMIT = 1e6
@@ -93,9 +100,9 @@ def why_inputs(votes: Float[np.ndarray, "filters 4"]) -> str | None:
     return INPUT
 
 
-def innovation_distance(heard: Innovation) -> tuple[jax.Array, jax.Array]:
+def innovation_distance(innovation: Innovation) -> tuple[jax.Array, jax.Array]:
     """e' S^-1 e of the components that arrived (infinite where S excludes them), and how many did."""
-    value, covariance = jnp.asarray(heard.value), jnp.asarray(heard.covariance)
+    value, covariance = jnp.asarray(innovation.value), jnp.asarray(innovation.covariance)
     present = ~jnp.isnan(value)
     total = jnp.where(present[:, None] & present, covariance, jnp.diag(jnp.where(present, 0.0, 1.0)))
     distance = _distance(total, jnp.where(present, value, 0.0)) if len(value) else jnp.zeros(())
@@ -108,8 +115,8 @@ def _distance(a: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def judge(
-    claim: Claim, states: tuple[PyTree, PyTree, PyTree], told: tuple[Estimate, Estimate, Estimate],
-    heard: Innovation, z: Float[Array, " m"], of_atoms: bool,
+    claim: Claim, states: tuple[PyTree, PyTree, PyTree], estimates: tuple[Estimate, Estimate, Estimate],
+    innovation: Innovation, z: Float[Array, " m"], of_atoms: bool,
 ) -> Judgement:  # fmt: skip
     """Judge a step: states and estimates before it, after its prediction and after its correction, and the innovation.
 
@@ -119,8 +126,8 @@ def judge(
     leaves it. A state is unsound where the one before it was not:
     a mean or variance that is no finite number, a negative variance, an infinite number in it.
     """
-    (before, prior, after), value = told, jnp.asarray(heard.value)
-    z, covariance = jnp.asarray(z), jnp.asarray(heard.covariance)
+    (before, prior, after), value = estimates, jnp.asarray(innovation.value)
+    z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
     z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter that does not listen
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)
@@ -133,7 +140,7 @@ def judge(
     far = _some((free > LIMIT**2) | (larger & jnp.isinf(value))) | (_total(free) > LIMIT**2)
     excluded = _some(jnp.isinf(every) & certain) & ~_some(~certain & present)
     if of_atoms:
-        excluded |= (jnp.asarray(heard.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
+        excluded |= (jnp.asarray(innovation.log_likelihood) == -jnp.inf) & jnp.isfinite(distance)
 
     unsound = (_sound(prior, claim, before) & ~_sound(after, claim, prior)) | _overflows(states[1], states[2])
     predicted = (_finite(before, claim) & ~_finite(prior, claim)) | _overflows(states[0], states[1])
@@ -169,34 +176,34 @@ def _squares(value: jax.Array, covariance: jax.Array, used: jax.Array, size: jax
     return jnp.where(used, squares, 0.0), used & determined
 
 
-def _finite(told: Estimate, claim: Claim) -> jax.Array:
-    finite = ~_some(~jnp.isfinite(jnp.asarray(told.mean)))
-    return finite if claim == "none" else finite & ~_some(~jnp.isfinite(jnp.asarray(told.covariance)))
+def _finite(estimates: Estimate, claim: Claim) -> jax.Array:
+    finite = ~_some(~jnp.isfinite(jnp.asarray(estimates.mean)))
+    return finite if claim == "none" else finite & ~_some(~jnp.isfinite(jnp.asarray(estimates.covariance)))
 
 
-def _sound(told: Estimate, claim: Claim, before: Estimate) -> jax.Array:
+def _sound(estimates: Estimate, claim: Claim, before: Estimate) -> jax.Array:
     """Finite, and no variance below zero by more than the rounding of what was there before."""
     if claim == "none":
-        return _finite(told, claim)
-    left, whole = own(jnp.asarray(told.covariance)), own(jnp.asarray(before.covariance))
+        return _finite(estimates, claim)
+    left, whole = diagonal_of(jnp.asarray(estimates.covariance)), diagonal_of(jnp.asarray(before.covariance))
     rounded = rounding(NEGATIVE_TOLERANCE, left) * jnp.where(jnp.isfinite(whole), jnp.abs(whole), 0.0)
-    return _finite(told, claim) & ~_some(left < -rounded)
+    return _finite(estimates, claim) & ~_some(left < -rounded)
 
 
 def _overflows(before: PyTree, after: PyTree) -> jax.Array:
     """Whether some number of a state became infinite."""
     pairs = zip(jax.tree.leaves(before), jax.tree.leaves(after), strict=True)
-    each = [_some(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
-    return reduce(jnp.logical_or, each, jnp.asarray(False))
+    items = [_some(jnp.isinf(jnp.asarray(b)) & ~jnp.isinf(jnp.asarray(a))) for a, b in pairs if _is_real(b)]
+    return reduce(jnp.logical_or, items, jnp.asarray(False))
 
 
 def _is_real(leaf: Array) -> bool:
     return bool(jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating))
 
 
-def _rounded_away(told: Estimate) -> jax.Array:
+def _rounded_away(estimates: Estimate) -> jax.Array:
     """Of each state whether its deviation is there but below the rounding of its mean."""
-    mean = jnp.asarray(told.mean)
-    variance = own(jnp.asarray(told.covariance))
+    mean = jnp.asarray(estimates.mean)
+    variance = diagonal_of(jnp.asarray(estimates.covariance))
     unit = float(np.finfo(mean.dtype).eps) * jnp.abs(mean)
     return (variance > 0) & (jnp.sqrt(jnp.maximum(variance, 0.0)) < unit)

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.correction import homogeneous
-from heliograph.fusion.cross_covariance import Errors, heard_noise
+from heliograph.filters.gaussian.correction import homogeneous
+from heliograph.fusion.cross_covariance import Errors, observation_noise
 from heliograph.fusion.informed import AbstractInformedFusion, Happened
 from heliograph.fusion.quantizer import widen
 from heliograph.fusion.report_link import Links
@@ -58,7 +58,7 @@ class AllReports(AbstractInformedFusion):
     """
 
     @property
-    def hears_reports(self) -> bool:
+    def uses_reports(self) -> bool:
         """It does."""
         return True
 
@@ -69,8 +69,8 @@ class AllReports(AbstractInformedFusion):
     def use(self, state: Knowledge, happened: Happened, means: Means) -> tuple[Knowledge, Fused]:
         """Move the plant and all errors, then hear the reports; one that is NaN did not arrive."""
         nodes, n = means.shape
-        after, _ = heard(moved(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
-        return after, told(after, n)
+        after, _ = receive_reports(moved(state, happened, faithful(nodes, n)), jnp.asarray(means)[None])
+        return after, fused_estimate(after, n)
 
 
 def faithful(nodes: int, n: int) -> Links:
@@ -83,9 +83,9 @@ def begin(errors: Errors, delays: int, received: int, quantized: bool) -> Knowle
     """Before the first report, where one may be so many steps late; each has `received` numbers."""
     nodes, n = errors.bias.shape
     size = nodes * n
-    own, joint = errors.own.reshape(size, n), errors.joint.reshape(size, size)
+    local, joint = errors.local.reshape(size, n), errors.joint.reshape(size, size)
     later = (0, size * delays)
-    covariance = jnp.pad(jnp.block([[errors.covariance, own.T], [own, joint]]), (later, later))
+    covariance = jnp.pad(jnp.block([[errors.covariance, local.T], [local, joint]]), (later, later))
     mean = jnp.pad(jnp.concatenate([errors.mean, errors.bias.reshape(-1)]), later)
     shapes = (received, n), (received,), (received, received), (n,)
     past = Past(*(jnp.zeros((delays + 1, nodes, *shape)) for shape in shapes))
@@ -97,18 +97,18 @@ def moved(state: Knowledge, happened: Happened, links: Links) -> Knowledge:
     motion, step, noise, _ = happened
     nodes, n, _ = step.transition.shape
     size = nodes * n
-    each = jnp.arange(nodes)
-    errors = jnp.zeros((nodes, n, nodes, n)).at[each, :, each, :].set(step.transition).reshape(size, size)
+    items = jnp.arange(nodes)
+    errors = jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(step.transition).reshape(size, size)
     plant = jnp.pad(jnp.asarray(motion.matrix), ((0, 0), (0, size)))
     transition = jnp.concatenate([plant, jnp.concatenate([step.of_state.reshape(size, n), errors], axis=1)])
     shared = jnp.concatenate([jnp.eye(n), step.of_noise.reshape(size, n)])
-    own = jnp.pad(heard_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
+    local = jnp.pad(observation_noise(step.gain, noise).reshape(size, size), ((n, 0), (n, 0)))
     drift = jnp.concatenate([jnp.asarray(motion.shift), step.drift.reshape(-1)])
-    new = shared @ motion.noise @ shared.T + own
+    new = shared @ motion.noise @ shared.T + local
     later = len(state.mean) - n - size
     if later:
-        kept = _kept(nodes, n, later)
-        transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), kept])
+        stored = _shifted(nodes, n, later)
+        transition = jnp.concatenate([jnp.pad(transition, ((0, 0), (0, later))), stored])
         new, drift = jnp.pad(new, (0, later)), jnp.pad(drift, (0, later))
     return Knowledge(
         transition @ state.mean + drift,
@@ -125,7 +125,7 @@ class Expected(NamedTuple):
     covariance: Float[jax.Array, "M M"]
 
 
-def heard(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Knowledge, Expected]:
+def receive_reports(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Knowledge, Expected]:
     """Use the reports that arrived, by how many steps ago they were sent; NaN for those that did not arrive now.
 
     With zeta- = F zeta and errors mu of quantizers, |mu| <= D, the gain K is that for mu white and even, D^2 / 3; the
@@ -157,7 +157,7 @@ def heard(state: Knowledge, reports: Float[jax.Array, "age node m"]) -> tuple[Kn
     return Knowledge(state.mean + gain @ unexpected, covariance, state.past, spill), Expected(expected, total)
 
 
-def told(state: Knowledge, n: int) -> Fused:
+def fused_estimate(state: Knowledge, n: int) -> Fused:
     """The estimate of x, and the covariance or bound of its error."""
     covariance = state.covariance[:n, :n]
     return state.mean[:n], covariance if state.spill is None else _sum(covariance, state.spill[:n, :n])
@@ -165,10 +165,12 @@ def told(state: Knowledge, n: int) -> Fused:
 
 def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     """What is sent now, before what was sent earlier."""
-    found = happened.errors
-    mean = found.mean - found.bias
-    blocks = jnp.einsum("iaib->iab", found.joint)
-    second = found.covariance - found.own - jnp.swapaxes(found.own, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
+    result = happened.errors
+    mean = result.mean - result.bias
+    blocks = jnp.einsum("iaib->iab", result.joint)
+    second = (
+        result.covariance - result.local - jnp.swapaxes(result.local, 1, 2) + blocks + mean[:, :, None] * mean[:, None]
+    )
     error = jnp.asarray(links.error)
     known = jax.vmap(lambda s, m: homogeneous(s, m, 1.0))(second, mean)
     known = jax.vmap(widen)(known, jnp.pad(error, ((0, 0), (0, 1))))
@@ -177,7 +179,7 @@ def _with_new(past: Past, happened: Happened, links: Links) -> Past:
     return Past(*(jnp.concatenate([a[None], b[:-1]]) for a, b in zip(new, past, strict=True)))
 
 
-def _kept(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
+def _shifted(nodes: int, n: int, later: int) -> Float[np.ndarray, "later N"]:
     """x - e_i becomes what was sent a step ago, what was sent a step ago becomes what was sent two steps ago."""
     size = nodes * n
     sent = np.concatenate([np.tile(np.eye(n), (nodes, 1)), -np.eye(size), np.zeros((size, later))], axis=1)
@@ -207,10 +209,10 @@ def _quantized(past: Past, present: jax.Array) -> Float[jax.Array, "M S"]:
 def _along_diagonal(blocks: Float[jax.Array, "age node a b"]) -> Float[jax.Array, "M S"]:
     """One block after another, zero elsewhere."""
     ages, nodes, rows, columns = blocks.shape
-    each = jnp.arange(ages * nodes)
-    empty = jnp.zeros((len(each), rows, len(each), columns))
-    full = empty.at[each, :, each, :].set(blocks.reshape(-1, rows, columns))
-    return full.reshape(len(each) * rows, len(each) * columns)
+    items = jnp.arange(ages * nodes)
+    empty = jnp.zeros((len(items), rows, len(items), columns))
+    full = empty.at[items, :, items, :].set(blocks.reshape(-1, rows, columns))
+    return full.reshape(len(items) * rows, len(items) * columns)
 
 
 def _within(into: Float[jax.Array, "N S"], error: Float[jax.Array, " S"]) -> Float[jax.Array, "N N"]:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from heliograph.filters.plan import Plan
+from heliograph.filters.linear.plan import Plan
 from heliograph.numerics.linalg import cholesky, symmetrize
 from heliograph.numerics.small_matrix import rounding
 from heliograph.numerics.types import Array, Float
@@ -27,7 +27,7 @@ class Motion(NamedTuple):
     noise: Float[Array, "n n"]
 
 
-class Hearing(NamedTuple):
+class Observation(NamedTuple):
     """What the nodes hear of x after a step, z_i = M_i x + o_i + nu_i; rows that a node has not are zero.
 
     Shapes: gain M (node, m, n), offset o (node, m); noise E[nu_i nu_j'] (node, m, node, m), or (node, m, m) where nodes
@@ -48,7 +48,7 @@ class Errors(NamedTuple):
     mean: Float[jax.Array, " n"]
     covariance: Float[jax.Array, "n n"]
     bias: Float[jax.Array, "node n"]
-    own: Float[jax.Array, "node n n"]
+    local: Float[jax.Array, "node n n"]
     joint: Float[jax.Array, "node n node n"]
 
 
@@ -66,23 +66,23 @@ def initial_errors(mean: Float[Array, " n"], covariance: Float[Array, "n n"], st
     """Before the first step: every filter starts at a known place, so all errors are x_0 but for their means."""
     mean, covariance, starts = jnp.asarray(mean), jnp.asarray(covariance), jnp.asarray(starts)
     nodes, n = starts.shape
-    own = jnp.broadcast_to(covariance, (nodes, n, n))
+    values = jnp.broadcast_to(covariance, (nodes, n, n))
     joint = jnp.broadcast_to(covariance[None, :, None, :], (nodes, n, nodes, n))
-    return Errors(mean, covariance, mean - starts, own, joint)
+    return Errors(mean, covariance, mean - starts, values, joint)
 
 
-def error_step(local: Plan, motion: Motion, hearing: Hearing) -> ErrorStep:
+def error_step(local: Plan, motion: Motion, observation: Observation) -> ErrorStep:
     """The errors' own recursion; `local` has a leading axis of nodes."""
     gain, identity = jnp.asarray(local.gain), jnp.eye(motion.matrix.shape[-1])
     keep = identity - gain @ local.output
-    astray = gain @ _difference(hearing.gain, local.output)
+    astray = gain @ _difference(observation.gain, local.output)
     moves = _difference(jnp.broadcast_to(motion.matrix, local.transition.shape), local.transition)
     shifts = _difference(jnp.broadcast_to(motion.shift, local.drift.shape), local.drift)
     drift = _times(keep, shifts) - astray @ jnp.asarray(motion.shift)
     return ErrorStep(
         transition=keep @ local.transition,
         of_state=keep @ moves - astray @ motion.matrix,
-        drift=drift - _times(gain, _difference(hearing.offset, local.offset)),
+        drift=drift - _times(gain, _difference(observation.offset, local.offset)),
         of_noise=keep - astray,
         gain=gain,
     )
@@ -101,16 +101,16 @@ def advance(errors: Errors, step: ErrorStep, motion: Motion, noise: Array) -> Er
     nodes, n = errors.bias.shape
     mean, covariance = moved_state(errors.mean, errors.covariance, motion)
     bias = _times(step.transition, errors.bias) + step.of_state @ errors.mean + step.drift
-    carried = step.transition @ errors.own  # Cov(T e, x)
+    carried = step.transition @ errors.local  # Cov(T e, x)
     of_state = step.of_state @ errors.covariance
     of_noise = step.of_noise @ motion.noise
-    own = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
+    local = (carried + of_state) @ jnp.asarray(motion.matrix).T + of_noise
     left = jnp.concatenate([carried + of_state, step.of_state, of_noise], axis=-1).reshape(nodes * n, -1)
     right = jnp.concatenate([step.of_state, carried, step.of_noise], axis=-1).reshape(nodes * n, -1)
     once = jnp.einsum("iab,ibc->iac", step.transition, errors.joint.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     both = jnp.einsum("iab,ibc->iac", step.transition, once.T.reshape(nodes, n, -1)).reshape(nodes * n, -1)
     joint = (both + left @ right.T).reshape(nodes, n, nodes, n)
-    return Errors(mean, covariance, bias, own, joint + heard_noise(step.gain, noise))
+    return Errors(mean, covariance, bias, local, joint + observation_noise(step.gain, noise))
 
 
 class Factors(NamedTuple):
@@ -124,7 +124,7 @@ class Factors(NamedTuple):
     state: Float[jax.Array, "n sources"]
     bias: Float[jax.Array, "node n"]
     shared: Float[jax.Array, "node n sources"]
-    own: Float[jax.Array, "node n n"]
+    local: Float[jax.Array, "node n n"]
 
 
 def initial_factors(errors: Errors, sources: int) -> Factors:
@@ -142,12 +142,12 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
     state = jnp.asarray(motion.matrix) @ factors.state
     shared = step.transition @ factors.shared + step.of_state @ factors.state
     bias = _times(step.transition, factors.bias) + step.of_state @ factors.mean + step.drift
-    moved = step.transition @ factors.own @ jnp.swapaxes(step.transition, 1, 2)
+    moved = step.transition @ factors.local @ jnp.swapaxes(step.transition, 1, 2)
     new = step.of_noise @ root
     if noise.ndim == 4:
         m = noise.shape[1]
-        heard = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
-        new = jnp.concatenate([new, -step.gain @ heard], axis=-1)
+        received = cholesky(jnp.asarray(noise).reshape(nodes * m, nodes * m)).reshape(nodes, m, nodes * m)
+        new = jnp.concatenate([new, -step.gain @ received], axis=-1)
         root = jnp.pad(root, ((0, 0), (0, nodes * m)))
     else:
         moved = symmetrize(moved + step.gain @ noise @ jnp.swapaxes(step.gain, 1, 2))
@@ -161,14 +161,14 @@ def advance_factors(factors: Factors, step: ErrorStep, motion: Motion, noise: Ar
     )
 
 
-def heard_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:
+def observation_noise(gain: Float[jax.Array, "node n m"], noise: Array) -> Float[jax.Array, "node n node n"]:
     """K_i S_ij K_j', zero between nodes that share nothing."""
     if noise.ndim == 4:
         return jnp.einsum("iam,imjl,jbl->iajb", gain, noise, gain)
     nodes, n, _ = gain.shape
-    each = jnp.arange(nodes)
+    items = jnp.arange(nodes)
     blocks = symmetrize(gain @ noise @ jnp.swapaxes(gain, 1, 2))
-    return jnp.zeros((nodes, n, nodes, n)).at[each, :, each, :].set(blocks)
+    return jnp.zeros((nodes, n, nodes, n)).at[items, :, items, :].set(blocks)
 
 
 def _difference(a: Array, b: Array) -> jax.Array:

@@ -35,18 +35,18 @@ class EventSending(AbstractQuantizer):
     """
 
     threshold: Float[Array, "..."]
-    told: bool = eqx.field(static=True, default=True)
+    announced: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, threshold: ArrayLike, told: bool = True):
+    def __init__(self, threshold: ArrayLike, announced: bool = True):
         self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)
-        self.told = told
+        self.announced = announced
 
     @property
     def silent(self) -> bool:
         """Whether nothing may arrive."""
-        return not self.told
+        return not self.announced
 
     @in_float64
     def init(self, n: int) -> LastSent:
@@ -60,15 +60,17 @@ class EventSending(AbstractQuantizer):
         there = ~jnp.any(jnp.isnan(x))
         sent = there & (~state.any | jnp.any(jnp.abs(x - state.value) > self.threshold))
         held = LastSent(jnp.where(sent, x, state.value), state.any | sent)
-        heard = jnp.where(there & (sent | self.told), held.value, jnp.nan)
-        error = jnp.where(jnp.isnan(heard), jnp.nan, self.error(len(x)))
-        return held, Quantized(heard, error, jnp.zeros(len(x), dtype=bool), jnp.where(sent, jnp.ones(len(x), int), 0))
+        received = jnp.where(there & (sent | self.announced), held.value, jnp.nan)
+        error = jnp.where(jnp.isnan(received), jnp.nan, self.error(len(x)))
+        return held, Quantized(
+            received, error, jnp.zeros(len(x), dtype=bool), jnp.where(sent, jnp.ones(len(x), int), 0)
+        )
 
     def error(self, n: int) -> Float[Array, " n"]:
         """The thresholds, where silence is understood."""
         bound = library(self.threshold).broadcast_to(self.threshold, (n,))
-        return bound if self.told else np.zeros(n)
+        return bound if self.announced else np.zeros(n)
 
     def claim(self, claim: Claim) -> Claim:
         """At most "upper", where silence is understood; else "nominal"."""
-        return weakest([claim, "upper" if self.told else "nominal"])
+        return weakest([claim, "upper" if self.announced else "nominal"])

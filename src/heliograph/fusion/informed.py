@@ -77,11 +77,11 @@ class AbstractWeights(AbstractInformedFusion):
 
     def use(self, state: PyTree, happened: Happened, means: Means) -> tuple[PyTree, Fused]:
         """Weigh what is said now."""
-        found = happened.errors
-        unbiased, joint = jnp.asarray(means) + found.bias, found.joint
+        result = happened.errors
+        unbiased, joint = jnp.asarray(means) + result.bias, result.joint
         if self.with_mean:
-            unbiased = jnp.concatenate([unbiased, found.mean[None]])
-            joint = with_mean(found)
+            unbiased = jnp.concatenate([unbiased, result.mean[None]])
+            joint = with_mean(result)
         chosen = self.weights(joint)
         # W sums to I: of differences, since digits that W lacks would count against the size of the means.
         mean = unbiased[0] + jnp.einsum("aib,ib->a", chosen, unbiased - unbiased[0])
@@ -90,8 +90,8 @@ class AbstractWeights(AbstractInformedFusion):
 
 def with_mean(errors: Errors) -> Joint:
     """Joint covariance of the errors and of x - E x, the error of the plant's own mean."""
-    column = errors.own[:, :, None, :]
-    last = jnp.concatenate([jnp.moveaxis(errors.own, 2, 0), errors.covariance[:, None, :]], axis=1)
+    column = errors.local[:, :, None, :]
+    last = jnp.concatenate([jnp.moveaxis(errors.local, 2, 0), errors.covariance[:, None, :]], axis=1)
     return jnp.concatenate([jnp.concatenate([errors.joint, column], axis=2), last[None]], axis=0)
 
 

@@ -198,16 +198,16 @@ def inverses(matrices: Float[jax.Array, "count n n"]) -> Float[jax.Array, "count
     known by itself KNOWN of the largest variance that any of the estimates has for it (1 where all know it): the limit,
     to KNOWN of each component's own scale, and never less.
     """
-    own = jnp.diagonal(matrices, axis1=1, axis2=2)
-    largest = jnp.max(own, axis=0)
-    reference = jnp.where(own > 0, own, jnp.where(largest > 0, largest, 1.0))
+    local = jnp.diagonal(matrices, axis1=1, axis2=2)
+    largest = jnp.max(local, axis=0)
+    reference = jnp.where(local > 0, local, jnp.where(largest > 0, largest, 1.0))
     return jax.vmap(_widened_inverse)(matrices, KNOWN * reference)
 
 
 @runs_last
 def _widened_inverse(a: jax.Array, least: jax.Array) -> jax.Array:
     _, scales = factor(a)  # 1 / root of what those before it leave of a component: rounding where that is next to none
-    none = jnp.stack([jnp.where((s == 0) | (s**2 * one > 1), 1.0, 0.0) for s, one in zip(scales, least, strict=True)])
+    none = jnp.stack([jnp.where((s == 0) | (s**2 * item > 1), 1.0, 0.0) for s, item in zip(scales, least, strict=True)])
     return inverse(a + diagonal(none * least))
 
 

@@ -38,7 +38,7 @@ class AbstractFusion(Module):
     """
 
     @property
-    def hears_reports(self) -> bool:
+    def uses_reports(self) -> bool:
         """Whether it makes something of reports that fade, are late, or never arrive."""
         return False
 
@@ -236,13 +236,13 @@ class Fusion(Module):
         self.rule.check(len(nodes))
         if isinstance(self.quantizer, Mapping) and set(self.quantizer) != set(nodes):
             raise fail("quantizers", f"one for each node of {list(nodes)}", list(self.quantizer))
-        for item in self._each(nodes):
+        for item in self._quantizers(nodes):
             if not isinstance(first(item), AbstractQuantizer):
                 raise fail("quantizer", "an AbstractQuantizer", type(item).__name__)
             first(item).check(n)
-            if first(item).silent and not self.rule.hears_reports:
-                wanted = "a rule that hears reports (AllReports)"
-                raise fail(f"fusion through {type(first(item)).__name__}", wanted, type(self.rule).__name__)
+            if first(item).silent and not self.rule.uses_reports:
+                expected = "a rule that hears reports (AllReports)"
+                raise fail(f"fusion through {type(first(item)).__name__}", expected, type(self.rule).__name__)
         if self.by_report:
             self._check_reports(nodes, n)
         self.uplinks(nodes)
@@ -250,16 +250,16 @@ class Fusion(Module):
     @property
     def by_report(self) -> bool:
         """Whether the centre hears reports that may not be what was sent."""
-        return self.uplink is not None or (self.rule.hears_reports and self.quantizer is not None)
+        return self.uplink is not None or (self.rule.uses_reports and self.quantizer is not None)
 
     def _check_reports(self, nodes: Sequence[str], n: int) -> None:
-        if not self.rule.hears_reports:
+        if not self.rule.uses_reports:
             raise fail("fusion over report links", "a rule that hears reports (AllReports)", type(self.rule).__name__)
         if isinstance(self.uplink, Mapping) and set(self.uplink) != set(nodes):
             raise fail("report links", f"one for each node of {list(nodes)}", list(self.uplink))
         for link in self.links(nodes):
             instance("report link", link, ReportLink, "a ReportLink").check(n)
-        for item in self._each(nodes):
+        for item in self._quantizers(nodes):
             if isinstance(item, OverTime):
                 raise fail("quantizer of reports", "one that does not vary over time", "an OverTime")
             item.error(n)
@@ -272,7 +272,7 @@ class Fusion(Module):
 
     def quantizers(self, nodes: Sequence[str]) -> list[AbstractQuantizer]:
         """The quantizers of these nodes' reports, which do not vary over time; none where there are none."""
-        return [item for item in self._each(nodes) if isinstance(item, AbstractQuantizer)]
+        return [item for item in self._quantizers(nodes) if isinstance(item, AbstractQuantizer)]
 
     def uplinks(self, nodes: Sequence[str]) -> Quantizer | None:
         """The quantizers of these nodes stacked along a leading axis; None where estimates arrive as they are.
@@ -280,17 +280,17 @@ class Fusion(Module):
         Raises:
             ValueError: quantizers of different kinds.
         """
-        return None if self.quantizer is None else stack(self._each(nodes))
+        return None if self.quantizer is None else stack(self._quantizers(nodes))
 
     def claim(self, claims: list[Claim]) -> Claim:
         """What the fused covariance claims, from what the filters claim."""
         if self.quantizer is None:
             return self.rule.claim(claims)
-        one = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
-        kind = one.values if isinstance(one, OverTime) else one
+        item = next(iter(self.quantizer.values())) if isinstance(self.quantizer, Mapping) else self.quantizer
+        kind = item.values if isinstance(item, OverTime) else item
         return self.rule.claim([kind.claim(claim) for claim in claims])
 
-    def _each(self, nodes: Sequence[str]) -> list[Quantizer]:
+    def _quantizers(self, nodes: Sequence[str]) -> list[Quantizer]:
         if self.quantizer is None:
             return []
         return [self.quantizer[n] if isinstance(self.quantizer, Mapping) else self.quantizer for n in nodes]

@@ -33,22 +33,22 @@ class SplitIntersection(AbstractFusion):
     known: Float[Array, "node n node n"]
 
     def __init__(self, known: ArrayLike):
-        found = array("known part", known, (None,) * rank("known part", known))
-        if found.ndim == 3 and found.shape[1] == found.shape[2]:
-            nodes, n, _ = found.shape
-            each = np.arange(nodes)
+        values = array("known part", known, (None,) * rank("known part", known))
+        if values.ndim == 3 and values.shape[1] == values.shape[2]:
+            nodes, n, _ = values.shape
+            items = np.arange(nodes)
             joint = np.zeros((nodes, n, nodes, n))
-            joint[each, :, each, :] = found
-            found = joint
-        if found.ndim != 4 or found.shape[:2] != found.shape[2:]:
-            raise fail("known part", "shape (nodes, n, nodes, n) or (nodes, n, n)", f"shape {found.shape}")
-        flat = found.reshape(found.shape[0] * found.shape[1], -1)
+            joint[items, :, items, :] = values
+            values = joint
+        if values.ndim != 4 or values.shape[:2] != values.shape[2:]:
+            raise fail("known part", "shape (nodes, n, nodes, n) or (nodes, n, n)", f"shape {values.shape}")
+        flat = values.reshape(values.shape[0] * values.shape[1], -1)
         scale = np.abs(flat).max(initial=0.0)
         if not np.allclose(flat, flat.T, rtol=0, atol=DEFINITENESS_TOLERANCE * scale) or (
             np.linalg.eigvalsh(flat)[0] < -DEFINITENESS_TOLERANCE * scale
         ):
             raise fail("known part", "a covariance of all parts together", "a matrix that is none")
-        self.known = found
+        self.known = values
 
     def check(self, count: int) -> None:
         """As many parts as estimates."""
@@ -65,11 +65,11 @@ class SplitIntersection(AbstractFusion):
         """Weights for shares, then shares as the roots of tr W_i P^b_i W_i': tr W P(w) W' falls with each."""
         known = jnp.asarray(self.known)
         count = len(means)
-        each = jnp.arange(count)
-        unknown = covariances - known[each, :, each, :]
+        items = jnp.arange(count)
+        unknown = covariances - known[items, :, items, :]
 
         def above(shares: jax.Array) -> jax.Array:
-            return known.at[each, :, each, :].add(unknown / shares[:, None, None])
+            return known.at[items, :, items, :].add(unknown / shares[:, None, None])
 
         def better(_: int, shares: jax.Array) -> jax.Array:
             weights = matrix_weights(above(shares))

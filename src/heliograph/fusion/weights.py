@@ -50,21 +50,21 @@ def matrix_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     scaled = joint / (unit[:, None, None] * unit)
     total = symmetrize((scaled + jnp.eye(n)[None, :, None, :]).reshape(nodes * n, nodes * n))
     ones = jnp.tile(jnp.eye(n), (nodes, 1))
-    found = solve_known(total, ones).T  # E' U^+
-    weights = regular_solve(found @ ones, found).reshape(n, nodes, n)
+    result = solve_known(total, ones).T  # E' U^+
+    weights = regular_solve(result @ ones, result).reshape(n, nodes, n)
     return jnp.asarray(unit[:, None, None] * weights / unit)
 
 
 @compiled
 def factored_weights(
-    shared: Float[Array, "node n sources"], own: Float[Array, "node n n"]
+    shared: Float[Array, "node n sources"], local: Float[Array, "node n n"]
 ) -> Float[jax.Array, "n node n"]:
     """`matrix_weights` of P = L L' + blockdiag(B_i) with every B_i positive definite, at a cost linear in nodes.
 
     P^-1 E = B^-1 E - B^-1 L (I + L' B^-1 L)^-1 L' B^-1 E.
     """
     nodes, n, sources = shared.shape
-    factors = jnp.linalg.cholesky(jnp.asarray(own))
+    factors = jnp.linalg.cholesky(jnp.asarray(local))
     both = jnp.concatenate([jnp.asarray(shared), jnp.broadcast_to(jnp.eye(n), (nodes, n, n))], axis=-1)
     white = jax.lax.linalg.triangular_solve(factors, both, left_side=True, lower=True).reshape(nodes * n, -1)
     common, e = white[:, :sources], white[:, sources:]
@@ -84,8 +84,8 @@ def diagonal_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "
     """The best weights for each component of the state by itself, diagonal W_i."""
     nodes, n = joint.shape[:2]
     component = jnp.einsum("iaja->aij", jnp.asarray(joint))
-    each = jax.vmap(lambda one: matrix_weights(one.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
-    return jnp.einsum("ai,ab->aib", each, jnp.eye(n))
+    items = jax.vmap(lambda item: matrix_weights(item.reshape(nodes, 1, nodes, 1))[0, :, 0])(component)
+    return jnp.einsum("ai,ab->aib", items, jnp.eye(n))
 
 
 @_of_joint
@@ -94,8 +94,8 @@ def scalar_weights(joint: Float[Array, "node n node n"]) -> Float[jax.Array, "n 
     """One number for each estimate, W_i = w_i I, that make tr W P W' smallest."""
     nodes, n = joint.shape[:2]
     traces = jnp.einsum("iaja->ij", jnp.asarray(joint))
-    one = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
-    return jnp.einsum("i,ab->aib", one, jnp.eye(n))
+    item = matrix_weights(traces.reshape(nodes, 1, nodes, 1))[0, :, 0]
+    return jnp.einsum("i,ab->aib", item, jnp.eye(n))
 
 
 def solve_known(total: Float[jax.Array, "N N"], right: Float[jax.Array, "N q"]) -> Float[jax.Array, "N q"]:

@@ -66,7 +66,7 @@ def certify_level(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     level = float(scalar("level", level))
-    growth = [instance("growth", one, GrowthFinding, FINDINGS) for one in items("growth", growth, FINDINGS)]
+    growth = [instance("growth", item, GrowthFinding, FINDINGS) for item in items("growth", growth, FINDINGS)]
     n, m, T = system.states, system.received, system.steps
     if not level > 0:
         raise fail("level", "a positive number", level)
@@ -77,11 +77,11 @@ def certify_level(
     tops, negative = np.array([_largest(phi) for phi in matrices]), np.array([is_negative(phi) for phi in matrices])
     allowed = level**2 * system.initial_weight
     initial = float(np.linalg.eigvalsh(allowed - P[0])[0])
-    own = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
+    local = smallest_eigenvalue(allowed - P[0], np.sqrt(np.diagonal(allowed)))
     definite = np.array([smallest_eigenvalue(p) for p in P])
-    margin = min(own, *(-_scaled_largest(phi) for phi in matrices))
+    margin = min(local, *(-_scaled_largest(phi) for phi in matrices))
     reasons = [f"step {k}: the largest eigenvalue is {tops[k]:.3g}, not negative" for k in np.flatnonzero(~negative)]
-    if not own > ROUNDING:
+    if not local > ROUNDING:
         reasons.append(f"initial condition: the smallest eigenvalue of level^2 W - P_0 is {initial:.3g}, not positive")
     reasons += [f"P_{k} is not positive definite ({definite[k]:.3g})" for k in np.flatnonzero(~(definite > ROUNDING))]
     reasons += [f"step {k}: a multiplier is negative" for k in np.flatnonzero((lam < 0).any(axis=1))]
@@ -111,12 +111,12 @@ def _supports(finding: GrowthFinding, constant: float) -> bool:
 
 def _constants(system: GrowthSystem) -> list[tuple[float, str]]:
     """The growth constants that are not zero, each once, with what each bounds."""
-    found: dict[tuple[float, str], None] = {}
+    results: dict[tuple[float, str], None] = {}
     for letter, growth in (("f", system.growth), ("h", system.output_growth)):
         for what, values in ((f"|{letter}(x)| <= a |x|", growth.state), ("", growth.error)):
             whole = what or f"|{letter}(x) - {letter}(y)| <= a |x - y|"
-            found |= {(float(value), whole): None for value in values if value > 0}
-    return list(found)
+            results |= {(float(value), whole): None for value in values if value > 0}
+    return list(results)
 
 
 def _assumed(constants: list[tuple[float, str]], growth: Sequence[GrowthFinding]) -> tuple[str, ...]:
@@ -159,12 +159,12 @@ def theorem_matrix(
 
     signal = np.concatenate([row(y, x=C, h=eye(y), v=D), row(r, r=eye(r))])
     expected = link.mean[:, :y] @ row(y, x=C, e=-C, h=eye(y), d=-eye(y))  # G-bar (C xhat + h(xhat))
-    own = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
+    values = np.concatenate([row(n, x=A, f=eye(n), v=B), row(n, e=A, g=eye(n), v=B) + gain @ expected])
     correction = np.concatenate([np.zeros_like(gain), gain])
     inner = correction.T @ following @ correction
-    cross = own.T @ following @ correction @ link.mean @ signal
+    cross = values.T @ following @ correction @ link.mean @ signal
     spread = signal.T @ np.einsum("ai,abij->bj", inner, link.second) @ signal
-    phi = own.T @ following @ own - cross - cross.T + spread
+    phi = values.T @ following @ values - cross - cross.T + spread
     phi[: 2 * n, : 2 * n] -= weight
     phi[n : 2 * n, n : 2 * n] += M.T @ M
     sizes = [level**2] * (v + r)
@@ -182,11 +182,11 @@ def _without_absent(
     phi: Float[np.ndarray, "q q"], at: dict[str, int], y: int, system: GrowthSystem
 ) -> Float[np.ndarray, "kept kept"]:
     """Leave out f and f~, or h and h~, where the function is zero throughout."""
-    kept = list(range(len(phi)))
+    stored = list(range(len(phi)))
     for growth, name, width in ((system.growth, "f", 2 * system.states), (system.output_growth, "h", 2 * y)):
         if growth.absent:
-            kept = [i for i in kept if not at[name] <= i < at[name] + width]
-    return np.asarray(phi[np.ix_(kept, kept)])
+            stored = [i for i in stored if not at[name] <= i < at[name] + width]
+    return np.asarray(phi[np.ix_(stored, stored)])
 
 
 def _multipliers(given: Float[np.ndarray, "steps count"]) -> Float[np.ndarray, "steps 4"]:

@@ -45,7 +45,7 @@ def _survives(system: GrowthSystem, scale: Float[np.ndarray, "steps _"], level: 
     weight = level**2 * system.initial_weight
     for k in range(system.steps):
         reduced = weight.copy()
-        reduced[n:, n:] -= system.wanted[k].T @ system.wanted[k]
+        reduced[n:, n:] -= system.target[k].T @ system.target[k]
         multiplier = np.linalg.eigvalsh(reduced / np.outer(scale[k], scale[k]))[0]
         if multiplier <= 0:
             return False
@@ -89,14 +89,14 @@ def _riccati(system: GrowthSystem, level: float, multipliers: Float[np.ndarray, 
     weights[0] = np.diag(np.repeat([state, start], n))
     design = HInfinityDesign(level, gains, weights, np.full((steps, 4), np.nan), False, "")
     for k in range(steps):
-        found = _best_gain(system, k, weights[k, n:, n:], inner, multipliers[k])
-        if found is None:
+        result = _best_gain(system, k, weights[k, n:, n:], inner, multipliers[k])
+        if result is None:
             text = f"no gain exists at step {k} of {steps} with these multipliers"
             return design._replace(status=text, failed_step=k)
-        gains[k], error = found
-        state, own = _state_weight(system, k, state)
+        gains[k], error = result
+        state, local = _state_weight(system, k, state)
         weights[k + 1] = np.block([[state * np.eye(n), np.zeros((n, n))], [np.zeros((n, n)), error]])
-        design.multipliers[k] = [own[0], multipliers[k, 0], own[1], multipliers[k, 1]]
+        design.multipliers[k] = [local[0], multipliers[k, 0], local[1], multipliers[k, 1]]
     return design._replace(feasible=True, status="optimal")
 
 
@@ -119,9 +119,9 @@ def _best_gain(
         parts.append((np.zeros((n, y)), gain, np.eye(y) / multipliers[1]))
     parts.append((B, gain @ D, np.eye(v) / level**2))
     parts.append((np.zeros((n, r)), noise, np.eye(r) / level**2))
-    forward, heard = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
+    forward, received = (np.concatenate([part[i] for part in parts], axis=1) for i in (0, 1))
     inverse = block_diag(*(part[2] for part in parts))
-    cross, spread = heard @ inverse @ forward.T, heard @ inverse @ heard.T
+    cross, spread = received @ inverse @ forward.T, received @ inverse @ received.T
     best = np.linalg.lstsq(spread, cross, rcond=None)[0].T
     following = np.linalg.inv(forward @ inverse @ forward.T - best @ cross)
     return best, (1 - SLACK) * (following + following.T) / 2

@@ -144,8 +144,8 @@ def horizon_design(
     n, m = system.states, system.received
     given = None if gains is None else np.asarray(array("gains", gains, (system.steps, n, m)))
     steps, coordinates = scale(system, step_matrices(system, separate), given)
-    own = None if given is None else np.zeros((n, m))  # beside the given ones
-    layouts = [Layout(n, m, len(s.growth), own) for s in steps]
+    local = None if given is None else np.zeros((n, m))  # beside the given ones
+    layouts = [Layout(n, m, len(s.growth), local) for s in steps]
     start = None if initial is None else coordinates.scaled_weight(_weight(initial, n), 0)
     allowed = coordinates.unit**2 * coordinates.scaled_weight(system.initial_weight, 0)
     problem = HorizonProblem(steps, layouts, allowed, start)
@@ -154,11 +154,11 @@ def horizon_design(
     if not status.startswith("optimal") or values is None:
         return _empty(system, separate, float("nan"), f"no level could be proven over the horizon ({status})")
     parts = [np.asarray(values[place]) for place in problem.places]
-    found = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
+    results = [layout.unpack(part) for layout, part in zip(layouts, parts[1:], strict=True)]
     square = float(parts[0][0])
-    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, found)]
-    for k, (step, unknowns) in enumerate(zip(steps, found, strict=True)):
-        fixed = step.wanted - square * step.energy
+    weights = [(1 - MARGIN) * square * allowed if start is None else start, *map(_block, results)]
+    for k, (step, unknowns) in enumerate(zip(steps, results, strict=True)):
+        fixed = step.target - square * step.energy
         fixed[: 2 * n, : 2 * n] -= weights[k]
         if not _holds(step, unknowns, fixed, SCREEN * square):
             text = f"the solver's answer fails at step {k} ({status})"
@@ -166,8 +166,8 @@ def horizon_design(
     level = float(np.sqrt(square)) * coordinates.unit
     chosen = given
     if chosen is None:
-        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(found)])
-    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(found)])
+        chosen = np.array([coordinates.gain(steps[k].nominal + _gain(u), k) for k, u in enumerate(results)])
+    multipliers = np.array([coordinates.multipliers(u, k) for k, u in enumerate(results)])
     unscaled = np.array([coordinates.weight(weight, k) for k, weight in enumerate(weights)])
     proven = all_multipliers(system, multipliers, separate)
     return HInfinityDesign(level, chosen, unscaled, proven, True, status)
@@ -193,23 +193,23 @@ class _Recursion:
             return design._replace(status="the initial condition 0 < P_0 < level^2 W fails", failed_step=0)
         design.weights[0] = relative * c.weight(present, 0)
         for k, step in enumerate(self.steps):
-            fixed = step.wanted / relative - step.energy
+            fixed = step.target / relative - step.energy
             fixed[: 2 * n, : 2 * n] -= present
-            status, found = self._problem(k, present if k == 0 else None).solve(fixed)
-            if found is None or not _holds(step, found, fixed, SCREEN):
+            status, result = self._problem(k, present if k == 0 else None).solve(fixed)
+            if result is None or not _holds(step, result, fixed, SCREEN):
                 text = f"no gain found at step {k} of {system.steps} ({status})"
                 return design._replace(status=text, failed_step=k)
-            present = _block(found)
-            design.gains[k] = c.gain(step.nominal + _gain(found), k)
+            present = _block(result)
+            design.gains[k] = c.gain(step.nominal + _gain(result), k)
             design.weights[k + 1] = relative * c.weight(present, k + 1)
-            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(found, k), self.separate)
+            design.multipliers[k] = all_multipliers(system, relative * c.multipliers(result, k), self.separate)
         return design._replace(feasible=True, status="optimal")
 
     def _problem(self, k: int, start: Float[np.ndarray, "w w"] | None) -> StepProblem:
         step, sizes = self.steps[k], self.coordinates.ratio(k + 1)
         coupling = _coupling(start, self.system.states)
-        for one, own, coupled, problem in self.compiled:
-            if all(map(np.array_equal, one, step)) and own == sizes and coupled is coupling is None:
+        for item, single, coupled, problem in self.compiled:
+            if all(map(np.array_equal, item, step)) and single == sizes and coupled is coupling is None:
                 return problem
         problem = StepProblem(step, self.layout, self.objective, self.solver, sizes, coupling)
         self.compiled.append((step, sizes, coupling, problem))
@@ -225,23 +225,23 @@ def _weight(initial: ArrayLike, n: int) -> Float[np.ndarray, "w w"]:
     return symmetric_weight("initial weight P_0", array("initial weight P_0", initial, (2 * n, 2 * n)))
 
 
-def _holds(step: StepMatrices, found: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
+def _holds(step: StepMatrices, unknowns: Unknowns, fixed: Float[np.ndarray, "q q"], strictness: float) -> bool:
     """Whether a solver's answer satisfies the inequality with Z = K'P2 K itself, strictly."""
-    gain = _gain(found)
-    exact = found._replace(product=found.error @ gain, spread=gain.T @ found.error @ gain)
-    positive = min(np.linalg.eigvalsh(found.state)[0], np.linalg.eigvalsh(found.error)[0]) > 0
+    gain = _gain(unknowns)
+    exact = unknowns._replace(product=unknowns.error @ gain, spread=gain.T @ unknowns.error @ gain)
+    positive = min(np.linalg.eigvalsh(unknowns.state)[0], np.linalg.eigvalsh(unknowns.error)[0]) > 0
     return bool(positive and np.linalg.eigvalsh(next_energy(step, exact) + fixed)[-1] < -strictness)
 
 
-def _gain(found: Unknowns) -> Float[np.ndarray, "n m"]:
+def _gain(unknowns: Unknowns) -> Float[np.ndarray, "n m"]:
     """K - K0 = P2^-1 Y."""
-    return np.asarray(np.linalg.solve(found.error, found.product))
+    return np.asarray(np.linalg.solve(unknowns.error, unknowns.product))
 
 
-def _block(found: Unknowns) -> Float[np.ndarray, "w w"]:
+def _block(unknowns: Unknowns) -> Float[np.ndarray, "w w"]:
     """diag(P1, P2)."""
-    zero = np.zeros_like(found.state)
-    return np.block([[found.state, zero], [zero, found.error]])
+    zero = np.zeros_like(unknowns.state)
+    return np.block([[unknowns.state, zero], [zero, unknowns.error]])
 
 
 def _empty(system: GrowthSystem, separate: bool, level: float, status: str) -> HInfinityDesign:

@@ -80,8 +80,8 @@ class GrowthFinding(NamedTuple):
             why = self.reason or (
                 "nothing is proved" if self.bound is None else f"slopes up to {self.bound:.6g} proved"
             )
-            found = f"not refuted {where} (largest slope {self.slope:.6g})"
-            return f"{self.name}: constant {self.constant:g} is assumed: {found}; {why}"
+            result = f"not refuted {where} (largest slope {self.slope:.6g})"
+            return f"{self.name}: constant {self.constant:g} is assumed: {result}; {why}"
         return f"{self.name}: constant {self.constant:g} is false {where}: {self._evidence()}"
 
     def _evidence(self) -> str:
@@ -168,9 +168,9 @@ class _Tools:
 
     def slope(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count"]:
         """Norm of the Jacobian."""
-        found = np.asarray(self.jacobian(points))
-        finite = np.isfinite(found).all(axis=(-2, -1))
-        safe = np.where(finite[:, None, None], found, 0.0)
+        values = np.asarray(self.jacobian(points))
+        finite = np.isfinite(values).all(axis=(-2, -1))
+        safe = np.where(finite[:, None, None], values, 0.0)
         return np.where(finite, np.linalg.norm(safe, 2, axis=(-2, -1)), np.inf)
 
     def steepest(self, points: Float[np.ndarray, "count n"]) -> Float[np.ndarray, "count n"]:
@@ -204,14 +204,14 @@ def _finding(
     slopes, ratios = tools.slope(points), tools.ratio(pairs)
     best, pair = int(np.argmax(slopes)), int(np.argmax(ratios))
     x, y = np.split(pairs[pair], 2)
-    found = GrowthFinding(
+    result = GrowthFinding(
         name, float(constant), low, high, float(slopes[best]), points[best], (x, y), float(ratios[pair]),
         tools.at_zero(len(low)), None, "", differences,
     )  # fmt: skip
-    if found.refuted:
-        return found
-    bound = slope_bound(tools.function, low, high, found.limit)
-    return found._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
+    if result.refuted:
+        return result
+    bound = slope_bound(tools.function, low, high, result.limit)
+    return result._replace(bound=bound.value if np.isfinite(bound.value) else None, reason=bound.reason)
 
 
 def _climb(
@@ -228,7 +228,7 @@ def _climb(
         moved = best[:, None] + size * random.normal(size=(len(best), TRIALS, len(low)))
         moved[:, 0] = best
         moved = np.clip(moved, low, high)
-        found = objective(moved.reshape(-1, len(low))).reshape(len(best), TRIALS)
-        best = moved[np.arange(len(best)), found.argmax(axis=1)]
+        result = objective(moved.reshape(-1, len(low))).reshape(len(best), TRIALS)
+        best = moved[np.arange(len(best)), result.argmax(axis=1)]
         size = SHRINK * size
     return best

@@ -99,8 +99,8 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
         case "lt" | "le" | "gt" | "ge" | "eq" | "ne":
             return _decided(_compare(name, *x), continuous)
         case "sign":
-            found = Interval(np.sign(x[0].low), np.sign(x[0].high))
-            return _decided(found, continuous)
+            result = Interval(np.sign(x[0].low), np.sign(x[0].high))
+            return _decided(result, continuous)
         case "and" | "or":
             combine = np.logical_and if name == "and" else np.logical_or
             return Interval(combine(x[0].low, x[1].low), combine(x[0].high, x[1].high))
@@ -111,10 +111,10 @@ def _operation(equation: Any, x: list[Interval], continuous: bool) -> Interval:
     raise UnknownError(name)
 
 
-def _decided(found: Interval, continuous: bool) -> Interval:
-    if continuous and not np.array_equal(found.low, found.high):
+def _decided(interval: Interval, continuous: bool) -> Interval:
+    if continuous and not np.array_equal(interval.low, interval.high):
         raise UnknownError("a decision that depends on where in the region x is")
-    return found
+    return interval
 
 
 def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
@@ -126,8 +126,8 @@ def _moved(equation: Any, x: list[Interval]) -> list[Interval]:
 
 
 def _bound(equation: Any, ends: list[Numbers]) -> list[Numbers]:
-    found = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
-    return list(map(np.asarray, found if equation.primitive.multiple_results else [found]))
+    result = equation.primitive.bind(*map(jax.device_put, ends), **equation.params)
+    return list(map(np.asarray, result if equation.primitive.multiple_results else [result]))
 
 
 def _compare(name: str, a: Interval, b: Interval) -> Interval:
@@ -173,8 +173,8 @@ def _quotient(a: Interval, b: Interval) -> Interval:
 
 def _square(a: Interval) -> Interval:
     low, high = np.minimum(a.low**2, a.high**2), np.maximum(a.low**2, a.high**2)
-    found = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
-    return Interval(np.maximum(found.low, 0.0), found.high)
+    result = outward(np.where((a.low <= 0) & (a.high >= 0), 0.0, low), high)
+    return Interval(np.maximum(result.low, 0.0), result.high)
 
 
 def _power(a: Interval, exponent: int) -> Interval:
@@ -197,8 +197,8 @@ def _rising(
     """Of a function that never falls, with the range that its values cannot leave."""
 
     def call(a: Interval) -> Interval:
-        found = outward(function(a.low), function(a.high), ULPS)
-        return Interval(np.maximum(found.low, low), np.minimum(found.high, high))
+        result = outward(function(a.low), function(a.high), ULPS)
+        return Interval(np.maximum(result.low, low), np.minimum(result.high, high))
 
     return call
 
@@ -206,12 +206,12 @@ def _rising(
 def _cosine(a: Interval) -> Interval:
     """A maximum at every even multiple of pi that is inside, a minimum at every odd one; a hair outside counts too."""
     ends = np.cos(a.low), np.cos(a.high)
-    found = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
+    result = outward(np.minimum(*ends), np.maximum(*ends), ULPS)
     first, last = a.low / np.pi - 1e-9 * (1 + np.abs(a.low)), a.high / np.pi + 1e-9 * (1 + np.abs(a.high))
     top = np.floor(last / 2) >= np.ceil(first / 2)
     bottom = np.floor((last - 1) / 2) >= np.ceil((first - 1) / 2)
     wild = ~(np.isfinite(a.low) & np.isfinite(a.high))
-    low, high = np.where(bottom | wild, -1.0, found.low), np.where(top | wild, 1.0, found.high)
+    low, high = np.where(bottom | wild, -1.0, result.low), np.where(top | wild, 1.0, result.high)
     return Interval(np.maximum(low, -1.0), np.minimum(high, 1.0))
 
 

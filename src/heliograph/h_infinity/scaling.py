@@ -18,7 +18,7 @@ from heliograph.h_infinity.system import GrowthSystem
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
 
-SETTLED = 0.1  # more of each error's variance: what the gain of the step before may cost to be searched near again
+CONVERGED = 0.1  # more of each error's variance: what the gain of the step before may cost to be searched near again
 SMALLEST = 1e-6  # of what an error's size was before a measurement: as small as one measurement can make it
 
 
@@ -52,9 +52,9 @@ class Coordinates(NamedTuple):
         n = len(scaled)
         return np.asarray(self.states[k + 1, n:, n:] @ scaled / self.received[k])
 
-    def multipliers(self, found: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
+    def multipliers(self, unknowns: Unknowns, k: int) -> Float[np.ndarray, "multipliers"]:
         """The multipliers of step k in the user's units."""
-        return np.asarray(self.unit**2 * found.multipliers / self.forms[k])
+        return np.asarray(self.unit**2 * unknowns.multipliers / self.forms[k])
 
 
 def _symmetric(a: Float[np.ndarray, "w w"]) -> Float[np.ndarray, "w w"]:
@@ -72,24 +72,24 @@ def scale(
     n, plain = system.states, system.growth.absent and system.output_growth.absent
     initial = np.diag(1 / np.diagonal(system.initial_weight))
     x, e = initial[:n, :n], initial[n:, n:]
-    sizes, heard, forms, scaled, wanted = [_sizes(x, e, plain)], [], [], [], 0.0
+    sizes, received, forms, scaled, target = [_sizes(x, e, plain)], [], [], [], 0.0
     nominal = steps[0].nominal
     for k, step in enumerate(steps):
         spread = _signals(system, k, step, x, e)
-        wanted = max(wanted, float(np.trace(step.wanted @ spread)))
+        target = max(target, float(np.trace(step.target @ spread)))
         x, e, measured, best = _moved(step, spread, None if gains is None else gains[k])
-        nominal = best if gains is not None or k == 0 else _settled(nominal, best, measured, e)
+        nominal = best if gains is not None or k == 0 else _steady_gain(nominal, best, measured, e)
         sizes.append(_sizes(x, e, plain))
-        heard.append(_kept(np.sqrt(np.diagonal(measured))))
+        received.append(_nonzero(np.sqrt(np.diagonal(measured))))
         unit = _coordinates(system, k, step, sizes[k])
         form = np.max(np.abs(step.growth) * np.diagonal(unit) ** 2, axis=1, initial=0.0)  # with growth, T is diagonal
         forms.append(np.where(form > 0, form, 1.0))
-        scaled.append(_congruent(step, unit, sizes[k + 1], heard[k], forms[k], nominal))
-    if wanted == 0:
+        scaled.append(_congruent(step, unit, sizes[k + 1], received[k], forms[k], nominal))
+    if target == 0:
         raise fail("wanted matrix", "one that is not zero", "zero at every step")
-    level = float(_power(np.sqrt(wanted)))
-    scaled = [s._replace(wanted=s.wanted / level**2) for s in scaled]
-    return scaled, Coordinates(np.array(sizes), np.array(heard), np.array(forms), level, plain)
+    level = float(_power(np.sqrt(target)))
+    scaled = [s._replace(target=s.target / level**2) for s in scaled]
+    return scaled, Coordinates(np.array(sizes), np.array(received), np.array(forms), level, plain)
 
 
 def _power(size: Float[np.ndarray, "*n"] | float) -> Float[np.ndarray, "*n"]:
@@ -101,18 +101,20 @@ def _sizes(x: np.ndarray, e: np.ndarray, plain: bool) -> Float[np.ndarray, "w w"
     """diag(S1, S2): factors of the covariances, or where growth is a ratio of norms a number for each."""
     if plain:
         return np.asarray(block_diag(_factor(x), _factor(e)))
-    return np.diag(np.concatenate([_kept(np.full(len(part), np.sqrt(np.trace(part) / len(part)))) for part in (x, e)]))
+    return np.diag(
+        np.concatenate([_nonzero(np.full(len(part), np.sqrt(np.trace(part) / len(part)))) for part in (x, e)])
+    )
 
 
 def _factor(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     """A lower factor, of what is never disturbed with a little of its own."""
-    unit = _kept(np.sqrt(np.diagonal(covariance)))
+    unit = _nonzero(np.sqrt(np.diagonal(covariance)))
     return np.asarray(
         unit[:, None] * np.linalg.cholesky(covariance / np.outer(unit, unit) + SMALLEST**2 * np.eye(len(unit)))
     )
 
 
-def _kept(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def _nonzero(size: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Components in very different units are all kept: only one without any size borrows the others'."""
     positive = size[size > 0]
     return _power(np.where(size > 0, size, positive.min() if positive.size else 1.0))
@@ -136,21 +138,23 @@ def _moved(
     step: StepMatrices, spread: np.ndarray, given: np.ndarray | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Covariances of x+, of e+ with the given or the best gain and of what is received, and that gain."""
-    heard = step.heard @ spread @ step.heard.T + np.einsum("jai,ik,jbk->ab", step.spreads, spread, step.spreads)
-    cross = step.error @ spread @ step.heard.T
-    unit = np.sqrt(np.maximum(np.diagonal(heard), np.finfo(float).tiny))
-    best = cross / unit @ np.linalg.pinv(heard / np.outer(unit, unit), rcond=1e-12, hermitian=True) / unit
+    received = step.received @ spread @ step.received.T + np.einsum(
+        "jai,ik,jbk->ab", step.spreads, spread, step.spreads
+    )
+    cross = step.error @ spread @ step.received.T
+    unit = np.sqrt(np.maximum(np.diagonal(received), np.finfo(float).tiny))
+    best = cross / unit @ np.linalg.pinv(received / np.outer(unit, unit), rcond=1e-12, hermitian=True) / unit
     gain = best if given is None else given
-    before, left = step.error @ spread @ step.error.T, step.error - gain @ step.heard
-    after = left @ spread @ left.T + gain @ (heard - step.heard @ spread @ step.heard.T) @ gain.T
+    before, left = step.error @ spread @ step.error.T, step.error - gain @ step.received
+    after = left @ spread @ left.T + gain @ (received - step.received @ spread @ step.received.T) @ gain.T
     floor = SMALLEST**2 * np.diag(np.diagonal(before))
-    return step.state @ spread @ step.state.T, _symmetric(after) + floor, heard, gain
+    return step.state @ spread @ step.state.T, _symmetric(after) + floor, received, gain
 
 
-def _settled(last: np.ndarray, best: np.ndarray, heard: np.ndarray, after: np.ndarray) -> np.ndarray:
+def _steady_gain(last: np.ndarray, best: np.ndarray, received: np.ndarray, after: np.ndarray) -> np.ndarray:
     """The last gain where it leaves little more than the best one, which is (K - K0) heard (K - K0)'."""
-    more = (last - best) @ heard @ (last - best).T
-    return last if np.all(np.diagonal(more) <= SETTLED * np.diagonal(after)) else best
+    more = (last - best) @ received @ (last - best).T
+    return last if np.all(np.diagonal(more) <= CONVERGED * np.diagonal(after)) else best
 
 
 def _coordinates(system: GrowthSystem, k: int, step: StepMatrices, sizes: np.ndarray) -> Float[np.ndarray, "q q"]:
@@ -168,18 +172,18 @@ def _congruent(
     step: StepMatrices,
     unit: np.ndarray,
     after: np.ndarray,
-    heard: np.ndarray,
+    received: np.ndarray,
     forms: np.ndarray,
     nominal: np.ndarray,
 ) -> StepMatrices:
     n = step.state.shape[0]
     return StepMatrices(
         np.linalg.solve(after[:n, :n], step.state @ unit),
-        np.linalg.solve(after[n:, n:], (step.error - nominal @ step.heard) @ unit),
-        step.heard @ unit / heard[:, None],
-        step.spreads @ unit / heard[:, None],
-        _symmetric(unit.T @ step.wanted @ unit),
+        np.linalg.solve(after[n:, n:], (step.error - nominal @ step.received) @ unit),
+        step.received @ unit / received[:, None],
+        step.spreads @ unit / received[:, None],
+        _symmetric(unit.T @ step.target @ unit),
         _symmetric(unit.T @ step.energy @ unit),
         step.growth * np.diagonal(unit) ** 2 / forms[:, None],
-        np.linalg.solve(after[n:, n:], nominal * heard),
+        np.linalg.solve(after[n:, n:], nominal * received),
     )

@@ -63,9 +63,9 @@ def _sharpened(
 def _bounds(slopes: jax.extend.core.ClosedJaxpr, low: np.ndarray, high: np.ndarray) -> Float[np.ndarray, " boxes"]:
     short = BOXES - len(low)
     ends = [np.concatenate([end, np.repeat(end[-1:], short, axis=0)]) for end in (low, high)]
-    (found,) = evaluate(slopes, [Interval(*ends)], continuous=False)
-    finite = np.isfinite(found.low) & np.isfinite(found.high)
-    a, b = np.where(finite, found.low, 0.0), np.where(finite, found.high, 0.0)
+    (result,) = evaluate(slopes, [Interval(*ends)], continuous=False)
+    finite = np.isfinite(result.low) & np.isfinite(result.high)
+    a, b = np.where(finite, result.low, 0.0), np.where(finite, result.high, 0.0)
     centre = a / 2 + b / 2
     radius = np.nextafter(np.maximum(b - centre, centre - a), np.inf)
     norms = sum(np.linalg.norm(part, 2, axis=(-2, -1)) for part in (centre, radius)) * (1 + NORM_ROUNDING)

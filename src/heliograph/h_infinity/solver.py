@@ -114,14 +114,14 @@ class StepProblem:
         status = run_solver(first, self.solver)
         if not status.startswith("optimal") or self.unknowns.value is None:
             return status, None
-        found, best = np.asarray(self.unknowns.value), float(first.value)
+        result, best = np.asarray(self.unknowns.value), float(first.value)
         for problem in others:  # next to no room is left to them, which a solver may find too narrow
             for tie in TIES:
                 self.reached.value = (1 - tie) * best
                 if run_solver(problem, self.solver) == "optimal":
-                    found = np.asarray(self.unknowns.value)
+                    result = np.asarray(self.unknowns.value)
                     break
-        return status, self.layout.unpack(found)
+        return status, self.layout.unpack(result)
 
 
 def _goals(
@@ -192,7 +192,7 @@ class HorizonProblem:
     ) -> None:
         """-Phi >= MARGIN level^2, for each part of eta that stands alone; the weight before is `present` + `fixed`."""
         q, width = len(step.energy), len(fixed)
-        constant = -step.wanted
+        constant = -step.target
         constant[:width, :width] += fixed
         for part in independent_parts(step, forms, start):
             entries = (part[:, None] * q + part).ravel()
@@ -208,10 +208,10 @@ class HorizonProblem:
 
     def _require(self, blocks: dict[int, np.ndarray], constant: np.ndarray) -> None:
         """The matrix sum_i blocks_i (unknowns in place i) + constant is positive semidefinite."""
-        found = [(block, *np.nonzero(block), self.places[place].start) for place, block in blocks.items()]
-        values = np.concatenate([block[rows, columns] for block, rows, columns, _ in found])
-        rows = np.concatenate([rows for _, rows, _, _ in found])
-        columns = np.concatenate([columns + start for _, _, columns, start in found])
+        results = [(block, *np.nonzero(block), self.places[place].start) for place, block in blocks.items()]
+        values = np.concatenate([block[rows, columns] for block, rows, columns, _ in results])
+        rows = np.concatenate([rows for _, rows, _, _ in results])
+        columns = np.concatenate([columns + start for _, _, columns, start in results])
         form = csr_array((values, (rows, columns)), shape=(constant.size, self.unknowns.size))
         matrix = solvers().reshape(form @ self.unknowns, constant.shape, order="C") + constant
         self.constraints.append(matrix >> 0)

@@ -24,9 +24,9 @@ class StepMatrices(NamedTuple):
 
     state: Float[np.ndarray, "n q"]
     error: Float[np.ndarray, "n q"]
-    heard: Float[np.ndarray, "m q"]
+    received: Float[np.ndarray, "m q"]
     spreads: Float[np.ndarray, "spreads m q"]
-    wanted: Float[np.ndarray, "q q"]
+    target: Float[np.ndarray, "q q"]
     energy: Float[np.ndarray, "q q"]
     growth: Float[np.ndarray, "multipliers q"]
     nominal: Float[np.ndarray, "n m"]
@@ -57,8 +57,8 @@ def all_multipliers(
     system: GrowthSystem, given: Float[np.ndarray, "*steps present"], separate: bool
 ) -> Float[np.ndarray, "*steps count"]:
     """Multipliers with zeros for functions that were left out, in the order f, f~, h, h~ or f, h."""
-    each = 2 if separate else 1
-    present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(each)]
+    items = 2 if separate else 1
+    present = [not growth.absent for growth in (system.growth, system.output_growth) for _ in range(items)]
     result = np.zeros((*given.shape[:-1], len(present)))
     result[..., present] = given
     return result
@@ -75,19 +75,19 @@ def _at(system: GrowthSystem, k: int, spreads: Float[np.ndarray, "spreads m _"],
     state[:, x], state[:, f], state[:, v] = A, eye, B
     error[:, e], error[:, df], error[:, v] = A, eye, B
     gain, noise = link.mean[:, :y], link.mean[:, y:]
-    heard = np.zeros((system.received, q))
-    heard[:, e], heard[:, dg], heard[:, v], heard[:, rho] = gain @ C, gain[:, :h], gain @ D, noise
+    received = np.zeros((system.received, q))
+    received[:, e], received[:, dg], received[:, v], received[:, rho] = gain @ C, gain[:, :h], gain @ D, noise
     varied = np.zeros((len(spreads), system.received, q))
     gain, noise = spreads[..., :y], spreads[..., y:]
     varied[..., x], varied[..., g], varied[..., v], varied[..., rho] = gain @ C, gain[..., :h], gain @ D, noise
-    wanted, energy = np.zeros((q, q)), np.zeros((q, q))
-    wanted[e, e] = M.T @ M
+    target, energy = np.zeros((q, q)), np.zeros((q, q))
+    target[e, e] = M.T @ M
     energy[v, v], energy[rho, rho] = np.eye(v.stop - v.start), np.eye(rho.stop - rho.start)
     parts = [[(f, x, system.growth.state[k]), (df, e, system.growth.error[k])]] if w else []
     parts += [[(g, x, system.output_growth.state[k]), (dg, e, system.output_growth.error[k])]] if h else []
     groups = [[part] for pair in parts for part in pair] if separate else parts
     growth = np.array([_growth(q, group) for group in groups]).reshape(-1, q)
-    return StepMatrices(state, error, heard, varied, wanted, energy, growth, np.zeros((n, system.received)))
+    return StepMatrices(state, error, received, varied, target, energy, growth, np.zeros((n, system.received)))
 
 
 def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray, "{q}"]:
@@ -101,7 +101,7 @@ def _growth(q: int, parts: list[tuple[slice, slice, float]]) -> Float[np.ndarray
 
 def next_energy(step: StepMatrices, unknowns: Unknowns) -> Float[np.ndarray, "q q"]:
     """The quadratic form E[V_next] + sum_i lambda_i N_i of eta, linear in the unknowns."""
-    X, E, U = step.state, step.error, step.heard
+    X, E, U = step.state, step.error, step.received
     p1, p2, Y, Z, multipliers = unknowns
     cross = E.T @ Y @ U
     result = X.T @ p1 @ X + E.T @ p2 @ E - cross - cross.T + U.T @ Z @ U
@@ -192,7 +192,7 @@ def independent_parts(
     `start`: the weight before the step, where it is not diag(P1, P2).
     """
     q = len(step.energy)
-    coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.wanted != 0) | (step.energy != 0)
+    coupled = np.any(forms.next != 0, axis=1).reshape(q, q) | (step.target != 0) | (step.energy != 0)
     n = step.state.shape[0]
     coupled[:n, :n] = coupled[n : 2 * n, n : 2 * n] = True  # the weight diag(P1, P2) of this step
     if start is not None:

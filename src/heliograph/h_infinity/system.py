@@ -10,7 +10,7 @@ from heliograph.numerics.check import SYMMETRY_TOLERANCE, array, check_count, fa
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
 from heliograph.random_affine.base import as_maps
-from heliograph.random_affine.disturbance import DisturbedGain, disturbed_gain
+from heliograph.random_affine.moments.disturbance import DisturbedGain, disturbed_gain
 
 Varying = ArrayLike | OverTime  # the same at all steps, or one for each
 
@@ -40,7 +40,7 @@ class GrowthSystem(NamedTuple):
     disturbance: Float[np.ndarray, "steps n v"]
     output: Float[np.ndarray, "steps y n"]
     feedthrough: Float[np.ndarray, "steps y v"]
-    wanted: Float[np.ndarray, "steps z n"]
+    target: Float[np.ndarray, "steps z n"]
     growth: Growth
     output_growth: Growth
     channel: tuple[DisturbedGain, ...]
@@ -66,7 +66,7 @@ def growth_system(
     steps: int,
     disturbance: Varying,
     feedthrough: Varying,
-    wanted: Varying,
+    target: Varying,
     channel: Channel,
     growth: Varying | tuple[Varying, Varying],
     output_growth: Varying | tuple[Varying, Varying] = 0.0,
@@ -98,7 +98,7 @@ def growth_system(
         B,
         _over(steps, "output matrix", np.zeros((y, n)) if output is None else output, (y, n)),
         D,
-        _over(steps, "wanted matrix", wanted, (None, n)),
+        _over(steps, "wanted matrix", target, (None, n)),
         _growth(steps, "growth", growth),
         _growth(steps, "output growth", output_growth),
         links,
@@ -109,12 +109,12 @@ def growth_system(
 def _over(steps: int, name: str, value: Varying, shape: tuple[int | None, ...]) -> Float[np.ndarray, "steps ..."]:
     """One matrix for each step."""
     if not isinstance(value, OverTime):
-        one: np.ndarray = array(name, value, shape)
-        return np.broadcast_to(one, (steps, *one.shape))
+        item: np.ndarray = array(name, value, shape)
+        return np.broadcast_to(item, (steps, *item.shape))
     if value.steps < steps:
         raise fail(f"{name} over time", f"at least {steps} steps", value.steps)
-    many: np.ndarray = array(name, value.values, (None, *shape))
-    return many[:steps]
+    values_: np.ndarray = array(name, value.values, (None, *shape))
+    return values_[:steps]
 
 
 def _links(steps: int, channel: Channel) -> tuple[DisturbedGain, ...]:

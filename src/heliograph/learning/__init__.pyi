@@ -4,34 +4,34 @@ from .choice import (
     Comparison as Comparison,
     compare_laws as compare_laws,
 )
-from .foretelling import (
+from .likelihood.predictive_density import (
     Predictive as Predictive,
     predictive as predictive,
 )
-from .hidden_losses import (
+from .losses.hidden_losses import (
     HiddenModeLosses as HiddenModeLosses,
 )
-from .loss_law import (
+from .losses.loss_law import (
     AbstractLossLaw as AbstractLossLaw,
     IndependentLosses as IndependentLosses,
     MarkovLosses as MarkovLosses,
 )
-from .loss_tests import (
+from .losses.loss_tests import (
     LossMemory as LossMemory,
     loss_memory as loss_memory,
 )
-from .losses import (
+from .losses.losses import (
     Losses as Losses,
     learn_losses as learn_losses,
     learn_losses_of as learn_losses_of,
 )
-from .running_losses import (
+from .losses.running_losses import (
     RunningRateLosses as RunningRateLosses,
 )
-from .shares import (
+from .losses.shares import (
     Share as Share,
 )
-from .stretches import (
+from .losses.stretches import (
     fates_by_hop as fates_by_hop,
     fates_by_node as fates_by_node,
     fates_of_measurements as fates_of_measurements,
@@ -43,7 +43,7 @@ from .fitting import (
 from .identification import (
     Identifiability as Identifiability,
 )
-from .many import (
+from .recordings_apart import (
     FitEach as FitEach,
     fit_each as fit_each,
 )

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import norm
 
-from heliograph.learning.foretelling import Predictive
+from heliograph.learning.likelihood.predictive_density import Predictive
 from heliograph.learning.long_run import mean_and_error
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.readable import readable
@@ -44,10 +44,10 @@ def compare_laws(a: Predictive, b: Predictive) -> Comparison:
         instance(name, item, Predictive, "what `predictive` gives")
     if a.pit.shape != b.pit.shape or np.any(np.isnan(a.pit) != np.isnan(b.pit)):
         raise fail("second law", "the same recording as the first", "another")
-    heard = ~np.all(np.isnan(a.pit), axis=1)
-    if heard.sum() < 10:
-        raise fail("recording", "at least 10 steps with a measurement", int(heard.sum()))
-    return compared((a.log_likelihood - b.log_likelihood)[heard])
+    received = ~np.all(np.isnan(a.pit), axis=1)
+    if received.sum() < 10:
+        raise fail("recording", "at least 10 steps with a measurement", int(received.sum()))
+    return compared((a.log_likelihood - b.log_likelihood)[received])
 
 
 def compared(differences: Float[np.ndarray, " steps"]) -> Comparison:

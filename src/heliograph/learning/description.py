@@ -38,7 +38,7 @@ class Description:
     @cached_property
     def start(self) -> Network:
         """The network at its starts."""
-        return self.at({one.name: plain_number(one.start) for one in self.parameters.every})
+        return self.at({item.name: plain_number(item.start) for item in self.parameters.every})
 
     def at_point(self, x: Float[np.ndarray, " p"]) -> Network:
         """The network at a point of the line, of plain numbers."""

@@ -9,11 +9,11 @@ from heliograph.learning.description import Description, describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.identification import Identifiability, identified_by
 from heliograph.learning.intervals import METHODS, Method
-from heliograph.learning.maximise import Maximum
-from heliograph.learning.objective import Form, objectives
-from heliograph.learning.recordings import gathered
+from heliograph.learning.likelihood.maximise import Maximum
+from heliograph.learning.likelihood.objective import Form, objectives
+from heliograph.learning.likelihood.recordings import gathered
+from heliograph.learning.likelihood.surface import StoppedError, Surface
 from heliograph.learning.solution import Row, Solution
-from heliograph.learning.surface import StoppedError, Surface
 from heliograph.numerics.check import check_count, check_seed, fail, shown
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike, Float
@@ -60,17 +60,17 @@ class Fit:
     @property
     def converged(self) -> bool:
         """Whether every form came to its maximum."""
-        return all(one.converged for one in self.solutions)
+        return all(solution.converged for solution in self.solutions)
 
     @property
     def log_likelihood(self) -> dict[str, float]:
         """At the maximum, by form, in nats."""
-        return {one.form: one.total for one in self.solutions}
+        return {solution.form: solution.total for solution in self.solutions}
 
     @property
     def table(self) -> tuple[Row, ...]:
         """A row for each number and form, the form that counts first; intervals by `rows("cosines")`."""
-        return tuple(row for one in reversed(self.solutions) for row in one.rows())
+        return tuple(row for solution in reversed(self.solutions) for row in solution.rows())
 
     def rows(self, method: Method = "cosines", form: Form | None = None) -> tuple[Row, ...]:
         """The table of one form with intervals by another method.
@@ -84,7 +84,7 @@ class Fit:
         """
         if method not in METHODS:
             raise fail("method of intervals", f"one of {', '.join(METHODS)}", shown(method))
-        known = {one.form: one for one in self.solutions}
+        known = {solution.form: solution for solution in self.solutions}
         if form is not None and form not in known:
             raise fail("form", f"one of {', '.join(known)}", shown(form))
         return known[self.best.form if form is None else form].rows(method)
@@ -95,10 +95,10 @@ class Fit:
         best = self.best
         inner, _ = best.covariance()
         turned = self.description.parameters.jacobian(best.x)[:, best.active]
-        found = turned @ inner @ turned.T
+        result = turned @ inner @ turned.T
         lost = np.array([row.boundary or not row.identified for row in best.rows()])
-        found[lost] = found[:, lost] = np.nan
-        return np.asarray(found)
+        result[lost] = result[:, lost] = np.nan
+        return np.asarray(result)
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -145,13 +145,13 @@ def fit(
     stopped, ends, solutions = False, np.zeros(0), []
     identified = identified_by(surfaces[-1], points[0], seed)
     for surface in surfaces:
-        found, stopped = _climbed(surface, points, say)
-        order = np.argsort(-np.nan_to_num(found.total, nan=-np.inf))
-        ends = found.total[order] if not len(ends) else ends
-        solutions.append(_settled(surface, found, int(order[0]), identified.ridges, say))
+        result, stopped = _climbed(surface, points, say)
+        order = np.argsort(-np.nan_to_num(result.total, nan=-np.inf))
+        ends = result.total[order] if not len(ends) else ends
+        solutions.append(_solution(surface, result, int(order[0]), identified.ridges, say))
         if stopped:
             break
-        points = found.x[order[:1]]
+        points = result.x[order[:1]]
     return Fit(description, tuple(solutions), identified.at(solutions[-1]), ends, stopped)
 
 
@@ -163,34 +163,34 @@ def _starts(surface: Surface, count: int, seed: int) -> Float[np.ndarray, "start
     """
     parameters = surface.objective.description.parameters
     start, rng = parameters.start, np.random.default_rng(seed)
-    first = surface.found(start[None])
+    first = surface.result(start[None])
     if not np.isfinite(first.total[0]):
         step = int(np.argmax(~np.isfinite(first.density[0].sum(axis=0))))
         raise fail("start of the fit", "numbers under which the recording is possible",
                    f"a log-likelihood of {first.total[0]} from step {step} on")  # fmt: skip
-    own = np.diag(first.information[0])
+    local = np.diag(first.information[0])
     spread = np.full(len(start), SPREAD)
     for entry in parameters.entries:
         if entry.place is not None and np.isinf([entry.domain.low, entry.domain.high]).all():
             at = abs(start[entry.place])
-            spread[entry.place] = at / 2 if at else 3 / np.sqrt(max(own[entry.place], 1e-300))
+            spread[entry.place] = at / 2 if at else 3 / np.sqrt(max(local[entry.place], 1e-300))
     points: np.ndarray = start + np.concatenate(
         [np.zeros((1, len(start))), rng.uniform(-1, 1, (count - 1, len(start))) * spread]
     )
     for _ in range(6):
-        wrong = ~np.isfinite(surface.found(points).total)
+        wrong = ~np.isfinite(surface.result(points).total)
         if not wrong.any():
             break
         points[wrong] = (points[wrong] + start) / 2
-    _check_dependence(surface, points, own)
+    _check_dependence(surface, points, local)
     return points
 
 
-def _check_dependence(surface: Surface, points: np.ndarray, own: np.ndarray) -> None:
+def _check_dependence(surface: Surface, points: np.ndarray, local: np.ndarray) -> None:
     """Every free number matters somewhere."""
-    if np.all(own > 0):
+    if np.all(local > 0):
         return
-    seen = np.nanmax(np.diagonal(surface.found(points).information, axis1=1, axis2=2), axis=0)
+    seen = np.nanmax(np.diagonal(surface.result(points).information, axis1=1, axis2=2), axis=0)
     names = surface.objective.description.parameters.coordinates
     lost = [name for name, size in zip(names, seen, strict=True) if not size > 0]
     if lost:
@@ -211,14 +211,14 @@ def _climbed(surface: Surface, points: np.ndarray, say: Progress) -> tuple[Maxim
         return stopped.best, True
 
 
-def _settled(surface: Surface, found: Maximum, lane: int, ridges: int, say: Progress) -> Solution:
+def _solution(surface: Surface, maximum: Maximum, lane: int, ridges: int, say: Progress) -> Solution:
     """The best of the ends, with numbers at a limit put there and the others climbed again."""
-    x, total, active = found.x[lane].copy(), float(found.total[lane]), np.ones(found.x.shape[1], dtype=bool)
-    converged, steps = bool(found.converged[lane]), found.steps
+    x, total, active = maximum.x[lane].copy(), float(maximum.total[lane]), np.ones(maximum.x.shape[1], dtype=bool)
+    converged, steps = bool(maximum.converged[lane]), maximum.steps
     for place in _invisible(surface, x):
         moved = x.copy()
         moved[place] = np.inf if x[place] > 0 and _two_sided(surface, place) else -np.inf
-        at_limit = surface.found(moved[None])
+        at_limit = surface.result(moved[None])
         if np.isfinite(at_limit.gradient[0][active]).all() and at_limit.total[0] > total - ELSEWHERE:
             x, active[place] = moved, False
     if not active.all():
@@ -233,14 +233,14 @@ def _settled(surface: Surface, found: Maximum, lane: int, ridges: int, say: Prog
 
 def _invisible(surface: Surface, x: np.ndarray) -> list[int]:
     """Coordinates of numbers with a limit that the data hardly see where they are."""
-    own = np.diag(surface.found(x[None]).information[0])
+    local = np.diag(surface.result(x[None]).information[0])
     entries = surface.objective.description.parameters.entries
     return [
         entry.place
         for entry in entries
         if entry.place is not None
         and np.isfinite([entry.domain.low, entry.domain.high]).any()
-        and own[entry.place] < INVISIBLE
+        and local[entry.place] < INVISIBLE
     ]
 
 
@@ -249,17 +249,19 @@ def _two_sided(surface: Surface, place: int) -> bool:
     return bool(np.isfinite([entry.domain.low, entry.domain.high]).all())
 
 
-def _of_climb(found: Fit) -> list[str]:
+def _of_climb(fitted: Fit) -> list[str]:
     sentences = []
-    if found.stopped:
+    if fitted.stopped:
         sentences.append("Stopped before the end: this is the best so far.")
-    elif not found.converged:
+    elif not fitted.converged:
         sentences.append("The climb did not converge: the estimates are the best points found.")
-    below = found.ends[0] - found.ends[1:]
+    below = fitted.ends[0] - fitted.ends[1:]
     elsewhere = np.count_nonzero(~(below < ELSEWHERE))
-    if elsewhere and not found.stopped:
+    if elsewhere and not fitted.stopped:
         lost = np.nanmin(np.where(below < ELSEWHERE, np.nan, below))
-        sentences.append(f"{elsewhere} of {len(found.ends)} starts ended elsewhere, {lost:.3g} or more below the best.")
+        sentences.append(
+            f"{elsewhere} of {len(fitted.ends)} starts ended elsewhere, {lost:.3g} or more below the best."
+        )
     return sentences
 
 
@@ -276,7 +278,7 @@ def _of_forms(solutions: tuple[Solution, ...]) -> list[str]:
     if len(solutions) < 2:
         return []
     sentences = []
-    for a, b in zip(*(one.rows() for one in solutions), strict=True):
+    for a, b in zip(*(solution.rows() for solution in solutions), strict=True):
         size = abs(a.estimate - b.estimate) / max(a.standard_error, b.standard_error)
         if np.isfinite(size) and size > APART:
             sentences.append(

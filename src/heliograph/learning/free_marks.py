@@ -7,8 +7,8 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from heliograph.learning.likelihood.transforms import to_line
 from heliograph.learning.parameters import Parameter, Parameters
-from heliograph.learning.transforms import to_line
 from heliograph.numerics.check import array, fail, rank, shown
 from heliograph.numerics.domain import COVARIANCE, POSITIVE, PROBABILITY, REAL, SIMPLEX, Domain, marked
 from heliograph.numerics.types import ArrayLike
@@ -76,7 +76,7 @@ class _Mark:
         self.domain = None if kind is None else DOMAINS[kind]
         self.explicit = kind is not None
 
-    def told(self, name: str, domain: Domain) -> None:
+    def report(self, name: str, domain: Domain) -> None:
         """A check says what it is: the narrowest holds."""
         self.place = self.place or name
         if self.explicit:
@@ -103,22 +103,22 @@ class Asking:
                     raise fail(
                         f"free number {name!r}", f"one start in all places, {mark.start.tolist()}", start.tolist()
                     )
-                return marked(start, mark.told)
+                return marked(start, mark.report)
         self.marks.append(_Mark(start, name, kind))
-        return marked(start, self.marks[-1].told)
+        return marked(start, self.marks[-1].report)
 
     def parameters(self) -> Parameters:
         """All of them; one without a name is called after its place."""
         taken = {mark.given for mark in self.marks if mark.given is not None}
-        found = []
+        results = []
         for mark in self.marks:
             name = mark.given or _new(mark.place or "free number", taken)
             taken.add(name)
             domain = REAL if mark.domain is None else mark.domain
-            one = Parameter(name, mark.start, domain)
+            item = Parameter(name, mark.start, domain)
             to_line(name, domain, mark.start)
-            found.append(one)
-        return Parameters(tuple(found))
+            results.append(item)
+        return Parameters(tuple(results))
 
 
 class Given:
@@ -126,7 +126,7 @@ class Given:
 
     def __init__(self, parameters: Parameters, named: tuple[bool, ...], values: Mapping[str, object]):
         self.values = values
-        self.unnamed = iter([one.name for one, own in zip(parameters.every, named, strict=True) if not own])
+        self.unnamed = iter([item.name for item, single in zip(parameters.every, named, strict=True) if not single])
 
     def read(self, start: np.ndarray, name: str | None, kind: Kind | None) -> object:
         """The value."""

@@ -7,14 +7,14 @@ from scipy.special import ndtr
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.learning.choice import Comparison, compared
-from heliograph.learning.foretelling import predictive
+from heliograph.learning.likelihood.predictive_density import predictive
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.check import InputError
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.whiteness import MemoryTest, heard_by, memory_of
+from heliograph.simulation.results.whiteness import MemoryTest, innovations_of, memory_of
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 
@@ -66,30 +66,32 @@ def changes(
     before: Network, after: Network, measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Change]:
     """Every filter that claims a covariance, over all rows, judged from row `cut` on."""
-    found = []
+    results = []
     for name, z in measurements.items():
         for key, old in before.nodes[name].filters.items():
             if old.claim == "none" or not old.received:
                 continue
-            one, other = (_expected(item, z, inputs, cut) for item in (old, after.nodes[name].filters[key]))
-            heard = ~np.all(np.isnan(one.white), axis=1)
-            gain = compared((other.log_likelihood - one.log_likelihood)[heard]) if heard.sum() >= LAGS else None
-            found.append(Change(name, key, one, other, gain))
-    return found
+            single, other = (_expected(item, z, inputs, cut) for item in (old, after.nodes[name].filters[key]))
+            received = ~np.all(np.isnan(single.white), axis=1)
+            gain = (
+                compared((other.log_likelihood - single.log_likelihood)[received]) if received.sum() >= LAGS else None
+            )
+            results.append(Change(name, key, single, other, gain))
+    return results
 
 
 def uniformity(
-    network: Network, found: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
+    network: Network, outcome: list[Change], measurements: dict[str, np.ndarray], inputs: np.ndarray, cut: int
 ) -> list[Uniformity]:
     """Pits of each node: by its laws where `predictive` knows its channel, else by its first filter's Gaussians."""
     result = []
     for name, z in measurements.items():
-        own, node = [change for change in found if change.node == name], network.nodes[name]
+        local, node = [change for change in outcome if change.node == name], network.nodes[name]
         by_law = _by_law(network, node, z, inputs) if isinstance(node, Node) else None
         if by_law is not None:
             result.append(Uniformity(name, by_law[cut:], True))
-        elif own:
-            result.append(Uniformity(name, np.asarray(ndtr(own[0].after.white)), False))
+        elif local:
+            result.append(Uniformity(name, np.asarray(ndtr(local[0].after.white)), False))
     return result
 
 
@@ -104,7 +106,7 @@ def _by_law(network: Network, node: Node, z: np.ndarray, inputs: np.ndarray) -> 
 
 
 def _expected(item: AbstractFilter, z: np.ndarray, u: np.ndarray, cut: int) -> Expected:
-    likelihood, white = (np.asarray(part)[cut:] for part in heard_by(item, z, u))
+    likelihood, white = (np.asarray(part)[cut:] for part in innovations_of(item, z, u))
     lags = min(LAGS, len(white) // 10)
     enough = lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
     return Expected(likelihood, white, memory_of(white, lags, claimed=True) if enough else None)

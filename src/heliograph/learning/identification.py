@@ -10,11 +10,11 @@ import numpy as np
 from heliograph.learning.description import describe
 from heliograph.learning.free_marks import Build
 from heliograph.learning.intervals import quantile
-from heliograph.learning.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.objective import Data, Objective, objectives
+from heliograph.learning.likelihood.surface import Surface
 from heliograph.learning.parameters import Parameters
 from heliograph.learning.ridges import WEAK, Confounded, Rank, confounded, product_text, rank_of, sum_text
 from heliograph.learning.routes import route_sentences
-from heliograph.learning.surface import Surface
 from heliograph.numerics.check import check_count, check_seed, fail
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.readable import readable
@@ -80,17 +80,17 @@ def identifiable(network: Build, inputs: ArrayLike | None = None, horizon: int =
     for i, x in enumerate(points):
         z = _drawn(objective, x, u, check_seed("seed", seed) + i)
         data = Data(z[None], u[None], (len(z),))
-        ranks.append(rank_of(Surface(objective, data).found(x[None]).late[0]))
+        ranks.append(rank_of(Surface(objective, data).result(x[None]).late[0]))
     return _identified(description.parameters, points, ranks)
 
 
 def identified_by(surface: Surface, start: Float[np.ndarray, " p"], seed: int) -> Identifiability:
     """What a recording tells, at three points around a start."""
     points = _points(start, seed)
-    late = surface.found(np.stack(points)).late
+    late = surface.result(np.stack(points)).late
     sound = [i for i in range(len(points)) if np.isfinite(late[i]).all()]
     if not sound:
-        points, late, sound = [start], surface.found(start[None]).late, [0]
+        points, late, sound = [start], surface.result(start[None]).late, [0]
     ranks = [rank_of(late[i]) for i in sound]
     return _identified(surface.objective.description.parameters, [points[i] for i in sound], ranks)
 
@@ -106,19 +106,21 @@ def _identified(parameters: Parameters, points: list[np.ndarray], ranks: list[Ra
     groups = tuple(confounded(parameters, points, ranks))
     ridges = min(rank.flat.shape[1] for rank in ranks)
     weakest = max(rank.weakest for rank in ranks)
-    found = Identifiability(parameters, groups, ridges, weakest, ())
-    return replace(found, sentences=sentences(found, None))
+    result = Identifiability(parameters, groups, ridges, weakest, ())
+    return replace(result, sentences=sentences(result, None))
 
 
-def sentences(found: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
+def sentences(identifiability: Identifiability, solution: "Solution | None") -> tuple[str, ...]:
     """What is not told, and what is instead."""
-    names = found.parameters.coordinates
-    lines = [_of_group(found.parameters, group, solution) for group in found.groups]
-    if solution is not None and any(group.fix + len(group.exponents) < len(group.places) for group in found.groups):
+    names = identifiability.parameters.coordinates
+    lines = [_of_group(identifiability.parameters, group, solution) for group in identifiability.groups]
+    if solution is not None and any(
+        group.fix + len(group.exponents) < len(group.places) for group in identifiability.groups
+    ):
         lines += route_sentences(solution)
-    if found.weakest < WEAK:
+    if identifiability.weakest < WEAK:
         lines.append(
-            f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {found.weakest:.1g}): "
+            f"The data hardly tell some of {', '.join(names)} apart (least eigenvalue {identifiability.weakest:.1g}): "
             "expect wide intervals."
         )
     return tuple(lines)
@@ -130,17 +132,17 @@ def _of_group(parameters: Parameters, group: Confounded, solution: "Solution | N
     left = len(names) - group.fix - len(group.exponents) - len(group.weights)
     if group.fix == len(names):
         return f"Nothing in the data tells {_listed(names)}."
-    told = [
+    outputs = [
         *(product_text(names, row) + _interval(parameters, group, row, solution, log=True) for row in group.exponents),
         *(sum_text(names, row) + _interval(parameters, group, row, solution, log=False) for row in group.weights),
     ]
-    if not told:
+    if not outputs:
         return f"The data tell only {_counted(left, 'combination')} of {_listed(names)}; {fix}."
     kind = "sum" if len(group.weights) else "product" if np.all(group.exponents >= 0) else "combination"
-    beside = f" and {_counted(left, 'other combination')}" if left else ""
-    verb = "is" if len(told) == 1 and not left else "are"
-    several = kind + ("s" if len(told) > 1 else "")
-    return f"Of {_listed(names)} only the {several} {_listed(told)}{beside} {verb} identified; {fix}."
+    others = f" and {_counted(left, 'other combination')}" if left else ""
+    verb = "is" if len(outputs) == 1 and not left else "are"
+    several = kind + ("s" if len(outputs) > 1 else "")
+    return f"Of {_listed(names)} only the {several} {_listed(outputs)}{others} {verb} identified; {fix}."
 
 
 def _counted(count: int, what: str) -> str:
@@ -155,10 +157,10 @@ def _interval(
         return ""
     jacobian, values = parameters.jacobian(solution.x), parameters.entries_at(solution.x)
     slopes, value = np.zeros(len(solution.x)), 0.0
-    for entry, own, number in zip(parameters.entries, jacobian, values, strict=True):
+    for entry, item, number in zip(parameters.entries, jacobian, values, strict=True):
         if entry.place in group.places:
             weight = row[group.places.index(entry.place)]
-            slopes += weight * (own / number if log else own)
+            slopes += weight * (item / number if log else item)
             value += weight * (np.log(abs(number)) if log else number)
     covariance, freedom = solution.covariance()
     along = slopes[solution.active]
@@ -184,12 +186,12 @@ def _expected(objective: Objective, x: Array, u: Array, key: jax.Array) -> jax.A
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         k, u_k, noise = row
         prior = item.predict(state, u_k, k)
-        heard = item.correct(prior, jnp.zeros(item.received), k)[1]
-        columns, _ = factor(jnp.asarray(heard.covariance))
-        z = jnp.stack(columns, axis=1) @ noise - heard.value
+        received = item.correct(prior, jnp.zeros(item.received), k)[1]
+        columns, _ = factor(jnp.asarray(received.covariance))
+        z = jnp.stack(columns, axis=1) @ noise - received.value
         return item.correct(prior, z, k)[0], z
 
     start = jax.tree.map(jnp.asarray, item.init())
     noise = jax.random.normal(key, (len(u), item.received), dtype=float)
-    found: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
-    return found
+    result: jax.Array = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u), noise))[1]
+    return result

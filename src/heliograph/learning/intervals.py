@@ -44,12 +44,12 @@ def bartlett(scores: Scores) -> LongRun:
 
     Source: Newey and West (1987).
     """
-    found = []
+    results = []
     for s in scores:
         lags = int(np.ceil(4 * (len(s) / 100) ** (2 / 9)))
         products = [s[lag:].T @ s[: len(s) - lag] * (1 - lag / (lags + 1)) for lag in range(min(lags + 1, len(s)))]
-        found.append(products[0] + sum(each + each.T for each in products[1:]))
-    return LongRun(np.sum(found, axis=0), np.inf)
+        results.append(products[0] + sum(product + product.T for product in products[1:]))
+    return LongRun(np.sum(results, axis=0), np.inf)
 
 
 def white(scores: Scores) -> LongRun:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.learning.transforms import from_line, size, slope, to_line, unlink_slope
+from heliograph.learning.likelihood.transforms import from_line, size, slope, to_line, unlink_slope
 from heliograph.numerics.domain import POSITIVE, PROBABILITY, REAL, Domain
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
@@ -83,39 +83,39 @@ class Parameters:
     @property
     def size(self) -> int:
         """Numbers on the line."""
-        return sum(one.size for one in self.every)
+        return sum(item.size for item in self.every)
 
     @property
     def start(self) -> Float[np.ndarray, " p"]:
         """The starts on the line."""
-        return np.concatenate([to_line(one.name, one.domain, one.start) for one in self.every])
+        return np.concatenate([to_line(item.name, item.domain, item.start) for item in self.every])
 
     @property
     def entries(self) -> tuple[Entry, ...]:
         """The rows of the table."""
-        found, begin = [], 0
-        for one in self.every:
-            own = one.domain.kind == "interval"
-            for i, (name, domain) in enumerate(zip(one.entries, one.entry_domains, strict=True)):
-                found.append(Entry(name, domain, begin + i if own else None))
-            begin += one.size
-        return tuple(found)
+        results, begin = [], 0
+        for item in self.every:
+            local = item.domain.kind == "interval"
+            for i, (name, domain) in enumerate(zip(item.entries, item.entry_domains, strict=True)):
+                results.append(Entry(name, domain, begin + i if local else None))
+            begin += item.size
+        return tuple(results)
 
     @property
     def coordinates(self) -> tuple[str, ...]:
         """Names of the numbers on the line."""
         return tuple(
-            one.entries[i] if one.domain.kind == "interval" else f"{one.name}({i})"
-            for one in self.every
-            for i in range(one.size)
+            item.entries[i] if item.domain.kind == "interval" else f"{item.name}({i})"
+            for item in self.every
+            for i in range(item.size)
         )
 
     def values(self, x: Array) -> dict[str, Array]:
         """The numbers at a point of the line, by name."""
-        ends = np.cumsum([0, *(one.size for one in self.every)])
+        ends = np.cumsum([0, *(item.size for item in self.every)])
         return {
-            one.name: from_line(one.domain, one.start.shape, x[a:b])
-            for one, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
+            item.name: from_line(item.domain, item.start.shape, x[a:b])
+            for item, a, b in zip(self.every, ends[:-1], ends[1:], strict=True)
         }
 
     def known(self, x: Float[np.ndarray, " p"]) -> dict[str, Any]:
@@ -125,14 +125,14 @@ class Parameters:
 
     def entries_at(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, " entries"]:
         """Values of the entries."""
-        return np.concatenate([one.values(own) for one, own in self._parts(x)])
+        return np.concatenate([item.values(single) for item, single in self._parts(x)])
 
     def jacobian(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:
         """Derivatives of the entries."""
-        return np.asarray(block_diag(*(one.derivatives(own) for one, own in self._parts(x))))
+        return np.asarray(block_diag(*(item.derivatives(single) for item, single in self._parts(x))))
 
     def _parts(self, x: np.ndarray) -> list[tuple[Parameter, np.ndarray]]:
-        ends = np.cumsum([one.size for one in self.every])
+        ends = np.cumsum([item.size for item in self.every])
         return list(zip(self.every, np.split(x, ends[:-1]), strict=True))
 
     def slopes(self, x: Float[np.ndarray, " p"]) -> Float[np.ndarray, "entries p"]:

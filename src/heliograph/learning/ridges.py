@@ -43,9 +43,9 @@ class Rank(NamedTuple):
 
 def rank_of(information: Float[np.ndarray, "p p"]) -> Rank:
     """Of I_ij / sqrt(I_ii I_jj); a coordinate of which nothing at all is known is a direction by itself."""
-    own = np.diag(information)
-    there = own > 0
-    unit = np.where(there, 1 / np.sqrt(np.where(there, own, 1.0)), 1.0)
+    local = np.diag(information)
+    there = local > 0
+    unit = np.where(there, 1 / np.sqrt(np.where(there, local, 1.0)), 1.0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
     none = values < NOTHING
     least = int(np.argmax(~none)) if (~none).any() else 0
@@ -64,19 +64,20 @@ def confounded(parameters: Parameters, points: list[Float[np.ndarray, " p"]], ra
         _basis(log[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (_, log) in zip(used, scales, strict=True)
     ]
     plain = [
-        _basis(own[:, None] * rank.unit[:, None] * rank.flat) for (_, rank), (own, _) in zip(used, scales, strict=True)
+        _basis(item[:, None] * rank.unit[:, None] * rank.flat)
+        for (_, rank), (item, _) in zip(used, scales, strict=True)
     ]
-    return [_told(group, logs, plain) for group in _groups(logs)]
+    return [_in_words(group, logs, plain) for group in _groups(logs)]
 
 
 def _scales(parameters: Parameters, x: Float[np.ndarray, " p"]) -> tuple[np.ndarray, np.ndarray]:
     """dv/dx and d log|v|/dx of each coordinate that is a number of its own; 1 of the others."""
-    own, log = np.ones(len(x)), np.ones(len(x))
+    local, log = np.ones(len(x)), np.ones(len(x))
     for entry, row, value in zip(parameters.entries, parameters.jacobian(x), parameters.entries_at(x), strict=True):
         if entry.place is not None:
-            own[entry.place] = row[entry.place]
+            local[entry.place] = row[entry.place]
             log[entry.place] = row[entry.place] / value if value else np.nan
-    return own, np.nan_to_num(log)
+    return local, np.nan_to_num(log)
 
 
 def _basis(vectors: np.ndarray) -> np.ndarray:
@@ -88,30 +89,30 @@ def _basis(vectors: np.ndarray) -> np.ndarray:
 def _groups(bases: list[np.ndarray]) -> list[tuple[int, ...]]:
     """Coordinates connected by flat directions at any point."""
     joined = np.max([np.abs(b @ b.T) for b in bases], axis=0) > SAME
-    left, found = [i for i in range(len(joined)) if joined[i, i]], []
+    left, results = [i for i in range(len(joined)) if joined[i, i]], []
     while left:
         group, edge = {left[0]}, {left[0]}
         while edge:
             edge = {int(j) for i in edge for j in np.flatnonzero(joined[i])} - group
             group |= edge
-        found.append(tuple(sorted(int(i) for i in group)))
+        results.append(tuple(sorted(int(i) for i in group)))
         left = [i for i in left if i not in group]
-    return found
+    return results
 
 
-def _told(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
+def _in_words(group: tuple[int, ...], logs: list[np.ndarray], plain: list[np.ndarray]) -> Confounded:
     places = list(group)
     size = int(max(np.linalg.matrix_rank(b[places], tol=SAME) for b in logs))
     none = np.zeros((0, len(group)))
-    powers = _everywhere_told([b[places] for b in logs])
+    powers = _everywhere_known([b[places] for b in logs])
     if len(powers):
         powers = powers / np.min(np.abs(np.where(powers == 0, np.inf, powers)), axis=1, keepdims=True)
         if np.all(np.abs(powers - np.round(powers)) < WHOLE) and np.max(np.abs(powers)) <= LARGEST + WHOLE:
             return Confounded(group, np.round(powers), none, size)
-    return Confounded(group, none, _everywhere_told([b[places] for b in plain]), size)
+    return Confounded(group, none, _everywhere_known([b[places] for b in plain]), size)
 
 
-def _everywhere_told(bases: list[np.ndarray]) -> np.ndarray:
+def _everywhere_known(bases: list[np.ndarray]) -> np.ndarray:
     """Rows orthogonal to the flat directions of all points, reduced."""
     _, size, right = np.linalg.svd(np.concatenate(bases, axis=1).T)
     rank = int(np.count_nonzero(size > SAME))

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.learning.intervals import quantile
-from heliograph.learning.joint import joint_world
+from heliograph.learning.likelihood.joint import joint_world
 from heliograph.model.over_time import OverTime, first
 from heliograph.numerics.small_matrix import congruence, contract
 from heliograph.numerics.types import Array
-from heliograph.random_affine.second_moments import second_order
+from heliograph.random_affine.moments.second_moments import second_order
 
 if TYPE_CHECKING:
     from heliograph.learning.solution import Solution
@@ -28,10 +28,10 @@ def route_sentences(solution: "Solution") -> list[str]:
 
     def totals(x: Array) -> jax.Array:
         world = joint_world(description.at(description.parameters.values(x)))
-        own, link = first(world[1]), first(world[2])
-        found, r = second_order(link), jnp.asarray(own.noise.covariance)
-        mean, p = jnp.asarray(found.mean_gain), found.mean_gain.shape[1]
-        spread = jnp.asarray(found.nominal.center)
+        local, link = first(world[1]), first(world[2])
+        result, r = second_order(link), jnp.asarray(local.noise.covariance)
+        mean, p = jnp.asarray(result.mean_gain), result.mean_gain.shape[1]
+        spread = jnp.asarray(result.nominal.center)
         whole = jnp.zeros((p + 1, p + 1)).at[:p, :p].set(r).at[p, p].set(1.0)
         noise = jnp.diagonal(congruence(mean, r) + contract(spread, whole))
         reached = jnp.argmax(jnp.abs(mean), axis=1)
@@ -44,13 +44,13 @@ def route_sentences(solution: "Solution") -> list[str]:
     covariance, freedom = solution.covariance()
     lines = []
     for i, name in enumerate(sensor.outputs if len(sensor.outputs) == len(values) else range(len(values))):
-        told = [
+        report = [
             f"{kind} {value:.3g} ({value - reach:.3g} .. {value + reach:.3g})"
             for kind, value, row in zip(KINDS, values[i], slopes[i][:, solution.active], strict=True)
-            if solution.told(row)
+            if solution.report(row)
             for reach in [quantile(freedom) * float(np.sqrt(max(row @ covariance @ row, 0.0)))]
         ]
-        if told:
+        if report:
             label = name if isinstance(name, str) else f"z{name}"
-            lines.append(f"Told of what arrives of {label}: {', '.join(told)}, 95 %, the sensor's noise included.")
+            lines.append(f"Told of what arrives of {label}: {', '.join(report)}, 95 %, the sensor's noise included.")
     return lines

@@ -16,11 +16,11 @@ from heliograph.learning.intervals import (
     quantile,
     sandwich,
 )
-from heliograph.learning.objective import Form
+from heliograph.learning.likelihood.objective import Form
+from heliograph.learning.likelihood.surface import REACH, Surface
+from heliograph.learning.likelihood.transforms import link, unlink
 from heliograph.learning.parameters import Entry, Parameters
 from heliograph.learning.ridges import Rank, rank_of
-from heliograph.learning.surface import REACH, Surface
-from heliograph.learning.transforms import link, unlink
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Bool, Float
 
@@ -75,22 +75,22 @@ class Solution:
     @cached_property
     def scores(self) -> Scores:
         """Of each step, by recording, among active coordinates."""
-        score = self.surface.found(self.x[None]).score[0][..., self.active]
+        score = self.surface.result(self.x[None]).score[0][..., self.active]
         return [s[:steps] for s, steps in zip(score, self.surface.data.lengths, strict=True)]
 
     @cached_property
     def rank(self) -> Rank:
         """Flat directions at the maximum, among active coordinates, as many as the ridges."""
-        return cut(self.surface.found(self.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
+        return cut(self.surface.result(self.x[None]).late[0][np.ix_(self.active, self.active)], self.ridges)
 
     @cached_property
     def hessian(self) -> Float[np.ndarray, "r r"]:
         """-d2 l along the directions that are told."""
         observed = self.surface.hessian(self.x, self.active)[np.ix_(self.active, self.active)]
-        found = self._reduced(observed)
-        if np.linalg.eigvalsh(found)[:1].sum() > 0:
-            return found
-        information = self.surface.found(self.x[None]).information[0]
+        result = self._reduced(observed)
+        if np.linalg.eigvalsh(result)[:1].sum() > 0:
+            return result
+        information = self.surface.result(self.x[None]).information[0]
         return self._reduced(information[np.ix_(self.active, self.active)])
 
     @property
@@ -107,8 +107,8 @@ class Solution:
         if method == "bootstrap":
             drawn = np.linalg.solve(self.hessian, block_sums(scores, DRAWS, 0).T)
             return np.asarray(self.basis @ np.cov(drawn).reshape(len(drawn), -1) @ self.basis.T), np.inf
-        found = long_run(method, scores, self.hessian)
-        return np.asarray(self.basis @ sandwich(self.hessian, found.covariance) @ self.basis.T), found.freedom
+        result = long_run(method, scores, self.hessian)
+        return np.asarray(self.basis @ sandwich(self.hessian, result.covariance) @ self.basis.T), result.freedom
 
     def rows(self, method: Method = "cosines") -> tuple[Row, ...]:
         """The table by this form."""
@@ -124,7 +124,7 @@ class Solution:
     ) -> Row:
         if entry.place is not None and not self.active[entry.place]:
             return self._at_boundary(entry, value)
-        if not self.told(slopes):
+        if not self.report(slopes):
             return Row(entry.name, value, np.nan, np.nan, np.nan, self.form, False, False)
         error = float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
         center = link(entry.domain, value)
@@ -134,11 +134,11 @@ class Solution:
             low, high = center + self._drawn(slopes)
         else:
             low, high = center + quantile(freedom) * error * np.array([-1.0, 1.0])
-        one, other = sorted(float(unlink(entry.domain, end)) for end in (low, high))
+        item, other = sorted(float(unlink(entry.domain, end)) for end in (low, high))
         width = abs(float(unlink(entry.domain, center + 1e-6) - unlink(entry.domain, center - 1e-6))) / 2e-6
-        return Row(entry.name, value, one, other, error * width, self.form, False, True)
+        return Row(entry.name, value, item, other, error * width, self.form, False, True)
 
-    def told(self, slopes: Float[np.ndarray, " active"]) -> bool:
+    def report(self, slopes: Float[np.ndarray, " active"]) -> bool:
         """Whether the data tell a function of the coordinates with this derivative."""
         along = self.rank.unit * slopes
         size = np.linalg.norm(along)
@@ -164,7 +164,7 @@ class Solution:
         outward = -1.0 if self.x[entry.place] < 0 else 1.0
         points = np.repeat(self.x[None], 33, axis=0)
         points[:, entry.place] = reach = -outward * np.linspace(-24.0, 8.0, 33)
-        totals = self.surface.found(points).total
+        totals = self.surface.result(points).total
         fallen = np.flatnonzero(~(totals > self.total - ONE_SIDED))
         last = int(fallen[0]) if len(fallen) else len(reach) - 1
         ends = reach[max(last - 1, 0)] + np.array([0.0, 0.4, 0.8, 1.2, 1.6, 2.0, 3.0, 5.0]) * -outward
@@ -181,7 +181,7 @@ def cut(late: Float[np.ndarray, "p p"], ridges: int) -> Rank:
     rank = rank_of(late)
     if rank.flat.shape[1] == ridges:
         return rank
-    own = np.diag(late)
-    unit = np.where(own > 0, 1 / np.sqrt(np.where(own > 0, own, 1.0)), 1.0)
+    local = np.diag(late)
+    unit = np.where(local > 0, 1 / np.sqrt(np.where(local > 0, local, 1.0)), 1.0)
     _, vectors = np.linalg.eigh(late * unit[:, None] * unit)
     return rank._replace(flat=vectors[:, :ridges], rest=vectors[:, ridges:], unit=unit)

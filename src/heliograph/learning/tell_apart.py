@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.stats import norm
 
-from heliograph.filters.gaussian import GaussianFilter, cubature_filter
-from heliograph.filters.open_loop import open_loop_filter
-from heliograph.learning.foretelling import NODES, Parts, expected_signals, of_signals
+from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter
+from heliograph.filters.linear.open_loop import open_loop_filter
+from heliograph.learning.likelihood.predictive_density import NODES, Parts, expected_signals, of_signals
 from heliograph.learning.long_run import long_run_deviation
 from heliograph.numerics.check import check_count, check_seed, fail, instance, scalar
 from heliograph.numerics.float64 import compiled
@@ -71,12 +71,12 @@ def samples_to_tell(
     name, node = _the_node(network)
     count = HORIZON if inputs is None else len(np.asarray(inputs))
     channels = [_with_law(node.channel, (law_a, law_b), law) for law in (law_a, law_b)]
-    found = []
-    for own, other in (channels, channels[::-1]):
-        ratio = _ratios(network, name, node, own, other, inputs, count, seed, nodes)
+    results = []
+    for item, other in (channels, channels[::-1]):
+        ratio = _ratios(network, name, node, item, other, inputs, count, seed, nodes)
         deviation = np.sqrt(np.mean([long_run_deviation(r) ** 2 for r in ratio]))
-        found.append((float(ratio.mean()), float(deviation)))
-    (gain_a, deviation_a), (gain_b, deviation_b) = found
+        results.append((float(ratio.mean()), float(deviation)))
+    (gain_a, deviation_a), (gain_b, deviation_b) = results
     gain = gain_a + gain_b
     needed = (norm.isf(level) * (deviation_a + deviation_b) / gain) ** 2 if gain > 0 else np.inf
     return SamplesToTell(float(needed), (gain_a, gain_b), (deviation_a, deviation_b))
@@ -84,16 +84,18 @@ def samples_to_tell(
 
 def _the_node(network: Network) -> tuple[str, Node]:
     instance("network", network, Network, "a Network")
-    heard = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    if len(heard) != 1 or len(network.nodes) != 1:
+    received = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    if len(received) != 1 or len(network.nodes) != 1:
         raise fail("network", "one node that hears its sensor through a channel", f"{len(network.nodes)} nodes")
-    return next(iter(heard.items()))
+    return next(iter(received.items()))
 
 
 def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: AbstractLaw) -> AbstractRandomAffine:
     """The channel with `law` in the place of the gain in question."""
-    one = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
-    laws = [leaf for leaf in jax.tree.leaves(one, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)]
+    single = instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
+    laws = [
+        leaf for leaf in jax.tree.leaves(single, is_leaf=_is_law) if _is_law(leaf) and not isinstance(leaf, Constant)
+    ]
     of_pair = [leaf for leaf in laws if any(same(leaf, item) for item in pair)]
     chosen = of_pair or [leaf for leaf in laws if same(leaf, laws[0])]
     if not of_pair and not 0 < len(chosen) == len(laws):
@@ -102,7 +104,7 @@ def _with_law(channel: object, pair: tuple[AbstractLaw, AbstractLaw], law: Abstr
     def placed(leaf: object) -> object:
         return law if any(leaf is item for item in chosen) else leaf
 
-    result: AbstractRandomAffine = jax.tree.map(placed, one, is_leaf=_is_law)
+    result: AbstractRandomAffine = jax.tree.map(placed, single, is_leaf=_is_law)
     return result
 
 
@@ -114,7 +116,7 @@ def _ratios(
     network: Network,
     name: str,
     node: Node,
-    own: AbstractRandomAffine,
+    local: AbstractRandomAffine,
     other: AbstractRandomAffine,
     inputs: ArrayLike | None,
     count: int,
@@ -122,14 +124,14 @@ def _ratios(
     nodes: int,
 ) -> np.ndarray:
     """log p_own - log p_other of each run and step, of data drawn under the first."""
-    plain = Node(node.sensor, own, {"open_loop": open_loop_filter(network.plant)})
+    plain = Node(node.sensor, local, {"open_loop": open_loop_filter(network.plant)})
     world = Network(network.plant, {name: plain})
     z = monte_carlo(world, count, RUNS, seed, inputs=inputs).measurements[name]
     u = np.zeros((count, len(network.inputs))) if inputs is None else np.asarray(inputs, dtype=float)
     said = []
-    for channel in (own, other):
-        heard = arrived(channel)
-        item, parts = cubature_filter(network.plant, node.sensor, heard), Parts.of(heard, nodes)
+    for channel in (local, other):
+        received = arrived(channel)
+        item, parts = cubature_filter(network.plant, node.sensor, received), Parts.of(received, nodes)
         y, spread, near = (np.asarray(a).reshape(-1, *a.shape[2:]) for a in _side_by_side(item, z, u))
         said.append(of_signals((y, spread, near), parts).log_likelihood.reshape(z.shape[:2]))
     return np.asarray(said[0] - said[1])
@@ -139,4 +141,4 @@ def _ratios(
 def _side_by_side(
     item: GaussianFilter, z: Float[Array, "runs steps m"], u: Float[Array, "steps inputs"]
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    return jax.vmap(lambda one: expected_signals(item, one, u))(jnp.asarray(z))
+    return jax.vmap(lambda single: expected_signals(item, single, u))(jnp.asarray(z))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.told_losses import ONE, ToldSystem, certified_radius, find_gains, spectral_radius
+from heliograph.linear.known_losses import BELOW_ONE, KnownLossSystem, certified_radius, find_gains, spectral_radius
 from heliograph.model.over_time import OverTime
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.model.sensor import AnySensor, LinearSensor, check_sensor, refuse_angles
@@ -54,33 +54,33 @@ def critical_arrival(plant: AnyPlant, sensor: AnySensor, gain: ArrayLike | None 
     def gain_at(arrival: float) -> Float[np.ndarray, "n m"] | None:
         """A certified gain, or None."""
         chain = np.array([[arrival, 1 - arrival]] * 2)
-        system = ToldSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
+        system = KnownLossSystem(a, q, chain, chain[0], np.array([0, 1]), (c, lost), (r, np.zeros((0, 0))))
         gains = find_gains(system) if fixed is None else (fixed, lost.T)
-        return gains[0] if certified_radius(system, gains) < ONE else None
+        return gains[0] if certified_radius(system, gains) < BELOW_ONE else None
 
     radius = spectral_radius(a)
-    if radius < ONE and fixed is None:
+    if radius < BELOW_ONE and fixed is None:
         return CriticalArrival(0.0, 0.0, np.zeros((len(a), len(c))))
     lower = max(1 - radius**-2, 0.0)
     if gain_at(1.0) is None:
         what = "sensor" if fixed is None else "gain"
         raise fail(what, "one that keeps the error bounded where everything arrives", "an unstable mode that stays")
-    upper, found = _smallest(gain_at, lower)
-    return CriticalArrival(lower if fixed is None else upper, upper, found)
+    upper, result = _smallest(gain_at, lower)
+    return CriticalArrival(lower if fixed is None else upper, upper, result)
 
 
 def _smallest(gain_at: Callable[[float], np.ndarray | None], lower: float) -> tuple[float, np.ndarray]:
     """The smallest arrival with a certified gain, by bisection, and that gain; `lower` itself if it is that close."""
-    near, found = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
+    near, result = gain_at(min(lower + RESOLUTION, 1.0)), gain_at(1.0)
     if near is not None:
         return lower, near
     low, high = lower, 1.0
     while high - low > RESOLUTION / 10:
         middle = (low + high) / 2
         candidate = gain_at(middle)
-        low, high, found = (middle, high, found) if candidate is None else (low, middle, candidate)
-    assert found is not None
-    return high, found
+        low, high, result = (middle, high, result) if candidate is None else (low, middle, candidate)
+    assert result is not None
+    return high, result
 
 
 def plant_matrices(plant: AnyPlant) -> tuple[Float[np.ndarray, "n n"], Float[np.ndarray, "n n"]]:

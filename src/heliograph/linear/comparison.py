@@ -16,7 +16,7 @@ from heliograph.model.sensor import AnySensor
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Float
-from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.moments.monomials import exponents
 
 SYMMETRIC = 1e-10  # standardised third moment below which it is rounding
 
@@ -66,13 +66,13 @@ def gain_over_linear(
         ValueError: what `lifted_system` refuses, no degree above 1, `after` outside the horizon.
     """
     check_count("horizon", horizon)
-    wanted = sorted({1, 2, *degrees})
+    expected = sorted({1, 2, *degrees})
     if not degrees or min(degrees) < 2:
         raise fail("degrees", "at least one, all of 2 or more", list(degrees))
     begin = horizon // 3 if after is None else after
     if not 0 <= begin < horizon:
         raise fail("first step that counts", f"one from 0 to {horizon - 1}", begin)
-    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in wanted}
+    systems = {d: lifted_system(plant, sensor, channel, d, horizon) for d in expected}
     n, m = len(first(plant).states), int(first(channel).outputs)
     covariances = {d: lmmse(system).gains.covariance for d, system in systems.items()}
     return GainOverLinear(first(plant).states, covariances, skewness(systems[2], n, m), begin)

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.linear.modal_lift import lifted_modes
-from heliograph.linear.moments_over_time import Settling, check_moments
+from heliograph.linear.moments_over_time import SteadyState, check_moments
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.model.channel import Channel, check_link
 from heliograph.model.over_time import OverTime, first, unstack
@@ -21,10 +21,10 @@ from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series
 from heliograph.random_affine.law import Constant
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
+from heliograph.random_affine.moments.monomials import MEMORY_LIMIT_ENTRIES, count, degrees, exponents
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.moments.second_moments import has_known_gain
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, noise_vector
-from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
-from heliograph.random_affine.second_moments import has_known_gain
 
 T = TypeVar("T")
 EPS = float(np.finfo(np.float64).eps)
@@ -62,18 +62,18 @@ def lifted_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: 
     refuse_lift(degree, n, m, horizon)
     routes, moments = model_routes(plant, sensor, channel, 2 * degree, horizon), initial_moments(start, 2 * degree)
     if first(channel).remembers:
-        want = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
+        projection = np.pad(linear_rows(n, degree), ((0, 0), (0, 1)))
         distinct = {id(r.measurement): r.measurement for r in routes}
         modes = {place: joint_modes(item, order=degree) for place, item in distinct.items()}
-        each = [modes[id(r.measurement)] for r in routes]
-        refuse_lift(degree, n, m, horizon, max(len(one.initial) for one in modes.values()))
-        return lifted_modes([r.plant for r in routes], each, degree, moments, want)
+        items = [modes[id(r.measurement)] for r in routes]
+        refuse_lift(degree, n, m, horizon, max(len(mode.initial) for mode in modes.values()))
+        return lifted_modes([r.plant for r in routes], items, degree, moments, projection)
     before = second_moments(moments, n + 1, degree)
     mean, spread = mean_and_spread(before)
     start_lost = EPS * np.diag(before)[:-1]
     varies = isinstance(plant, OverTime), isinstance(sensor, OverTime) or isinstance(channel, OverTime)
-    steps, process_rounding, heard_rounding = _lifted_steps(routes, degree, moments, varies)
-    return LinearSystem(steps, mean, spread, linear_rows(n, degree), process_rounding, heard_rounding, start_lost)
+    steps, process_rounding, received_rounding = _lifted_steps(routes, degree, moments, varies)
+    return LinearSystem(steps, mean, spread, linear_rows(n, degree), process_rounding, received_rounding, start_lost)
 
 
 def _lifted_steps(
@@ -84,10 +84,10 @@ def _lifted_steps(
     Where nothing varies and the moments of the state have come to stay, all later steps are as the last, to rounding.
     """
     parts, lost = [], []
-    settling = Settling(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
+    steady = SteadyState(np.asarray(routes[0].plant.matrix), 2 * degree, any(varies))
     last: Route | None = None
     for k, route in enumerate(routes):
-        if settling.stays(moments):
+        if steady.stays(moments):
             break
         if last is None or not _same(route.plant, last.plant):
             move = Lifted(route.plant, degree, varies[0])
@@ -101,12 +101,12 @@ def _lifted_steps(
         parts.append((*affine(move.matrix), process, *affine(listen.matrix), noise))
         lost.append((process_lost, noise_lost))
     steps = Steps(*(over_horizon(part, len(routes)) for part in zip(*parts, strict=True)))
-    process_rounding, heard_rounding = (over_horizon(part, len(routes)) for part in zip(*lost, strict=True))
-    return steps, process_rounding, heard_rounding
+    process_rounding, received_rounding = (over_horizon(part, len(routes)) for part in zip(*lost, strict=True))
+    return steps, process_rounding, received_rounding
 
 
-def _same(one: AbstractRandomAffine, two: AbstractRandomAffine) -> bool:
-    return one is two or bool(eqx.tree_equal(one, two))
+def _same(item: AbstractRandomAffine, two: AbstractRandomAffine) -> bool:
+    return item is two or bool(eqx.tree_equal(item, two))
 
 
 class Lifted:
@@ -122,8 +122,8 @@ class Lifted:
         small = not varies and rows * columns <= KEPT_ENTRIES
         self.whole = np.asarray(route.moments(2 * degree).matrix) if small else None
         self.given = degrees(route.inputs, 2 * degree)
-        own = degrees(route.outputs, degree)
-        self.highest = own[:, None] + own
+        local = degrees(route.outputs, degree)
+        self.highest = local[:, None] + local
         if not has_known_gain(route):
             self.highest = np.full_like(self.highest, 2 * degree + 2)
 
@@ -171,10 +171,10 @@ def affine(
     return homogeneous[:-1, :-1], homogeneous[:-1, -1]
 
 
-def linear_rows(variables: int, degree: int, wanted: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
+def linear_rows(variables: int, degree: int, expected: int | None = None) -> Float[np.ndarray, "wanted monomials"]:
     """Rows that read the first `wanted` variables off their C(variables + degree, degree) - 1 monomials."""
     places = {powers: i for i, powers in enumerate(exponents(variables + 1, degree))}
-    rows = np.zeros((variables if wanted is None else wanted, len(places) - 1))
+    rows = np.zeros((variables if expected is None else expected, len(places) - 1))
     for i, row in enumerate(rows):
         row[places[(*(int(i == j) for j in range(variables)), degree - 1)]] = 1.0
     return rows
@@ -210,8 +210,8 @@ def model_routes(plant: AnyPlant, sensor: AnySensor, channel: Channel, order: in
     sensors = _maps(each_step(sensor, horizon), order)
     channels = each_step(channel, horizon)
     fixed = not isinstance(sensor, OverTime) and not isinstance(channel, OverTime)
-    one = Series([sensors[0], channels[0]])
-    measurements = [one if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
+    item = Series([sensors[0], channels[0]])
+    measurements = [item if fixed else Series(pair) for pair in zip(sensors, channels, strict=True)]
     return [Route(*pair) for pair in zip(plants, measurements, strict=True)]
 
 

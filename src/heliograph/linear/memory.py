@@ -23,9 +23,9 @@ from heliograph.random_affine.atoms import GainAndNoise, known
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Series, Stack
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.monomials import exponents, symmetric_power
+from heliograph.random_affine.moments.monomials import exponents, symmetric_power
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Independent
-from heliograph.random_affine.push import Tabulated, push, push_known, second_moments
 
 
 def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: Schedule) -> LinearSystem:
@@ -48,16 +48,16 @@ def memory_system(plant: AnyPlant, sensor: AnySensor, channel: Channel, linear: 
     moments = push_known(beginning, 4, initial_moments(start, 4))
     before = second_moments(moments, total + 1, 2)
     mean, spread = mean_and_spread(before)
-    heard, parts, rounding, kept = _heard(n, m), [], [], _Kept()
+    received, parts, rounding, stored = _received_products(n, m), [], [], _Recorded()
     for k, route in enumerate(model_routes(plant, sensor, channel, 4, horizon)):
-        move, listen = kept.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
-        wide = kept.widen(route.measurement, n)
+        move, listen = stored.move(route.plant, m), _listen(Gains(*(field[k] for field in linear.gains)))
+        wide = stored.widen(route.measurement, n)
         transition = symmetric_power(listen, 2) @ wide[0] @ move.moments(2).matrix
         moments = push_known(listen, 4, wide[1] @ push(move, 4, moments))
         after = second_moments(moments, total + 1, 2)
         process = after - transition @ before @ transition.T
-        nothing = np.zeros(len(heard)), np.zeros((len(heard), len(heard)))
-        parts.append((*affine(transition), process[:-1, :-1], heard, *nothing))
+        nothing = np.zeros(len(received)), np.zeros((len(received), len(received)))
+        parts.append((*affine(transition), process[:-1, :-1], received, *nothing))
         rounding.append(np.finfo(float).eps * np.diag(after)[:-1])
         before = after
     steps = Steps(*map(np.array, zip(*parts, strict=True)))
@@ -76,7 +76,7 @@ def _listen(g: Gains) -> np.ndarray:
     return _homogeneous(after, np.concatenate([np.zeros(n), g.offset, np.zeros(m)]))
 
 
-class _Kept:
+class _Recorded:
     """What is computed anew only where the model changes: the noise's moments, and those of the route to z."""
 
     def __init__(self) -> None:
@@ -103,15 +103,15 @@ class _Kept:
         return self.wide
 
 
-def _heard(n: int, m: int) -> np.ndarray:
+def _received_products(n: int, m: int) -> np.ndarray:
     """Rows that read (monomials of z up to degree 2, z_i q_j) off the square of (x, q, z)."""
     total = 2 * n + m
     places = {powers: i for i, powers in enumerate(exponents(total + 1, 2))}
-    wanted = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
+    expected = [(*(0,) * (2 * n), *powers) for powers in exponents(m + 1, 2)[:-1]]
     for i in range(m):
         for j in range(n):
-            wanted.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
-    rows = np.zeros((len(wanted), len(places) - 1))
-    for row, powers in zip(rows, wanted, strict=True):
+            expected.append(tuple(int(v in (n + j, 2 * n + i)) for v in range(total + 1)))
+    rows = np.zeros((len(expected), len(places) - 1))
+    for row, powers in zip(rows, expected, strict=True):
         row[places[powers]] = 1.0
     return rows

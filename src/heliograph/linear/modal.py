@@ -12,8 +12,8 @@ from heliograph.random_affine.base import as_maps, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.second_moments import symmetric_product
-from heliograph.random_affine.told import second_moments
+from heliograph.random_affine.moments.second_moments import symmetric_product
+from heliograph.random_affine.side_information import second_moments
 
 Moments = tuple[Float[np.ndarray, "M m n1"], Float[np.ndarray, "M m m n1 n1"]]  # E[(G, n)] and its spread, by mode
 
@@ -24,7 +24,7 @@ def modal_system(
     initial_mean: ArrayLike,
     initial_covariance: ArrayLike,
     horizon: int,
-    want: ArrayLike | None = None,
+    projection: ArrayLike | None = None,
 ) -> LinearSystem:
     """The system of y 1{mode} for a state y+ = `move`(y), heard as z = `measure`(y+), both random affine maps.
 
@@ -51,28 +51,28 @@ def modal_system(
         raise fail("move", "chains as its memories", "a gain that drifts")
     mean = np.append(array("initial mean", initial_mean, (n,)), 1.0)
     spread = np.pad(covariance("initial covariance", initial_covariance, n), ((0, 1), (0, 1)))
-    read = np.eye(n) if want is None else array("what is to be known", want, (None, n))
+    read = np.eye(n) if projection is None else array("what is to be known", projection, (None, n))
     pairs = zip(each_step(move, horizon), each_step(measure, horizon), strict=True)
     steps = [joint_modes(Stack(pair)) for pair in pairs]
     law, rows = np.asarray(steps[0].initial), np.eye(len(steps[0].initial))
     moments = law[:, None, None] * (np.outer(mean, mean) + spread)
     start = np.kron(np.diag(law), spread) + np.kron(np.diag(law) - np.outer(law, law), np.outer(mean, mean))
     parts = []
-    for one in steps:
-        maps = [m.maps for m in one.maps if isinstance(m, Stack)]
-        moved, heard = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
+    for step in steps:
+        maps = [m.maps for m in step.maps if isinstance(m, Stack)]
+        moved, received = (_by_mode([second_moments(m[i]) for m in maps]) for i in range(2))
         transition, process, moments = _moved(moved, rows, moments)
-        noise = np.einsum("jabcd,jcd->ab", heard[1], moments)
-        output = np.concatenate(list(heard[0]), axis=1)
+        noise = np.einsum("jabcd,jcd->ab", received[1], moments)
+        output = np.concatenate(list(received[0]), axis=1)
         parts.append((transition, np.zeros(len(transition)), process, output, np.zeros(len(output)), noise))
-        rows = np.asarray(one.transition)
+        rows = np.asarray(step.transition)
     whole = np.tile(np.pad(read, ((0, 0), (0, 1))), (1, len(law)))
     return LinearSystem(Steps(*map(np.array, zip(*parts, strict=True))), np.kron(law, mean), start, whole)
 
 
-def _by_mode(each: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
-    mean = np.array([first_order for first_order, _ in each])
-    second = np.array([second_order for _, second_order in each])
+def _by_mode(items: list[tuple[np.ndarray, np.ndarray]]) -> Moments:
+    mean = np.array([first_order for first_order, _ in items])
+    second = np.array([second_order for _, second_order in items])
     return mean, second - np.array([symmetric_product(m, m) for m in mean])
 
 

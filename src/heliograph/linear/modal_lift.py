@@ -4,12 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from heliograph.linear.moments_over_time import EPS, Settling, check_moments
+from heliograph.linear.moments_over_time import EPS, SteadyState, check_moments
 from heliograph.linear.system import LinearSystem, Steps, over_horizon
 from heliograph.numerics.types import Float
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.modes import JointModes
-from heliograph.random_affine.push import push, second_moments
+from heliograph.random_affine.moments.push import push, second_moments
 
 
 def lifted_modes(
@@ -17,7 +17,7 @@ def lifted_modes(
     measurements: Sequence[JointModes],
     degree: int,
     moments: Float[np.ndarray, " monomials"],
-    want: Float[np.ndarray, "n L"],
+    projection: Float[np.ndarray, "n L"],
 ) -> LinearSystem:
     """The system of Y 1{mode} for every mode, Y = (monomials of x up to `degree`, 1), measured by those of z.
 
@@ -34,16 +34,16 @@ def lifted_modes(
     mean = np.kron(law, before[:, -1])
     start = np.kron(np.diag(law), before) - np.outer(mean, mean)
     parts, rounding, earlier = [], [], law
-    distinct = {id(heard): heard for heard in measurements}
-    of_modes = {place: heard.moments(degree) for place, heard in distinct.items()}
+    distinct = {id(measurement): measurement for measurement in measurements}
+    of_modes = {place: item.moments(degree) for place, item in distinct.items()}
     of_plant = {place: np.asarray(p.moments(degree).matrix) for place, p in {id(p): p for p in plants}.items()}
     # Where nothing varies, and the moments and the law have come to stay, all later steps are as the last, to rounding.
-    settling = Settling(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
-    for k, (plant, heard) in enumerate(zip(plants, measurements, strict=True)):
-        if settling.stays(moments) and np.array_equal(law, earlier) and k > 1:
+    steady = SteadyState(np.asarray(plants[0].matrix), 2 * degree, varies=len(of_modes) > 1 or len(of_plant) > 1)
+    for k, (plant, measurement) in enumerate(zip(plants, measurements, strict=True)):
+        if steady.stays(moments) and np.array_equal(law, earlier) and k > 1:
             break
         earlier = law
-        moved, means = of_plant[id(plant)], of_modes[id(heard)]
+        moved, means = of_plant[id(plant)], of_modes[id(measurement)]
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is refused
             moments = np.asarray(push(plant, 2 * degree, moments))
         check_moments(moments, k, 2 * degree)
@@ -52,16 +52,16 @@ def lifted_modes(
         law = _stays(law, law @ rows)
         process = np.kron(chosen, carried) + np.kron(np.diag(law), after - carried)
         noise = np.zeros((1, 1))
-        for p, matrix, route in zip(law, means, heard.maps, strict=True):
+        for p, matrix, route in zip(law, means, measurement.maps, strict=True):
             arrives = second_moments(push(route, 2 * degree, moments), route.outputs + 1, degree)
             noise = noise + p * (np.asarray(arrives) - matrix @ after @ matrix.T)
         output = np.concatenate(list(means), axis=1)[:-1]
         zero = np.zeros(len(mean)), np.zeros(len(output))
         parts.append((np.kron(rows.T, moved), zero[0], process, output, zero[1], noise[:-1, :-1]))
         rounding.append(EPS * np.kron(law, np.diag(after)))
-        before, rows = after, np.asarray(heard.transition)
+        before, rows = after, np.asarray(measurement.transition)
     steps = Steps(*(over_horizon(part, len(plants)) for part in zip(*parts, strict=True)))
-    return LinearSystem(steps, mean, start, np.tile(want, (1, modes)), over_horizon(rounding, len(plants)))
+    return LinearSystem(steps, mean, start, np.tile(projection, (1, modes)), over_horizon(rounding, len(plants)))
 
 
 def _stays(law: Float[np.ndarray, " modes"], after: Float[np.ndarray, " modes"]) -> Float[np.ndarray, " modes"]:

@@ -4,7 +4,7 @@ import numpy as np
 
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float
-from heliograph.random_affine.monomials import exponents, position
+from heliograph.random_affine.moments.monomials import exponents, position
 
 EPS = float(np.finfo(np.float64).eps)
 
@@ -18,7 +18,7 @@ def check_moments(moments: Moments, k: int, order: int) -> None:
         raise fail(f"moments of the state up to order {order}", "finite ones at every step", got)
 
 
-class Settling:
+class SteadyState:
     """Whether moments of x up to `order` stay, to rounding, where x+ = A x + noise has one law for all time.
 
     What a step changes shrinks with the spectral radius r of A, so that all later steps change no more than 1 / (1 - r)

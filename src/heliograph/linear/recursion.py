@@ -38,8 +38,8 @@ def covariance_step(spread: Float[np.ndarray, "N N"], s: Steps) -> Corrected:
     total = cross @ s.output.T + s.noise
     gain = solve_innovation(total, cross).T
     rounded = with_rounding(predicted, len(cross))
-    own = np.diag(s.noise)
-    if np.all(own >= 0) and np.any(own < PRECISE * np.diag(total)):  # P - G C P lost digits
+    local = np.diag(s.noise)
+    if np.all(local >= 0) and np.any(local < PRECISE * np.diag(total)):  # P - G C P lost digits
         keep, units = np.eye(len(gain)) - gain @ s.output, np.diag(rounded - predicted) ** 2
         known = np.diag(units / np.where(units > 0, np.diag(predicted), 1.0))
         after = keep @ predicted @ keep.T + gain @ s.noise @ gain.T + known
@@ -70,7 +70,7 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
     Source: Kalman (1960), with the second moments of random coefficients in the noises.
     """
     instance("system", system, LinearSystem, "a LinearSystem")
-    spread, want, parts = system.covariance, system.want, []
+    spread, projection, parts = system.covariance, system.projection, []
     rounding, worst, when = np.diag(system.start_rounding), 0.0, 0
     steady, transition = system.steady_from, np.eye(len(spread))
     last: tuple[np.ndarray, np.ndarray] | None = None
@@ -84,13 +84,16 @@ def lmmse(system: LinearSystem, claim: Claim = "exact") -> Schedule:
         keep = np.eye(len(spread)) - gain @ s.output
         transition, offset = keep @ s.transition, keep @ s.drift - gain @ s.offset
         expected = s.output @ s.transition, s.output @ s.drift + s.offset
-        estimate, claimed = (want @ transition, want @ gain, want @ offset), want @ spread @ want.T
-        before = want @ predicted @ want.T, s.output @ predicted @ s.output.T + s.noise
+        estimate, claimed = (
+            (projection @ transition, projection @ gain, projection @ offset),
+            projection @ spread @ projection.T,
+        )
+        before = projection @ predicted @ projection.T, s.output @ predicted @ s.output.T + s.noise
         parts.append((transition, gain, offset, *estimate, *expected, claimed, *before))
         # what an error diag(rounding) in Cov(w) adds to the error's covariance: a gain that minimises has no part in it
         rounding = transition @ rounding @ transition.T + (keep * system.rounding[k]) @ keep.T
-        rounding += (gain * system.heard_rounding[k]) @ gain.T
-        error = np.diag(want @ rounding @ want.T)
+        rounding += (gain * system.received_rounding[k]) @ gain.T
+        error = np.diag(projection @ rounding @ projection.T)
         share = np.divide(error, np.maximum(np.diag(claimed), error), out=np.zeros_like(error), where=error > 0)
         worst, when = max((worst, when), (float(np.max(share, initial=0.0)), k))
     gains = Gains(*(over_horizon(part, system.horizon) for part in zip(*parts, strict=True)))
@@ -153,9 +156,9 @@ def true_covariance(system: LinearSystem, schedule: Schedule) -> Float[np.ndarra
         z = s.output @ mean + s.offset
         yy, ys = s.transition @ yy @ s.transition.T + s.process, s.transition @ ys
         zz, yz, sz = s.output @ yy @ s.output.T + s.noise, yy @ s.output.T, ys.T @ s.output.T
-        bias = system.want @ mean - now.output @ state - now.direct @ z - now.output_offset
+        bias = system.projection @ mean - now.output @ state - now.direct @ z - now.output_offset
         joint = np.block([[yy, ys, yz], [ys.T, ss, sz], [yz.T, sz.T, zz]])
-        row = np.concatenate([system.want, -now.output, -now.direct], axis=1)
+        row = np.concatenate([system.projection, -now.output, -now.direct], axis=1)
         result.append(row @ joint @ row.T + np.outer(bias, bias))
         state = now.transition @ state + now.gain @ z + now.offset
         cross = now.transition @ sz @ now.gain.T

@@ -44,9 +44,9 @@ class LinearSystem(Module):
     steps: Steps
     mean: Float[np.ndarray, "N"]
     covariance: Float[np.ndarray, "N N"]
-    want: Float[np.ndarray, "q N"]
+    projection: Float[np.ndarray, "q N"]
     rounding: Float[np.ndarray, "time N"]
-    heard_rounding: Float[np.ndarray, "time m"]
+    received_rounding: Float[np.ndarray, "time m"]
     start_rounding: Float[np.ndarray, "N"]
 
     def __init__(
@@ -54,9 +54,9 @@ class LinearSystem(Module):
         steps: Steps,
         mean: ArrayLike,
         covariance_: ArrayLike,
-        want: ArrayLike,
+        projection: ArrayLike,
         rounding: ArrayLike | None = None,
-        heard_rounding: ArrayLike | None = None,
+        received_rounding: ArrayLike | None = None,
         start_rounding: ArrayLike | None = None,
     ):
         instance("steps of a system", steps, Steps, "Steps")
@@ -68,9 +68,9 @@ class LinearSystem(Module):
         self.steps = Steps(*checked)
         self.mean = array("mean of the start", mean, (n,))
         self.covariance = covariance("covariance of the start", covariance_, n)
-        self.want = array("what is to be known", want, (None, n))
+        self.projection = array("what is to be known", projection, (None, n))
         self.rounding = _rounding(rounding, (time, n))
-        self.heard_rounding = _rounding(heard_rounding, (time, m))
+        self.received_rounding = _rounding(received_rounding, (time, m))
         self.start_rounding = _rounding(start_rounding, (n,))
 
     @property
@@ -86,7 +86,7 @@ class LinearSystem(Module):
     def steady_from(self) -> int:
         """The first step from which on all steps are as the last."""
         changes = [0]
-        for field in (*self.steps, self.rounding, self.heard_rounding):
+        for field in (*self.steps, self.rounding, self.received_rounding):
             moved = field[1:] != field[:-1]
             changed = np.flatnonzero(np.any(moved, axis=tuple(range(1, moved.ndim))))
             changes += (changed[-1:] + 1).tolist()
@@ -95,13 +95,13 @@ class LinearSystem(Module):
 
 def over_horizon(parts: Sequence[np.ndarray], horizon: int) -> np.ndarray:
     """Parts of the first steps, of which all that follow are as the last, for every step of the horizon."""
-    found = np.array(parts)
-    return np.concatenate([found, np.repeat(found[-1:], horizon - len(found), axis=0)])
+    values = np.array(parts)
+    return np.concatenate([values, np.repeat(values[-1:], horizon - len(values), axis=0)])
 
 
 def _rounding(given: ArrayLike | None, shape: tuple[int, ...]) -> np.ndarray:
-    found: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
-    return found
+    result: np.ndarray = np.zeros(shape) if given is None else array("rounding", given, shape)
+    return result
 
 
 class StateMoments(NamedTuple):

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.linear.told_losses import spectral_radius
+from heliograph.linear.known_losses import spectral_radius
 from heliograph.numerics.types import Float
 
 UNSEEN = 1e-9  # of its size: what of an eigenvector an output or a noise may show that is taken for nothing
@@ -27,14 +27,14 @@ class Unseen(NamedTuple):
 
 def eigenspaces(matrix: Float[np.ndarray, "n n"]) -> list[tuple[complex, np.ndarray]]:
     """Each distinct eigenvalue, conjugates once, with an orthonormal basis of its eigenvectors (n, d)."""
-    found: list[tuple[complex, np.ndarray]] = []
+    results: list[tuple[complex, np.ndarray]] = []
     size = max(float(np.linalg.norm(matrix, 2)), 1e-300)
     for value in np.linalg.eigvals(matrix):
-        if value.imag >= 0 and all(abs(value - other) > SAME * size for other, _ in found):
+        if value.imag >= 0 and all(abs(value - other) > SAME * size for other, _ in results):
             _, singular, right = np.linalg.svd(matrix - value * np.eye(len(matrix)))
             count = max(int(np.sum(singular <= SAME * size)), 1)
-            found.append((complex(value), right.conj().T[:, -count:]))
-    return found
+            results.append((complex(value), right.conj().T[:, -count:]))
+    return results
 
 
 def fastest_unseen(
@@ -44,13 +44,13 @@ def fastest_unseen(
 
     E P >= eps P(the links stay in the set for l steps) |a|^(2 l) v v' for an eigenvector v that the set does not show.
     """
-    found = [
+    results = [
         Unseen(abs(value) ** 2 * spectral_radius(chain[np.ix_(modes, modes)]), value, modes, vectors)
         for value, space in eigenspaces(matrix)
         for modes, vectors in _blind(space, outputs)
     ]
     nothing = Unseen(0.0, 0j, (), np.zeros((len(matrix), 0)))
-    return max(found, key=lambda each: each.growth, default=nothing)
+    return max(results, key=lambda items: items.growth, default=nothing)
 
 
 def _blind(space: np.ndarray, outputs: Sequence[np.ndarray]) -> list[tuple[tuple[int, ...], np.ndarray]]:

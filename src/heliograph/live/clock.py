@@ -23,14 +23,14 @@ def time_input(network: Network) -> int | None:
     """
     if TIME_STEP not in network.inputs:
         return None
-    wanted = f"no part that goes by steps where the plant's time does not (its input {TIME_STEP!r})"
+    expected = f"no part that goes by steps where the plant's time does not (its input {TIME_STEP!r})"
     if steps_covered(network) is not None:
-        raise fail("timeline", wanted, f"one that covers {steps_covered(network)} steps")
+        raise fail("timeline", expected, f"one that covers {steps_covered(network)} steps")
     if network.relays is not None:
-        raise fail("timeline", wanted, "relays that talk in slots")
+        raise fail("timeline", expected, "relays that talk in slots")
     for name, node in network.nodes.items():
         if isinstance(node, Node) and first(node.channel).remembers:
-            raise fail("timeline", wanted, f"a channel that remembers, at node {name!r}")
+            raise fail("timeline", expected, f"a channel that remembers, at node {name!r}")
     return network.inputs.index(TIME_STEP)
 
 
@@ -45,9 +45,9 @@ def uneven(plant: AbstractPlant, dt: int) -> str:
         for x in (mean, mean + spread):
             for s, t in CUTS:
                 whole, parts = _moved(plant, dt, x, (s + t,)), _moved(plant, dt, x, (s, t))
-                for what, one, two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
-                    gap = float(np.abs(one - two).max())
-                    if not gap <= TOLERANCE * max(1.0, float(np.abs(one).max())):
+                for what, item, two in zip(("transition", "Jacobian", "noise"), whole, parts, strict=True):
+                    gap = float(np.abs(item - two).max())
+                    if not gap <= TOLERANCE * max(1.0, float(np.abs(item).max())):
                         return f"{what} over {s:g} and then {t:g} differs by {gap:.3g} from that over {s + t:g}"
     return ""
 

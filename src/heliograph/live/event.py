@@ -61,15 +61,15 @@ def numbers(name: str, value: ArrayLike, size: int) -> Float[np.ndarray, " size"
     """A copy of `size` real numbers, NaN where one did not arrive; a single one need not be a list."""
     expected = "1 number" if size == 1 else f"{size} numbers"
     try:
-        found = np.array(value)
-        if found.dtype.kind not in "fiu":
+        values = np.array(value)
+        if values.dtype.kind not in "fiu":
             raise ValueError
     except ValueError:
         raise fail(name, expected, shown(value)) from None
-    found = found.astype(np.float64)
-    found = found[None] if found.ndim == 0 and size == 1 else found
-    if found.ndim != 1 or len(found) != size:
-        raise fail(name, expected, f"shape {found.shape}")
-    if np.isinf(found).any():
-        raise fail(name, "finite numbers, or NaN for what is missing", found.tolist())
-    return found
+    values = values.astype(np.float64)
+    values = values[None] if values.ndim == 0 and size == 1 else values
+    if values.ndim != 1 or len(values) != size:
+        raise fail(name, expected, f"shape {values.shape}")
+    if np.isinf(values).any():
+        raise fail(name, "finite numbers, or NaN for what is missing", values.tolist())
+    return values

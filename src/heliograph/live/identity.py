@@ -59,9 +59,9 @@ def short_name(part: PyTree) -> str:
     """A short name of all numbers in a part, or of a text."""
     if isinstance(part, str):
         return sha256(part.encode()).hexdigest()[:DIGITS]
-    found = sha256()
+    result = sha256()
     for leaf in jax.tree.leaves(part):
         if isinstance(leaf, jax.Array | np.ndarray | np.generic | int | float):
             array = np.asarray(leaf)
-            found.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
-    return found.hexdigest()[:DIGITS]
+            result.update(f"{array.shape}{array.dtype}".encode() + array.tobytes())
+    return result.hexdigest()[:DIGITS]

@@ -10,63 +10,63 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
-from heliograph.live.mould import Mould, cast
-from heliograph.live.tape import Ears, Tape, at_step, interval
+from heliograph.live.history import History, NetworkStep, at_step, interval
+from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim, Estimate
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.gathering import Fused
+from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.judging import reasons
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
 
-Retained: TypeAlias = "tuple[dict[int, AbstractRetained], dict[str, AbstractRetained]]"  # by kind, and by name
+SmootherStep: TypeAlias = "tuple[dict[int, AbstractRetained], dict[str, AbstractRetained]]"  # by kind, and by name
 
 
 class Sweep(Module):
     """The filters of a network that can be smoothed, by `kinds`, and the fusions of these."""
 
-    ears: Ears
+    network_step: NetworkStep
     fusions: tuple[Fused, ...]
     kinds: tuple[int, ...] = eqx.field(static=True)
     structure: jax.tree_util.PyTreeDef = eqx.field(static=True)  # of what is told after a row
 
     def step(
-        self, tape: Tape, row: jax.Array, state: PyTree, heard: jax.Array, u: jax.Array, k: jax.Array
-    ) -> tuple[PyTree, Retained]:
+        self, history: History, row: jax.Array, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, SmootherStep]:
         """One step of all into a row, with what a sweep back over it needs; without what was implausible there."""
-        own, central = reasons(self.structure.unflatten([leaf[row] for leaf in tape.told]))
-        skip = own, {name: central[name] for name in self.ears.filters.central}
-        after, found = self.ears.filters.step(state, self.ears.groups(heard), u, k, skip=skip)
-        return after, ({kind: found["retained"][kind] for kind in self.kinds}, found["retained_centrally"])
+        local, central = reasons(self.structure.unflatten([leaf[row] for leaf in history.outputs]))
+        skip = local, {name: central[name] for name in self.network_step.filters.central}
+        after, result = self.network_step.filters.step(state, self.network_step.groups(received), u, k, skip=skip)
+        return after, ({kind: result["retained"][kind] for kind in self.kinds}, result["retained_centrally"])
 
-    def start(self, tape: Tape, slot: jax.Array) -> PyTree:
+    def start(self, history: History, slot: jax.Array) -> PyTree:
         """The filters' states after a row of the tape."""
-        own, central, *_ = tape.known(slot)
-        return own, {name: central[name] for name in self.ears.filters.central}, (), (), {}
+        local, central, *_ = history.known(slot)
+        return local, {name: central[name] for name in self.network_step.filters.central}, (), (), {}
 
-    def told(self, steps: Retained, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
+    def outputs(self, steps: SmootherStep, later: PyTree) -> tuple[dict[int, Estimate], dict[str, Estimate]]:
         """Estimates after a step given what is later, by kind and by name; fused ones of these."""
-        own, central = _each(lambda step, later: step.told(step.smoothed(later)), steps, later)
-        parts = [own.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
+        local, central = _over_filters(lambda step, later: step.outputs(step.smoothed(later)), steps, later)
+        parts = [local.get(kind) for kind in range(max(self.kinds, default=-1) + 1)]
         for item in self.fusions:
             central |= item.step((), parts, jnp.asarray(0))[1]
-        return own, central
+        return local, central
 
 
-def _each(function: Callable[..., object], steps: Retained, *rest: PyTree) -> PyTree:
+def _over_filters(function: Callable[..., object], steps: SmootherStep, *rest: PyTree) -> PyTree:
     """A function of one filter's step for those of each kind, (filter, node, ...), and for the central ones."""
-    own = {
+    local = {
         kind: jax.vmap(jax.vmap(function))(step, *(part[0][kind] for part in rest)) for kind, step in steps[0].items()
     }
-    return own, {name: function(step, *(part[1][name] for part in rest)) for name, step in steps[1].items()}
+    return local, {name: function(step, *(part[1][name] for part in rest)) for name, step in steps[1].items()}
 
 
-def _back(step: AbstractRetained, later: PyTree, before: AbstractRetained) -> PyTree:
+def _back(step: AbstractSmootherStep, later: PyTree, before: AbstractSmootherStep) -> PyTree:
     return step.back(later, before.mean, before.covariance)
 
 
@@ -75,7 +75,7 @@ Into: TypeAlias = "Callable[[Sweep, Tape, jax.Array, Place], Retained]"
 
 
 @lru_cache
-def sweep_back(mould: Mould, dt: int | None) -> Callable[..., PyTree]:
+def sweep_back(static: Static, dt: int | None) -> Callable[..., PyTree]:
     """The program (numbers, tape, order, (begin, stop)) -> estimates after the row order[begin], given those after it.
 
     Rows are order[begin:stop], begin > 0. What a step leaves is computed anew from the state before it, and so is what
@@ -83,56 +83,56 @@ def sweep_back(mould: Mould, dt: int | None) -> Callable[..., PyTree]:
     """
     into, earlier = (_into_step, _earlier_step) if dt is None else (_into_row(dt), _earlier_row)
 
-    def run(numbers: list[jax.Array], tape: Tape, order: jax.Array, place: jax.Array) -> PyTree:
-        item: Sweep = mould.filled(numbers)
+    def run(numbers: list[jax.Array], history: History, order: jax.Array, place: jax.Array) -> PyTree:
+        item: Sweep = static.filled(numbers)
         begin, stop = place
-        last = stop - 1, tape.step[order[stop - 1]]
-        count = stop - 1 - begin if dt is not None else last[1] - tape.step[order[begin]]
+        last = stop - 1, history.step[order[stop - 1]]
+        count = stop - 1 - begin if dt is not None else last[1] - history.step[order[begin]]
         blank = jax.tree.map(
-            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, tape, order, last))
+            lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(lambda: into(item, history, order, last))
         )
 
-        def one(i: jax.Array, carry: tuple[Place, Retained, PyTree]) -> tuple[Place, Retained, PyTree]:
+        def single(i: jax.Array, carry: tuple[Place, SmootherStep, PyTree]) -> tuple[Place, SmootherStep, PyTree]:
             now, steps, later = carry
-            before = into(item, tape, order, now)
-            passed, ends = _each(_back, steps, later, before), _each(lambda step: step.end(), before)
+            before = into(item, history, order, now)
+            passed, ends = _over_filters(_back, steps, later, before), _over_filters(lambda step: step.end(), before)
             later = jax.tree.map(lambda a, b: jnp.where(i == 0, a, b), ends, passed)
-            return earlier(tape, order, now), before, later
+            return earlier(history, order, now), before, later
 
-        begun = last, blank, _each(lambda step: step.end(), blank)
-        _, steps, later = jax.lax.fori_loop(0, count + 1, one, begun)
-        return item.told(steps, later)
+        begun = last, blank, _over_filters(lambda step: step.end(), blank)
+        _, steps, later = jax.lax.fori_loop(0, count + 1, single, begun)
+        return item.outputs(steps, later)
 
     return jax.jit(run, compiler_options=understood())
 
 
 def _into_row(dt: int) -> Into:
-    def into(item: Sweep, tape: Tape, order: jax.Array, place: Place) -> Retained:
+    def into(item: Sweep, history: History, order: jax.Array, place: Place) -> SmootherStep:
         before, now = order[place[0] - 1], order[place[0]]
-        u = interval(tape, before, now, dt)
-        return item.step(tape, now, item.start(tape, before), tape.parts(now)[0], u, tape.step[now])[1]
+        u = interval(history, before, now, dt)
+        return item.step(history, now, item.start(history, before), history.parts(now)[0], u, history.step[now])[1]
 
     return into
 
 
-def _earlier_row(tape: Tape, order: jax.Array, place: Place) -> Place:
-    return place[0] - 1, tape.step[order[place[0] - 1]]
+def _earlier_row(history: History, order: jax.Array, place: Place) -> Place:
+    return place[0] - 1, history.step[order[place[0] - 1]]
 
 
-def _into_step(item: Sweep, tape: Tape, order: jax.Array, place: Place) -> Retained:
+def _into_step(item: Sweep, history: History, order: jax.Array, place: Place) -> SmootherStep:
     """By way of the steps from the row before, at which nothing was heard."""
     before, now, k = order[place[0] - 1], order[place[0]], place[1]
 
-    def one(j: jax.Array, state: PyTree) -> PyTree:
-        return item.step(tape, now, state, *at_step(tape, before, now, j), j)[0]
+    def single(j: jax.Array, state: PyTree) -> PyTree:
+        return item.step(history, now, state, *at_step(history, before, now, j), j)[0]
 
-    state = jax.lax.fori_loop(tape.step[before] + 1, k, one, item.start(tape, before))
-    return item.step(tape, now, state, *at_step(tape, before, now, k), k)[1]
+    state = jax.lax.fori_loop(history.step[before] + 1, k, single, item.start(history, before))
+    return item.step(history, now, state, *at_step(history, before, now, k), k)[1]
 
 
-def _earlier_step(tape: Tape, order: jax.Array, place: Place) -> Place:
+def _earlier_step(history: History, order: jax.Array, place: Place) -> Place:
     row, k = place
-    return jnp.where(k - 1 == tape.step[order[row - 1]], row - 1, row), k - 1
+    return jnp.where(k - 1 == history.step[order[row - 1]], row - 1, row), k - 1
 
 
 class Sweeper:
@@ -140,9 +140,9 @@ class Sweeper:
 
     def __init__(self, network: Network, dt: int | None, structure: jax.tree_util.PyTreeDef):
         self.network = network
-        kinds = tuple(k for k, kind in enumerate(network.kinds) if _retains(_of(network, k, kind.filters[0])))
+        kinds = tuple(k for k, kind in enumerate(network.kinds) if _can_smooth(_of(network, k, kind.filters[0])))
         items = {name: item for name, item in network.fused.items() if isinstance(item, AbstractFilter)}
-        central = {name: item for name, item in items.items() if _retains(item)}
+        central = {name: item for name, item in items.items() if _can_smooth(item)}
         if not kinds and not central:
             raise fail(
                 "smoothing", "a filter that keeps its covariance and says how its state moves", "none in the network"
@@ -150,46 +150,46 @@ class Sweeper:
         alone = Network(network.plant, network.nodes, central, network.relays, network.common)
         fusions = tuple(item for item in AllFilters(network).fusions if self._fuses(item, kinds))
         with jax.enable_x64(True):
-            self.item = Sweep(Ears(network, AllFilters(alone, kinds)), fusions, kinds, structure)
-            self._numbers, mould = cast(self.item)
-        self._run = sweep_back(mould, dt)
+            self.item = Sweep(NetworkStep(network, AllFilters(alone, kinds)), fusions, kinds, structure)
+            self._numbers, static = cast(self.item)
+        self._run = sweep_back(static, dt)
 
     def _fuses(self, item: Fused, kinds: tuple[int, ...]) -> bool:
         return item.quantizers is None and all(kind in kinds for source in item.sources for kind, _ in source)
 
-    def estimates(self, tape: Tape, order: np.ndarray, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
+    def estimates(self, history: History, order: np.ndarray, begin: int, stop: int) -> dict[str, dict[str, Estimate]]:
         """Estimates after a row given the rows after it, by node and filter."""
         with jax.enable_x64(True):
-            own, fused = self._run(self._numbers, tape, order, np.array([begin, stop], dtype=np.int32))
-        found: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
-        for k, told in own.items():
+            local, fused = self._run(self._numbers, history, order, np.array([begin, stop], dtype=np.int32))
+        results: dict[str, dict[str, Estimate]] = {name: {} for name in self.network.names}
+        for k, outputs in local.items():
             for f, name in enumerate(self.network.kinds[k].filters):
                 for i, node in enumerate(self.network.groups[self.network.kinds[k].group]):
-                    found[node][name] = _one(told, told.claim, (f, i))
-        claims = {node: {name: told.claim for name, told in filters.items()} for node, filters in found.items()}
-        for name, told in fused.items():
-            item, claim = self.network.fused[name], told.claim
+                    results[node][name] = _estimate_of(outputs, outputs.claim, (f, i))
+        claims = {node: {name: outputs.claim for name, outputs in filters.items()} for node, filters in results.items()}
+        for name, outputs in fused.items():
+            item, claim = self.network.fused[name], outputs.claim
             if isinstance(item, Fusion):
                 claim = item.claim([claims[node][item.filter] for node in self.network.nodes_with(item.filter)])
-            found.setdefault(FUSED, {})[name] = _one(told, claim, ())
-        return {node: filters for node, filters in found.items() if filters}
+            results.setdefault(FUSED, {})[name] = _estimate_of(outputs, claim, ())
+        return {node: filters for node, filters in results.items() if filters}
 
 
-def _one(told: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
-    return Estimate(np.asarray(told.mean)[where], np.asarray(told.covariance)[where], claim)
+def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
+    return Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim)
 
 
 def _of(network: Network, kind: int, name: str) -> AbstractFilter:
     return network.nodes[network.groups[network.kinds[kind].group][0]].filters[name]
 
 
-def _retains(item: AbstractFilter) -> bool:
+def _can_smooth(item: AbstractFilter) -> bool:
     """Whether a filter can be smoothed."""
     u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
     try:
         with jax.enable_x64(True):
             state = jax.tree.map(jnp.asarray, item.init())
-            eqx.filter_eval_shape(lambda one, state: one.step_retained(state, z, u, 0), item, state)
+            eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), item, state)
     except InputError:
         return False
     return True

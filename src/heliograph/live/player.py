@@ -10,10 +10,10 @@ import numpy as np
 from heliograph.filters.plausibility import why_inputs, why_values
 from heliograph.live.clock import time_input, uneven
 from heliograph.live.event import INPUTS
+from heliograph.live.history import History, NetworkStep, replay
 from heliograph.live.identity import Identity, network_identity
 from heliograph.live.later import Sweeper
-from heliograph.live.mould import cast
-from heliograph.live.tape import Ears, Tape, replay
+from heliograph.live.static import cast
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import PyTree
@@ -39,21 +39,23 @@ class Player:
             filters = AllFilters(network, judges=True)
             for name, link in filters.reporting.items():
                 if link.uplinks.groups:
-                    wanted = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
-                    raise fail(f"timeline: fusion {name!r}", wanted, "links that chance has a part in")
-            ears = Ears(network, filters)
-            self.numbers, mould = cast(ears)
-            self.start = begun(ears.filters)
+                    expected = "reports that arrive as they are sent, or the fusion as a filter (centre_filter)"
+                    raise fail(f"timeline: fusion {name!r}", expected, "links that chance has a part in")
+            network_step = NetworkStep(network, filters)
+            self.numbers, static = cast(network_step)
+            self.start = begun(network_step.filters)
             data = self.numbers, self.start, np.zeros(self.received), np.zeros(inputs), np.asarray(0)
-            told = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).step(*row)[1], *data)
-        self._like, self.structure = jax.tree.leaves(told), jax.tree.structure(told)
-        self.replay, self._judges = replay(mould, self.dt), Judges(network)
+            outputs = jax.eval_shape(lambda numbers, *row: static.filled(numbers).step(*row)[1], *data)
+        self._like, self.structure = jax.tree.leaves(outputs), jax.tree.structure(outputs)
+        self.replay, self._judges = replay(static, self.dt), Judges(network)
 
-    def why(self, told: list[np.ndarray], node: str) -> str | None:
+    def why(self, outputs: list[np.ndarray], node: str) -> str | None:
         """Why what a node said at a row is implausible, from what was told after it; None if it is not."""
-        found = jax.tree.unflatten(self.structure, told)
+        result = jax.tree.unflatten(self.structure, outputs)
         return (
-            why_inputs(self._judges.of_all(found)) if node == INPUTS else why_values(self._judges.of_node(found, node))
+            why_inputs(self._judges.of_all(result))
+            if node == INPUTS
+            else why_values(self._judges.of_node(result, node))
         )
 
     @cached_property
@@ -71,20 +73,22 @@ class Player:
         two = np.zeros(2, dtype=np.int32)
         program: Any = self.replay  # the compiler's functions have no type that says so
         with jax.enable_x64(True):
-            tape = self.blank(2, 0.0)
-            lowered = program.lower(self.numbers, tape, np.asarray(tape.rows[0]), two, np.zeros(3, dtype=np.int32))
+            history = self.blank(2, 0.0)
+            lowered = program.lower(
+                self.numbers, history, np.asarray(history.rows[0]), two, np.zeros(3, dtype=np.int32)
+            )
         return network_identity(self.network, lowered.as_text(), {})
 
-    def blank(self, slots: int, time: float) -> Tape:
+    def blank(self, slots: int, time: float) -> History:
         """A tape of nothing, with the filters before the first step in slot 0, at `time`."""
         rows = np.full((1, self.received + self.given + 1), np.nan)
         rows[0, -1] = time
         state = jax.tree.map(lambda leaf: np.asarray(leaf)[None], self.start)
-        told = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._like]
-        begun = rows, state, np.zeros((1, self.given)), np.full(1, -1), told
+        outputs = [np.zeros((1, *leaf.shape), leaf.dtype) for leaf in self._like]
+        begun = rows, state, np.zeros((1, self.given)), np.full(1, -1), outputs
         return self.filled(slots, begun)
 
-    def filled(self, slots: int, some: tuple[PyTree, ...]) -> Tape:
+    def filled(self, slots: int, some: tuple[PyTree, ...]) -> History:
         """A tape with these rows in its first slots; in the others the first again, which nobody reads."""
 
         def repeated(part: np.ndarray) -> jax.Array:
@@ -96,7 +100,7 @@ class Player:
             return copied
 
         with jax.enable_x64(True):
-            return Tape(*jax.tree.map(repeated, tuple(some)))
+            return History(*jax.tree.map(repeated, tuple(some)))
 
 
 _SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id of a network, which its entry keeps
@@ -104,7 +108,7 @@ _SHARED: WeakValueDictionary[int, Player] = WeakValueDictionary()  # by the id o
 
 def player(network: Network) -> Player:
     """The one of this network."""
-    found = _SHARED.get(id(network))
-    if found is None:
-        found = _SHARED[id(network)] = Player(network)
-    return found
+    result = _SHARED.get(id(network))
+    if result is None:
+        result = _SHARED[id(network)] = Player(network)
+    return result

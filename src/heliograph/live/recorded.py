@@ -11,7 +11,7 @@ from heliograph.live.timeline import Timeline
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 
 @dataclass(frozen=True)
@@ -75,10 +75,10 @@ def _joined(parts: Sequence[Record]) -> Record:
 
 
 def _record(network: Network, parts: Sequence[tuple[float, Mapping[str, Mapping[str, Estimate]]]]) -> Record:
-    found = [part for _, part in parts]
+    results = [part for _, part in parts]
     estimates = {
-        node: {name: _stacked([part[node][name] for part in found], np.stack) for name in filters}
-        for node, filters in (found[0] if found else {}).items()
+        node: {name: _stacked([part[node][name] for part in results], np.stack) for name in filters}
+        for node, filters in (results[0] if results else {}).items()
     }
     return Record(np.array([time for time, _ in parts]), network.states, None, {}, estimates)
 

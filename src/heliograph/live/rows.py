@@ -21,7 +21,7 @@ class HeldRow:
         self.numbers[-1] = key[0]
         self.events: dict[tuple[int, int, float], Float[np.ndarray, " size"]] = {}
 
-    def hears(self) -> bool:
+    def observe(self) -> bool:
         """Whether some event of it is a node's; the others are inputs."""
         return any(place >= 0 for place, _, _ in self.events)
 
@@ -58,7 +58,7 @@ class Rows:
             return "future"
         if self.key(event) > self.keys[-1]:  # as most are: nothing can be said against what is newest
             return "used"
-        base = self.settle(watermark)[0]
+        base = self.finalise(watermark)[0]
         place, row = self.find(event)
         held = None if row is None else row.events.get(event.name)
         if place < base or (place == base and held is None):
@@ -101,7 +101,7 @@ class Rows:
             there[:] = event.values
         row.events[event.name] = event.values
 
-    def settle(self, watermark: float) -> tuple[int, int]:
+    def finalise(self, watermark: float) -> tuple[int, int]:
         """Where the base has to move to, and how many rows of these become final for want of room."""
         by_time = self.base(watermark)
         base = max(by_time, len(self.held) - 1 - self.capacity)

@@ -13,7 +13,7 @@ from heliograph.codegen.engine import attempted, setting
 from heliograph.codegen.graph import Unsupported
 from heliograph.codegen.program import lower
 from heliograph.filters.base import AbstractFilter
-from heliograph.live.mould import Mould
+from heliograph.live.static import Static
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.types import Float, PyTree
 
@@ -97,10 +97,10 @@ class XlaStepper:
 
 
 def _judged(
-    mould: Mould, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
+    static: Static, numbers: Sequence[jax.Array], state: PyTree, z: jax.Array, u: jax.Array, k: jax.Array
 ) -> tuple[jax.Array, jax.Array, list[jax.Array], list[jax.Array]]:
     """A step of every filter that differs in numbers alone: judgement, whether it is to be refused, state, estimate."""
-    item: AbstractFilter = mould.filled(numbers)
+    item: AbstractFilter = static.filled(numbers)
     after, estimate, judgement = item.step_judged(state, z, u, k)
     spoilt = jnp.any(jnp.isinf(z)) | ~jnp.all(jnp.isfinite(u))
     flagged = spoilt | (judgement.reason > 0) | (judgement.input > 0)
@@ -108,16 +108,16 @@ def _judged(
 
 
 @lru_cache
-def by_xla(mould: Mould) -> Any:
+def by_xla(static: Static) -> Any:
     """(numbers, state, z, u, k) to (judgement, whether it is to be refused, leaves of the state, of the estimate)."""
 
     def step(*data: PyTree) -> PyTree:
-        return _judged(mould, *data)
+        return _judged(static, *data)
 
     return jax.jit(step, compiler_options=understood())
 
 
-def natively(mould: Mould, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Alone | None:
+def natively(static: Static, numbers: Sequence[jax.Array], state: PyTree, data: Sequence[np.ndarray]) -> Alone | None:
     """Code whose arguments are the leaves of numbers, state and data, z, u and k; None where XLA steps.
 
     Raises:
@@ -125,19 +125,19 @@ def natively(mould: Mould, numbers: Sequence[jax.Array], state: PyTree, data: Se
     """
     leaves, tree = jax.tree.flatten(state)
     shapes = tuple((np.shape(leaf), str(leaf.dtype)) for leaf in (*numbers, *leaves, *data))
-    return _made(mould, shapes, (len(numbers), len(leaves)), tree, setting())
+    return _made(static, shapes, (len(numbers), len(leaves)), tree, setting())
 
 
 @lru_cache
 def _made(
-    mould: Mould, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
+    static: Static, shapes: tuple[tuple[tuple[int, ...], str], ...], counts: tuple[int, int], tree: Any, engine: str
 ) -> Alone | None:
     """The code, made once for each engine that is forced."""
     numbers, state = counts
 
     def step(*leaves: jax.Array) -> PyTree:
         before, (z, u, k) = leaves[numbers : numbers + state], leaves[numbers + state :]
-        judged, flagged, after, estimate = _judged(mould, leaves[:numbers], tree.unflatten(before), z, u, k)
+        judged, flagged, after, estimate = _judged(static, leaves[:numbers], tree.unflatten(before), z, u, k)
         if any(a.shape != b.shape or a.dtype != b.dtype for a, b in zip(after, before, strict=True)):
             raise Unsupported("a state whose shape or type changes")
         placed = [jnp.where(flagged, b, a) for a, b in zip(after, before, strict=True)]

@@ -11,8 +11,8 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, given, measured
 from heliograph.filters.plausibility import INPUT, in_words, why_inputs
 from heliograph.live.identity import Identity, check_same, short_name, versions
-from heliograph.live.mould import cast
 from heliograph.live.snapshot import packed, unpacked
+from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
 from heliograph.model.estimate import Estimate
 from heliograph.model.limits import LimitsLike, limits_of
@@ -145,16 +145,16 @@ class _Placed:
         self.filter, self.horizon = filter_, filter_.horizon
         self.received, self.given = filter_.received, len(filter_.inputs)
         with jax.enable_x64(True):
-            self.numbers, self._mould = cast(filter_)
+            self.numbers, self._static = cast(filter_)
             self._start: PyTree = jax.tree.map(jnp.asarray, filter_.init())
         self._data = np.zeros(self.received), np.zeros(self.given), np.asarray(0)
         self.estimate: PyTree = jax.tree.structure(Estimate(np.zeros(()), np.zeros(()), filter_.claim))
 
     def stepper(self) -> NativeStepper | XlaStepper:
         """A state before the first step, and what steps it."""
-        code = natively(self._mould, self.numbers, self._start, self._data)
+        code = natively(self._static, self.numbers, self._start, self._data)
         if code is None:
-            return XlaStepper(by_xla(self._mould), self.numbers, self._start)
+            return XlaStepper(by_xla(self._static), self.numbers, self._start)
         leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(self._start)]
         return NativeStepper(code, [np.asarray(leaf) for leaf in self.numbers], leaves)
 
@@ -162,7 +162,7 @@ class _Placed:
     def identity(self) -> Identity:
         """Versions, names, numbers, and what a step computes, which counts for functions, whichever engine steps."""
         with jax.enable_x64(True):
-            text = by_xla(self._mould).lower(self.numbers, self._start, *self._data).as_text()
+            text = by_xla(self._static).lower(self.numbers, self._start, *self._data).as_text()
         item = self.filter
         return {
             **versions(),
@@ -180,7 +180,7 @@ _SHARED: WeakValueDictionary[int, _Placed] = WeakValueDictionary()  # by the id 
 
 
 def _place(filter_: AbstractFilter) -> _Placed:
-    found = _SHARED.get(id(filter_))
-    if found is None:
-        found = _SHARED[id(filter_)] = _Placed(filter_)
-    return found
+    result = _SHARED.get(id(filter_))
+    if result is None:
+        result = _SHARED[id(filter_)] = _Placed(filter_)
+    return result

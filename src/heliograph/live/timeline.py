@@ -10,20 +10,20 @@ import numpy as np
 
 from heliograph.live.event import INPUTS, VERDICTS, Known, Verdict, moment, numbers, whole
 from heliograph.live.finals import Finals
+from heliograph.live.history import READ, History, copied, read
 from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
-from heliograph.live.tape import READ, Tape, copied, read
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import ArrayLike
-from heliograph.simulation.by_name import by_name
 from heliograph.simulation.network import Network
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.by_name import by_name
+from heliograph.simulation.results.record import Record
 
 
 @readable
@@ -75,7 +75,7 @@ class Timeline:
         self.forced = 0
         slots = self.capacity + READ + 3  # the base, a row too many until the base moves, and one to look ahead in
         begun = self.now if self._dt is not None else -1.0
-        self._tape, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
+        self._history, self._finals = self._player.blank(slots, begun), Finals(2 * self.capacity)
         ends = np.cumsum([size for _, size in self._sizes.values()])
         places = [slice(end - size, end) for end, (_, size) in zip(ends, self._sizes.values(), strict=True)]
         self._size = int(ends[-1])
@@ -87,14 +87,14 @@ class Timeline:
 
     def __getstate__(self) -> dict[str, object]:
         """All that is held, in double precision wherever it is read: what is compiled is no part of it."""
-        kept = {name: value for name, value in vars(self).items() if name != "_player"}
-        return kept | {"_tape": to_numpy(self._tape)}
+        stored = {name: value for name, value in vars(self).items() if name != "_player"}
+        return stored | {"_tape": to_numpy(self._history)}
 
-    def __setstate__(self, kept: dict[str, object]) -> None:
-        vars(self).update(kept)
+    def __setstate__(self, stored: dict[str, object]) -> None:
+        vars(self).update(stored)
         self._player = player(self.network)
         with jax.enable_x64(True):
-            self._tape = jax.tree.map(jnp.asarray, self._tape)
+            self._history = jax.tree.map(jnp.asarray, self._history)
 
     def push(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None = None) -> Verdict:
         """Take what a node measured at `time`, which arrived at `arrival` (None: at once), and judge it.
@@ -113,7 +113,7 @@ class Timeline:
             verdict = "implausible"
         if verdict == "used":
             self.now = now
-            self._settle()
+            self._solve_steady()
         if verdict in ("used", "implausible") and dropped:
             self.dropped[node] += dropped
         self.counts[node][verdict] += 1
@@ -134,7 +134,7 @@ class Timeline:
             ValueError: no finite number.
         """
         self.now = max(self.now, moment("now", now))
-        self._settle()
+        self._solve_steady()
 
     def estimates(self) -> dict[str, dict[str, Estimate]]:
         """Estimates at `now` from all that is held, by node and filter; those of several nodes stand under "fused".
@@ -154,10 +154,10 @@ class Timeline:
 
     def _look(self, time: float, place: int) -> list[np.ndarray]:
         """What the filters tell at a time after the row before `place`; it stands in a slot that no row has."""
-        kept, self._order[place] = self._order[place], len(self._order) - 1
-        told = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
-        self._order[place] = kept
-        return told
+        stored, self._order[place] = self._order[place], len(self._order) - 1
+        outputs = self._replayed(HeldRow((float(time), 0, 0), len(self._order) - 1, self._size), place, place + 1)
+        self._order[place] = stored
+        return outputs
 
     def lagged(self, lag: float) -> dict[str, dict[str, Estimate]]:
         """Estimates at `now` - `lag` given all that is held, by node and filter: smoothed over the rows since then.
@@ -180,7 +180,7 @@ class Timeline:
             order, stop = np.insert(order, place, len(order) - 1)[:-1], stop + 1
         else:
             place -= 1
-        return self._player.sweeper.estimates(self._tape, order, place, stop)
+        return self._player.sweeper.estimates(self._history, order, place, stop)
 
     def final(self) -> Record:
         """Estimates that became final since they were last asked for: one for each row that nodes were heard in.
@@ -188,17 +188,17 @@ class Timeline:
         They are the filters' own after the row, in the order of time. If nobody asks, the last 2 `capacity` are kept.
         """
         self._collect()
-        time, told = self._finals.take(self._tape.told)
-        return Record(time, self.network.states, None, {}, self._named(told))
+        time, outputs = self._finals.take(self._history.outputs)
+        return Record(time, self.network.states, None, {}, self._named(outputs))
 
     def save(self) -> bytes:
         """All that is held, for `restore`: after it, the same pushes give the same bits."""
         self._collect()
-        time, told = self._finals.take(self._tape.told)
-        self._finals.add(time, told)
+        time, outputs = self._finals.take(self._history.outputs)
+        self._finals.add(time, outputs)
         slots = [row.slot for row in self._rows.held]
-        held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._tape))}
-        final = {f"final.{i}": leaf for i, leaf in enumerate(told)}
+        held = {f"tape.{i}": leaf[slots] for i, leaf in enumerate(copied(self._history))}
+        final = {f"final.{i}": leaf for i, leaf in enumerate(outputs)}
         head = {"now": self.now, "forced": self.forced, "counts": self.counts, "of": self._player.identity}
         head |= {"dropped": self.dropped}
         head |= {"options": [self.window, self.ahead, self.capacity]}
@@ -217,22 +217,22 @@ class Timeline:
         with warnings.catch_warnings():  # it was told when the timeline was made
             warnings.simplefilter("ignore")
             new = cls(network, window, ahead=ahead, capacity=capacity)
-        leaves, structure = jax.tree.flatten(new._tape)
+        leaves, structure = jax.tree.flatten(new._history)
         saved = [arrays[f"tape.{i}"] for i in range(len(leaves))]
         new._resume(head, arrays, jax.tree.unflatten(structure, saved))
         return new
 
-    def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: Tape) -> None:
+    def _resume(self, head: Mapping[str, Any], arrays: Mapping[str, np.ndarray], saved: History) -> None:
         """Hold what was saved."""
         self.now, self.forced, self.counts = head["now"], head["forced"], head["counts"]
         self.dropped = head["dropped"]
         slots, count = len(self._order), len(arrays["row.time"])
-        self._tape = self._player.filled(slots, saved)
+        self._history = self._player.filled(slots, saved)
         self._rows.hold(rows_from(arrays, np.asarray(saved.rows), dict(self._sizes.values())))
         self._order[:count], self._free = np.arange(count), list(range(slots - 2, count - 1, -1))
-        self._finals.add(arrays["final.time"], [arrays[f"final.{i}"] for i in range(len(saved.told))])
+        self._finals.add(arrays["final.time"], [arrays[f"final.{i}"] for i in range(len(saved.outputs))])
         begun = self._rows.keys[-1][1] != BEFORE
-        self._latest = [np.asarray(leaf)[-1] for leaf in saved.told] if begun else None
+        self._latest = [np.asarray(leaf)[-1] for leaf in saved.outputs] if begun else None
 
     def _known(self, node: str, sequence: int, time: float, values: ArrayLike, arrival: float | None) -> Known:
         """An event as numbers."""
@@ -276,36 +276,38 @@ class Timeline:
     def _refuses(self, event: Known, row: HeldRow, place: int, latest: list[np.ndarray]) -> bool:
         """Whether an event that was just replayed is implausible; an input also over one unit of time from its own."""
         if place < len(self._rows.held) - 1:
-            latest = self._told_at(row.slot)
+            latest = self._published_at(row.slot)
         name = INPUTS if event.place < 0 else self.network.names[event.place]
         why = self._player.why(latest, name)
         if why is None and name == INPUTS and self._dt is not None:
             why = self._player.why(self._look(row.key[0] + 1.0, place + 1), name)
         return why is not None
 
-    def _told_at(self, slot: int) -> list[np.ndarray]:
+    def _published_at(self, slot: int) -> list[np.ndarray]:
         """What the filters told after the row in a slot."""
         slots = np.full(READ, slot, dtype=np.int32)
         with jax.enable_x64(True):
-            return [np.asarray(leaf)[0] for leaf in read(self._tape.told, slots)]
+            return [np.asarray(leaf)[0] for leaf in read(self._history.outputs, slots)]
 
     def _replayed(self, row: HeldRow, start: int, stop: int) -> list[np.ndarray]:
         """Write a row and step over those of the order from `start` to `stop`; what is told after the last."""
         place = np.array([row.slot, start, stop], dtype=np.int32)
         with jax.enable_x64(True):
-            self._tape, told = self._player.replay(self._player.numbers, self._tape, row.numbers, self._order, place)
-        return [np.asarray(leaf) for leaf in told]
+            self._history, outputs = self._player.replay(
+                self._player.numbers, self._history, row.numbers, self._order, place
+            )
+        return [np.asarray(leaf) for leaf in outputs]
 
-    def _settle(self) -> None:
+    def _solve_steady(self) -> None:
         """Move the base to where it belongs."""
-        base, forced = self._rows.settle(self.now - self.window)
+        base, forced = self._rows.finalise(self.now - self.window)
         if not base:
             return
         self.forced += forced
         final, left = self._rows.drop(base)
         count = len(self._rows.held)
         self._order[:count] = self._order[base : base + count].copy()
-        self._unread += [row for row in final if row.hears()]
+        self._unread += [row for row in final if row.observe()]
         self._left += [row.slot for row in left]
 
     def _collect(self) -> None:
@@ -315,16 +317,16 @@ class Timeline:
             slots = np.zeros(READ, dtype=np.int32)
             slots[: len(rows)] = [row.slot for row in rows]
             with jax.enable_x64(True):
-                told = [np.asarray(leaf)[: len(rows)] for leaf in read(self._tape.told, slots)]
-            self._finals.add(np.array([row.key[0] for row in rows]), told)
+                outputs = [np.asarray(leaf)[: len(rows)] for leaf in read(self._history.outputs, slots)]
+            self._finals.add(np.array([row.key[0] for row in rows]), outputs)
         self._free += self._left
         self._unread, self._left = [], []
 
-    def _named(self, told: list[np.ndarray]) -> dict[str, dict[str, Estimate]]:
+    def _named(self, outputs: list[np.ndarray]) -> dict[str, dict[str, Estimate]]:
         """What was told, by node and filter."""
-        found = jax.tree.unflatten(self._player.structure, told)
-        mean = by_name(self.network, found, lambda part: np.asarray(part.mean), -3)
-        covariance = by_name(self.network, found, lambda part: np.asarray(part.covariance), -4)
+        result = jax.tree.unflatten(self._player.structure, outputs)
+        mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
+        covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
         return {
             node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
             for node, claims in self._player.claims.items()

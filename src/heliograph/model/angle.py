@@ -18,7 +18,7 @@ def received_angles(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> Ang
     start, senses = first(plant), first(sensor)
     check_turns("sensor of a plant", senses.measure, start.initial_mean, start.angles, senses.angles)
     steps = unstack(channel) if isinstance(channel, OverTime) and senses.circular else [first(channel)]
-    found = {carried(one, senses.angles) for one in steps}
-    if len(found) > 1:
-        raise fail("channel", "the same angles at every step", sorted(found))
-    return found.pop()
+    results = {carried(step, senses.angles) for step in steps}
+    if len(results) > 1:
+        raise fail("channel", "the same angles at every step", sorted(results))
+    return results.pop()

@@ -102,7 +102,7 @@ def amplify_and_forward(hops: Sequence[AbstractRandomAffine]) -> AbstractRandomA
     return in_series(hops)
 
 
-def delayed(link: AbstractRandomAffine, delay: Delay, told: bool = False) -> Delayed:
+def delayed(link: AbstractRandomAffine, delay: Delay, timestamped: bool = False) -> Delayed:
     """A link that hears at step k what was sent d steps before, z_k = G_k y_{k-d} + n_k; before the first step, zeros.
 
     `delay` is a number of steps, a `Discrete` law from which one is drawn at each step, or a `MarkovChain` whose mode
@@ -111,7 +111,7 @@ def delayed(link: AbstractRandomAffine, delay: Delay, told: bool = False) -> Del
     Raises:
         ValueError: a delay that is no whole number of steps from 0, a link that is late already.
     """
-    return Delayed(link, delay, told)
+    return Delayed(link, delay, timestamped)
 
 
 def dropout(channel: AbstractRandomAffine, arrival: ArrayLike, radius: ArrayLike = 0.0) -> Mixture:

@@ -47,11 +47,11 @@ class Stamped(AbstractSensor):
 
     def measure(self, x: jax.Array) -> jax.Array:
         """h(x) - o dh/dt; h(x) where the clock is right."""
-        own = jnp.asarray(x)[: self.states]
+        local = jnp.asarray(x)[: self.states]
         if self.motion is None:
-            return self.base.measure(own)
-        rate = jnp.asarray(self.motion(own) if callable(self.motion) else jnp.asarray(self.motion) @ own)
-        y, change = jax.jvp(self.base.measure, (own,), (rate,))
+            return self.base.measure(local)
+        rate = jnp.asarray(self.motion(local) if callable(self.motion) else jnp.asarray(self.motion) @ local)
+        y, change = jax.jvp(self.base.measure, (local,), (rate,))
         return jnp.asarray(y - x[self.offset] * change)
 
 
@@ -121,8 +121,8 @@ def _plant(plant: AbstractPlant, clocks: Mapping[str, Clock], dt: float) -> Line
     states = (*plant.states, *(f"{name}_{part}" for name in clocks for part in ("offset", "drift")))
     if isinstance(plant, LinearPlant):
         xp, n = library(plant.matrix, plant.input_matrix), len(plant.states)
-        beside = np.zeros((n, len(move)))
-        matrix = xp.block([[plant.matrix, beside], [beside.T, move]])
+        others = np.zeros((n, len(move)))
+        matrix = xp.block([[plant.matrix, others], [others.T, move]])
         driven = xp.concatenate([plant.input_matrix, np.zeros((len(move), len(plant.inputs)))])
         return LinearPlant(matrix, noise, center, start, driven, states, plant.inputs)
     return Clocked(

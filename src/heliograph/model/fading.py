@@ -16,7 +16,7 @@ from heliograph.random_affine.chain import Autoregression, MarkovChain
 from heliograph.random_affine.combine import Stack
 from heliograph.random_affine.forgetful import forgetful, harmless, laws, mixed
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed, joint_modes
+from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
 from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, as_noise, components
 
 
@@ -110,8 +110,8 @@ def with_flag(
     if chain is None and (not held or (probabilities is not None and len(held) > 1)):
         raise fail("chain", "one that the flag tells of, since the channel does not hold just one", "none")
     if probabilities is None:
-        told = [Revealed(m, channel.inputs) for m in (held if chain is None else [chain])]
-        return Stack([channel, *(OneStepLate(flag) if late else flag for flag in told)])
+        outputs = [ModeOutput(m, channel.inputs) for m in (held if chain is None else [chain])]
+        return Stack([channel, *(OneStepLate(flag) if late else flag for flag in outputs)])
     memory = held[0] if chain is None else chain
     if not isinstance(memory, MarkovChain):
         raise fail("chain", "a MarkovChain, of whose modes classes tell", type(memory).__name__)
@@ -134,8 +134,8 @@ def without_memory(channel: Channel) -> Channel:
         return channel
     if not isinstance(channel, OverTime):
         return forgetful(channel)
-    steps = [joint_modes(one, order=2) for one in unstack(channel)]
-    return over_time([mixed(one, law) for one, law in zip(steps, laws(steps), strict=True)])
+    steps = [joint_modes(item, order=2) for item in unstack(channel)]
+    return over_time([mixed(step, law) for step, law in zip(steps, laws(steps), strict=True)])
 
 
 def memory_matters(channel: Channel) -> bool:
@@ -150,7 +150,7 @@ def memory_matters(channel: Channel) -> bool:
         return False
     if uncertain_chain(channel):
         return True
-    steps = [joint_modes(one) for one in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    steps = [joint_modes(item) for item in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
     return not harmless(steps, not isinstance(channel, OverTime))
 
 

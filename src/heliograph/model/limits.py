@@ -55,11 +55,11 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
     if limits is None:
         return np.tile(everything, (received, 1))
     expected = f"(low, high), or such a pair for each of {received} received numbers, None where there is no limit"
-    found = np.asarray(limits, dtype=object)
-    if found.shape not in ((2,), (received, 2)):
+    values = np.asarray(limits, dtype=object)
+    if values.shape not in ((2,), (received, 2)):
         raise fail("limits", expected, shown(limits))
-    rows = np.tile(found, (received, 1)) if found.ndim == 1 else found
-    pairs = [[end if one is None else one for one, end in zip(row, everything, strict=True)] for row in rows]
+    rows = np.tile(values, (received, 1)) if values.ndim == 1 else values
+    pairs = [[end if item is None else item for item, end in zip(row, everything, strict=True)] for row in rows]
     result = _numbers("limits", pairs, expected)
     if np.any(~(result[:, 0] < result[:, 1])):
         raise fail("limits", "a low end below the high one", shown(limits))
@@ -68,9 +68,9 @@ def _pairs(limits: LimitsLike, received: int) -> Float[np.ndarray, "m 2"]:
 
 def _numbers(name: str, value: object, expected: str = "numbers") -> Float[np.ndarray, "..."]:
     try:
-        found = np.asarray(value)
-        if found.size and found.dtype.kind not in "fiu":
+        values = np.asarray(value)
+        if values.size and values.dtype.kind not in "fiu":
             raise ValueError
     except ValueError:
         raise fail(name, expected, shown(value)) from None
-    return found.astype(np.float64)
+    return values.astype(np.float64)

@@ -57,8 +57,8 @@ def stack(items: Sequence[T]) -> T:
     flat = [jax.tree.flatten(item) for item in items]
     if len({_structure(*parts) for parts in flat}) != 1:
         raise fail("stack", "objects of one structure and one set of shapes", "objects that differ")
-    each = zip(*(leaves for leaves, _ in flat), strict=True)
-    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in each]
+    pieces = zip(*(leaves for leaves, _ in flat), strict=True)
+    stacked = [_stack_leaves(*same) if eqx.is_array(same[0]) else same[0] for same in pieces]
     result: T = jax.tree.unflatten(flat[0][1], stacked)
     return result
 

@@ -44,20 +44,20 @@ def _with_line(plant: Any, sensor: Any, past: int) -> LinearPlant:
     c = sensor.matrix
     xp = library(plant.matrix, plant.input_matrix, c)
     m, n = c.shape
-    kept = past * m
-    enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((kept, n + m))]])
-    shift = np.eye(kept, kept + m)
-    moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((kept, n))])
-    rest = np.concatenate([np.zeros((n + m, kept + m)), shift])
-    driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((kept, len(plant.inputs)))])
+    length = past * m
+    enters = xp.block([[np.eye(n), np.zeros((n, m))], [c, np.eye(m)], [np.zeros((length, n + m))]])
+    shift = np.eye(length, length + m)
+    moves = xp.concatenate([plant.matrix, c @ plant.matrix, np.zeros((length, n))])
+    rest = np.concatenate([np.zeros((n + m, length + m)), shift])
+    driven = xp.concatenate([plant.input_matrix, c @ plant.input_matrix, np.zeros((length, len(plant.inputs)))])
     law = Gaussian(plant.initial_covariance) if plant.deviation is None else plant.deviation
     names = sensor.outputs
     line = [f"{name}_{d}_ago" if d else f"{name}_sent" for d in range(past + 1) for name in names]
     return LinearPlant(
         xp.concatenate([moves, rest], axis=1),
         Shaped(enters, Independent([plant.noise, sensor.noise])),
-        xp.concatenate([plant.initial_mean - law.mean, np.zeros(kept + m)]),
-        Independent([law, Gaussian(np.zeros((kept + m, kept + m)))]),
+        xp.concatenate([plant.initial_mean - law.mean, np.zeros(length + m)]),
+        Independent([law, Gaussian(np.zeros((length + m, length + m)))]),
         driven,
         (*plant.states, *line),
         plant.inputs,

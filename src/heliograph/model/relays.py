@@ -14,7 +14,7 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, PyTree
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 SENSOR, RECEIVER = "sensor", "receiver"
 
@@ -48,8 +48,8 @@ class RelayNetwork(Module):
         self.plant, self.sensor = plant, sensor
         self.relays = names("relays", relays, len(items("relays", relays, "names")), "relay")
         listed = [table("slot", slot, "links of a listener") for slot in items("slots", slots, "dictionaries")]
-        each = [{name: table(f"links to {name!r}", links, "links") for name, links in slot.items()} for slot in listed]
-        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in each)
+        parts = [{name: table(f"links to {name!r}", links, "links") for name, links in slot.items()} for slot in listed]
+        self.slots = tuple({listener: links for listener, links in slot.items() if links} for slot in parts)
         _check_linear(first(plant), first(sensor))
         if len({*self.relays, SENSOR, RECEIVER}) != len(self.relays) + 2:
             raise fail("relays", f"distinct names other than {SENSOR!r} and {RECEIVER!r}", list(self.relays))
@@ -80,10 +80,10 @@ class RelayNetwork(Module):
         names: tuple[str, ...] = first(self.plant).states
         return names
 
-    def hears_always(self, name: str) -> bool:
+    def always_receives(self, name: str) -> bool:
         """Whether some hop leads to this listener in every slot, and none of them erases."""
-        heard = [slot.get(name, {}) for slot in self.slots]
-        return all(heard) and not any(first(hop).erases for hops in heard for hop in hops.values())
+        observed = [slot.get(name, {}) for slot in self.slots]
+        return all(observed) and not any(first(hop).erases for hops in observed for hop in hops.values())
 
     def initial(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n,) and covariance (n, n) of x_0."""
@@ -191,13 +191,13 @@ def _slot_moments(network: RelayNetwork, slot: Slot, k: int) -> tuple[np.ndarray
     for listener, links in slot.items():
         for sender, link in links.items():
             own_gain, own_offset, own_spread = link_moments(at(link, k))
-            heard = starts[listener] + np.arange(len(own_offset))
+            received = starts[listener] + np.arange(len(own_offset))
             sent = m * senders.index(sender) + np.arange(m)
-            gain[np.ix_(heard, sent)] = own_gain
-            offset[heard] += own_offset
+            gain[np.ix_(received, sent)] = own_gain
+            offset[received] += own_offset
             with_one = np.append(sent, columns)
-            spread[np.ix_(heard, heard, with_one, with_one)] += own_spread  # independent links: variances add
-            live[heard], talks[senders.index(sender)] = 1.0, 1.0
+            spread[np.ix_(received, received, with_one, with_one)] += own_spread  # independent links: variances add
+            live[received], talks[senders.index(sender)] = 1.0, 1.0
     return gain, offset, spread, live, talks
 
 
@@ -242,9 +242,9 @@ def _check_listener(network: RelayNetwork, number: int, listener: str, links: Li
 
 
 def _check_reached(network: RelayNetwork, name: str) -> None:
-    heard = {sender for slot in network.slots for sender in slot.get(name, {})}
-    if name == RECEIVER and not heard:
+    received = {sender for slot in network.slots for sender in slot.get(name, {})}
+    if name == RECEIVER and not received:
         raise fail("slots", "one in which somebody transmits to the receiver", "a schedule in which nobody does")
-    if not heard - {name}:
-        got = "itself only" if heard else "nobody"
+    if not received - {name}:
+        got = "itself only" if received else "nobody"
         raise fail(f"relay {name!r}", "to hear the sensor or another relay in some slot", got)

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from heliograph.model.over_time import OverTime, first
 from heliograph.model.plant import AnyPlant, LinearPlant
 from heliograph.numerics.angle import Angles, angles_named
+from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, function, instance, items, names, shown_error
-from heliograph.numerics.kept import kept
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.noise import AbstractNoise, as_noise, components
@@ -126,7 +126,7 @@ def _circular(outputs: tuple[str, ...], circular: Sequence[str]) -> tuple[str, .
 AnySensor = AbstractSensor | OverTime  # an OverTime holds one sensor per step
 
 
-@kept
+@cached
 def check_sensor(sensor: AbstractSensor, states: int) -> None:
     """Raise ValueError unless the sensor takes a state of this length and returns its outputs."""
     instance("sensor", sensor, AbstractSensor, "a sensor")
@@ -148,6 +148,6 @@ def check_linear(name: str, plant: AnyPlant, sensor: AnySensor) -> None:
 
 def refuse_angles(name: str, *parts: AnyPlant | AnySensor) -> None:
     """Raise ValueError where a state or an output is an angle, for what knows numbers on a line alone."""
-    circular = [one for part in parts for one in first(part).circular]
+    circular = [item for part in parts for item in first(part).circular]
     if circular:
         raise fail(name, "no angles (cubature, extended, mixture and multiple model filters take them)", circular)

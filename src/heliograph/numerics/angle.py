@@ -22,11 +22,11 @@ def angles_named(name: str, circular: Sequence[str], names: Sequence[str]) -> An
     Raises:
         ValueError: a name that there is not, or one given twice.
     """
-    given = [str(one) for one in items(name, circular, "names")]
-    unknown = [one for one in given if one not in names]
+    given = [str(item) for item in items(name, circular, "names")]
+    unknown = [item for item in given if item not in names]
     if unknown or len(set(given)) < len(given):
         raise fail(name, f"some of {list(names)}, each once", given)
-    return tuple(i for i, one in enumerate(names) if one in given)
+    return tuple(i for i, single in enumerate(names) if single in given)
 
 
 def nearest(value: A, reference: Array, angles: Angles) -> A:
@@ -49,7 +49,7 @@ def wrapped(value: A, angles: Angles) -> A:
 
 
 def continued(
-    function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, found: Angles
+    function: Callable[[jax.Array], jax.Array], center: jax.Array, given: Angles, result: Angles
 ) -> Callable[[jax.Array], jax.Array]:
     """The function with what it finds of angles continued from `center`, so that no jump is taken for a change.
 
@@ -57,11 +57,11 @@ def continued(
     their derivatives, rounded. So an angle that is a given one and a little more follows it any number of turns, and
     every other is taken within half a turn of that at the center.
     """
-    if not found:
+    if not result:
         return function
     start, size = function(center), center.shape[0]
     turns = jnp.zeros((*start.shape, size))
     for i in given:
         slope = jax.jvp(function, (center,), (jnp.zeros_like(center).at[i].set(1.0),))[1]
         turns = turns.at[:, i].set(jnp.round(slope))
-    return lambda x: nearest(function(x), start + turns @ (x - center), found)
+    return lambda x: nearest(function(x), start + turns @ (x - center), result)

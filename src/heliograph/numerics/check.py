@@ -54,7 +54,8 @@ def array(name: str, value: ArrayLike, shape: tuple[int | str | None, ...], miss
     tell(name, value, REAL)
     result = _numbers(name, value)
     matches = result.ndim == len(shape) and all(
-        not isinstance(want, int) or want == have for want, have in zip(shape, result.shape, strict=True)
+        not isinstance(projection, int) or projection == have
+        for projection, have in zip(shape, result.shape, strict=True)
     )
     if not matches:
         raise fail(name, _shape_words(shape, result.ndim), f"shape {result.shape}")
@@ -168,15 +169,15 @@ def per_step(name: str, value: ArrayLike, count: int) -> np.ndarray:
         single = np.ndim(value) == 0
     except ValueError:  # rows of different lengths
         single = False
-    found: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
-    return found
+    result: np.ndarray = np.broadcast_to(array(name, value, () if single else (count,)), (count,))
+    return result
 
 
 def check_count(name: str, value: object, least: int = 1) -> int:
     """Return a whole number of at least `least`: an int or one of NumPy's, no float and no bool."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        wanted = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
-        raise fail(name, wanted, value if isinstance(value, int | float) else shown(value))
+        expected = "a positive whole number" if least == 1 else f"a whole number of at least {least}"
+        raise fail(name, expected, value if isinstance(value, int | float) else shown(value))
     if value > MOST:
         raise fail(name, f"at most {MOST}", value)
     return int(value)
@@ -215,8 +216,8 @@ def check_times(name: str, value: ArrayLike, count: int) -> np.ndarray:
 
 def backwards(clock: np.ndarray) -> int | None:
     """The first row whose time is before that of the row above."""
-    found = np.flatnonzero(clock[1:] < clock[:-1])
-    return int(found[0]) + 1 if found.size else None
+    result = np.flatnonzero(clock[1:] < clock[:-1])
+    return int(result[0]) + 1 if result.size else None
 
 
 def backwards_text(clock: np.ndarray, row: int) -> str:
@@ -257,8 +258,8 @@ def own_units(matrix: np.ndarray) -> np.ndarray:
     """
     diagonal = np.sqrt(np.abs(np.diagonal(matrix, axis1=-2, axis2=-1)))
     others = np.where(diagonal > 0, diagonal, np.inf)
-    beside = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
-    return np.asarray(np.where(diagonal > 0, diagonal, np.where(beside > 0, beside, 1.0)))
+    others_ = np.max(np.abs(matrix) / others[..., None, :], axis=-1, initial=0.0)
+    return np.asarray(np.where(diagonal > 0, diagonal, np.where(others_ > 0, others_, 1.0)))
 
 
 def probabilities(name: str, value: ArrayLike, count: int | None = None) -> Any:

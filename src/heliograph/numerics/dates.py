@@ -29,24 +29,24 @@ def dates(texts: Iterable[object], name: str) -> np.ndarray:
     Raises:
         ValueError: a text that is no date; some with a zone and some without; one line that names the row, from 1.
     """
-    found, zones = [], set()
-    for row, each in enumerate(texts, 1):
-        text = each.isoformat() if hasattr(each, "isoformat") else "" if each is None else str(each).strip()
+    results, zones = [], set()
+    for row, element in enumerate(texts, 1):
+        text = element.isoformat() if hasattr(element, "isoformat") else "" if element is None else str(element).strip()
         if not text or text == "NaT":
-            found.append(MISSING)
+            results.append(MISSING)
             continue
         match = DATE.fullmatch(text)
         try:
             if match is None:
                 raise ValueError
-            found.append(_instant(match))
+            results.append(_instant(match))
         except ValueError:
-            wanted = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
-            raise fail(f"{name}, row {row}", wanted, shown(text)) from None
+            expected = "a date as 2026-11-21T23:25:00+01:00, from 1678 to 2261"
+            raise fail(f"{name}, row {row}", expected, shown(text)) from None
         zones.add(match["zone"] is not None)
         if len(zones) > 1:
             raise fail(f"{name}, row {row}", "a zone with every date or with none", shown(text))
-    return np.array(found, dtype=np.int64).view("datetime64[ns]")
+    return np.array(results, dtype=np.int64).view("datetime64[ns]")
 
 
 def _instant(match: re.Match[str]) -> int:

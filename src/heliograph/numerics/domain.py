@@ -21,21 +21,21 @@ SIMPLEX, COVARIANCE = Domain("simplex"), Domain("covariance")
 class Marked(np.ndarray):
     """An array that is told what it is for, once a check sees it; what is computed from it is told nothing."""
 
-    told: Callable[[str, Domain], None] | None = None
+    report: Callable[[str, Domain], None] | None = None
 
 
-def marked(value: object, told: Callable[[str, Domain], None]) -> Marked:
+def marked(value: object, report: Callable[[str, Domain], None]) -> Marked:
     """A copy of an array that calls `told(name, domain)` when it is checked."""
     result = np.array(value, dtype=np.float64).view(Marked)
-    result.told = told
+    result.report = report
     return result
 
 
 def tell(name: str, value: object, whole: Domain, entry: Domain | None = None) -> None:
     """Tell a marked value what it is for; in a list, marked entries that they are each an `entry`."""
     if isinstance(value, Marked):
-        if value.told is not None:
-            value.told(name, whole)
+        if value.report is not None:
+            value.report(name, whole)
     elif isinstance(value, list | tuple):
         for item in value:
             if isinstance(item, Marked | list | tuple):

@@ -72,7 +72,7 @@ def _traced(tree: PyTree) -> bool:
 
 
 def _as_array(leaf: object) -> object:
-    found = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
-    if isinstance(found, np.ndarray) and found.dtype.kind in "OUS":
+    result = np.asarray(leaf) if isinstance(leaf, int | float) else leaf
+    if isinstance(result, np.ndarray) and result.dtype.kind in "OUS":
         raise fail("argument", "numbers that a double can hold", shown(leaf))
-    return found
+    return result

@@ -17,5 +17,5 @@ def check_process() -> None:
     if not _first:
         _first.append(here)
     elif _first[0] != here:
-        wanted = 'one started anew (multiprocessing.get_context("spawn"))'
-        raise fail("process", wanted, "a fork of one in which JAX has run, which would hang")
+        expected = 'one started anew (multiprocessing.get_context("spawn"))'
+        raise fail("process", expected, "a fork of one in which JAX has run, which would hang")

@@ -50,13 +50,13 @@ def runs_last(
         leaves, tree = jax.tree.flatten((args, kwargs))
         leaves = [jnp.asarray(leaf) for leaf in leaves]
         if shapes is None:
-            one = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
+            item = jax.eval_shape(this.function, *jax.tree.unflatten(tree, leaves))
         else:
-            one = _said(shapes(*args, **kwargs), leaves)
-        told, form = jax.tree.flatten(one)
-        sizes = tuple((x.shape, x.dtype) for x in told)
+            item = _said(shapes(*args, **kwargs), leaves)
+        declared, form = jax.tree.flatten(item)
+        sizes = tuple((x.shape, x.dtype) for x in declared)
         x64 = bool(jnp.result_type(float) == np.float64)
-        results = _kernel.bind(*leaves, kernel=this, tree=tree, told=sizes, x64=x64, runs=())
+        results = _kernel.bind(*leaves, kernel=this, tree=tree, declared=sizes, x64=x64, runs=())
         result: R = jax.tree.unflatten(form, results)
         return result
 
@@ -75,15 +75,15 @@ def _said(shapes: PyTree, leaves: Sequence[jax.Array]) -> PyTree:
     return jax.tree.map(struct, shapes, is_leaf=lambda s: isinstance(s, tuple) and all(isinstance(i, int) for i in s))
 
 
-def _shapes(*_: Any, told: tuple[Any, ...], runs: tuple[int, ...], **rest: Any) -> list[jax.core.ShapedArray]:
-    return [jax.core.ShapedArray((*shape, *runs), dtype) for shape, dtype in told]
+def _shapes(*_: Any, declared: tuple[Any, ...], runs: tuple[int, ...], **rest: Any) -> list[jax.core.ShapedArray]:
+    return [jax.core.ShapedArray((*shape, *runs), dtype) for shape, dtype in declared]
 
 
 def _computed(
     *leaves: jax.Array,
     kernel: _Kernel,
     tree: Any,
-    told: tuple[Any, ...],
+    declared: tuple[Any, ...],
     x64: bool,
     runs: tuple[int, ...],
     alone: bool = False,
@@ -92,12 +92,12 @@ def _computed(
     function = _alone(kernel.function) if alone else kernel.function
     with jax.enable_x64(x64):
         results = jax.tree.leaves(function(*jax.tree.unflatten(tree, leaves)))
-        return _for_each(results, told, runs)
+        return _for_each(results, declared, runs)
 
 
-def _for_each(results: Sequence[jax.Array], told: tuple[Any, ...], runs: tuple[int, ...]) -> list[jax.Array]:
+def _for_each(results: Sequence[jax.Array], declared: tuple[Any, ...], runs: tuple[int, ...]) -> list[jax.Array]:
     """Results that no run's own argument has a part in come with an axis of 1."""
-    return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, told, strict=True)]
+    return [jnp.broadcast_to(x, (*shape, *runs)) for x, (shape, _) in zip(results, declared, strict=True)]
 
 
 def _over_one_more(
@@ -118,7 +118,7 @@ def _with_tangents(
     *,
     kernel: _Kernel,
     tree: Any,
-    told: tuple[Any, ...],
+    declared: tuple[Any, ...],
     runs: tuple[int, ...],
     **rest: Any,
 ) -> tuple[list[jax.Array], list[jax.Array]]:
@@ -127,9 +127,9 @@ def _with_tangents(
 
     @wraps(kernel.source)
     def source(*moving: jax.Array) -> list[jax.Array]:
-        each = iter(moving)
-        args, kwargs = jax.tree.unflatten(tree, [next(each) if m else x for m, x in zip(moves, primals, strict=True)])
-        return _for_each(jax.tree.leaves(kernel.source(*args, **kwargs)), told, runs)
+        items = iter(moving)
+        args, kwargs = jax.tree.unflatten(tree, [next(items) if m else x for m, x in zip(moves, primals, strict=True)])
+        return _for_each(jax.tree.leaves(kernel.source(*args, **kwargs)), declared, runs)
 
     at, along = (tuple(x for m, x in zip(moves, part, strict=True) if m) for part in (primals, tangents))
     results, slopes = jax.jvp(source, at, along)

@@ -16,7 +16,7 @@ T = TypeVar("T", bound=type)
 E = TypeVar("E")
 
 WIDTH, LINES, DEPTH = 110, 10, 3  # characters, lines and levels of what is shown
-FEW, SOME, MANY = 4, 8, 20  # numbers of an array, items on a line, rows of a table
+FEW, SOME, LARGE = 4, 8, 20  # numbers of an array, items on a line, rows of a table
 
 
 def readable(kind: T) -> T:
@@ -61,7 +61,7 @@ def line(value: object, depth: int) -> str:
         marks = "[]" if isinstance(value, list) else ("(", ",)" if len(value) == 1 else ")")
         return _joined(marks[0], value, len(value), depth, lambda item: line(item, depth - 1), marks[1])
     if _ours(value) or is_dataclass(value):
-        name, parts = type(value).__name__, list(islice(_parts(value), MANY))
+        name, parts = type(value).__name__, list(islice(_parts(value), LARGE))
         return _joined(f"{name}(", parts, len(parts), depth, lambda p: f"{p[0]}={line(p[1], depth - 1)}", ")")
     if isinstance(value, partial):
         return line(value.func, depth)
@@ -77,12 +77,12 @@ def _ours(value: object) -> bool:
 def _parts(value: object) -> Iterable[tuple[str, object]]:
     """Names and values of what an object holds and anybody may use."""
     if isinstance(value, Mapping):
-        return ((repr(key), each) for key, each in value.items())
+        return ((repr(key), item) for key, item in value.items())
     if is_dataclass(value):
         named = ((field.name, getattr(value, field.name, None)) for field in fields(value))
     else:
         named = ((name, getattr(value, name)) for name in getattr(value, "_fields", getattr(value, "__dict__", {})))
-    return ((name, each) for name, each in named if not name.startswith("_"))
+    return ((name, item) for name, item in named if not name.startswith("_"))
 
 
 def _array(value: np.ndarray | np.generic | jax.Array) -> str:
@@ -110,14 +110,14 @@ def _cut(text: str) -> str:
 
 
 def _table(value: object, depth: int) -> str:
-    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(each, depth - 1)}</td></tr>" for name, each in _entries(value)]
+    rows = [f"<tr><th>{escape(name)}</th><td>{_cell(item, depth - 1)}</td></tr>" for name, item in _entries(value)]
     return f"<table><caption>{escape(type(value).__name__)}</caption>{''.join(rows)}</table>"
 
 
 def _entries(value: object) -> Iterable[tuple[str, object]]:
-    found = _parts(value)
-    yield from islice(found, MANY)
-    left = sum(1 for _ in found)
+    result = _parts(value)
+    yield from islice(result, LARGE)
+    left = sum(1 for _ in result)
     if left:
         yield "…", f"{left} more"
 

@@ -10,43 +10,43 @@ import jax.numpy as jnp
 import numpy as np
 
 
-def same(one: Any, other: Any) -> bool:
+def same(item: Any, other: Any) -> bool:
     """One bool for objects that hold arrays: of the same class, and the same in each part.
 
     Arrays are the same if shape, kind of number and every number are; NaN is the same as NaN. What JAX traces is the
     same as itself alone.
     """
-    if one is other:
+    if item is other:
         return True
-    if isinstance(one, jax.core.Tracer) or isinstance(other, jax.core.Tracer):
+    if isinstance(item, jax.core.Tracer) or isinstance(other, jax.core.Tracer):
         return False
-    if isinstance(one, np.ndarray | np.generic | jax.Array) and isinstance(other, np.ndarray | np.generic | jax.Array):
-        return _same_array(one, other)
-    if type(one) is not type(other):
+    if isinstance(item, np.ndarray | np.generic | jax.Array) and isinstance(other, np.ndarray | np.generic | jax.Array):
+        return _same_array(item, other)
+    if type(item) is not type(other):
         return False
-    if isinstance(one, Mapping):
-        return one.keys() == other.keys() and all(same(one[key], other[key]) for key in one) and _rest(one, other)
-    if isinstance(one, tuple | list):
-        return len(one) == len(other) and all(map(same, one, other))
-    if isinstance(one, partial):
-        return same((one.func, one.args, one.keywords), (other.func, other.args, other.keywords))
-    if is_dataclass(one):
-        return all(same(getattr(one, f.name, None), getattr(other, f.name, None)) for f in fields(one) if f.compare)
-    kind: Any = type(one)
-    if kind.__eq__ is object.__eq__ and not callable(one) and getattr(one, "__dict__", None):
-        return same(vars(one), vars(other))  # nobody has said when two of these are equal
-    return bool(one == other) or (isinstance(one, float) and one != one and other != other)
+    if isinstance(item, Mapping):
+        return item.keys() == other.keys() and all(same(item[key], other[key]) for key in item) and _rest(item, other)
+    if isinstance(item, tuple | list):
+        return len(item) == len(other) and all(map(same, item, other))
+    if isinstance(item, partial):
+        return same((item.func, item.args, item.keywords), (other.func, other.args, other.keywords))
+    if is_dataclass(item):
+        return all(same(getattr(item, f.name, None), getattr(other, f.name, None)) for f in fields(item) if f.compare)
+    kind: Any = type(item)
+    if kind.__eq__ is object.__eq__ and not callable(item) and getattr(item, "__dict__", None):
+        return same(vars(item), vars(other))  # nobody has said when two of these are equal
+    return bool(item == other) or (isinstance(item, float) and item != item and other != other)
 
 
-def _rest(one: object, other: object) -> bool:
+def _rest(item: object, other: object) -> bool:
     """What a dictionary of a class of its own holds beside its entries."""
-    return same(getattr(one, "__dict__", None), getattr(other, "__dict__", None))
+    return same(getattr(item, "__dict__", None), getattr(other, "__dict__", None))
 
 
-def _same_array(one: Any, other: Any) -> bool:
-    if one.shape != other.shape or one.dtype != other.dtype:
+def _same_array(item: Any, other: Any) -> bool:
+    if item.shape != other.shape or item.dtype != other.dtype:
         return False
-    if jnp.issubdtype(one.dtype, jax.dtypes.prng_key):
-        one, other = jax.random.key_data(one), jax.random.key_data(other)
-    a, b = np.asarray(one), np.asarray(other)
+    if jnp.issubdtype(item.dtype, jax.dtypes.prng_key):
+        item, other = jax.random.key_data(item), jax.random.key_data(other)
+    a, b = np.asarray(item), np.asarray(other)
     return bool(np.array_equal(a, b, equal_nan=a.dtype.kind in "fcmM"))

@@ -85,10 +85,10 @@ def inner(a: jax.Array, b: jax.Array) -> jax.Array:
 
 def trace(a: jax.Array) -> jax.Array:
     """tr A."""
-    return summed(own(a), 0)
+    return summed(diagonal_of(a), 0)
 
 
-def own(a: jax.Array) -> jax.Array:
+def diagonal_of(a: jax.Array) -> jax.Array:
     """The diagonal of A, (n, ...): each component's own entry."""
     n = a.shape[0]
     return lax.slice_in_dim(a.reshape(n * n, *a.shape[2:]), 0, n * n, n + 1)
@@ -127,9 +127,9 @@ def sum_of_squares(
     rounding alone, which are not negative.
     """
     n = len(prior)
-    kept = identity(n, prior) - times(gain, output)
-    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * own(prior))
-    left = times(kept, prior_root)
+    stored = identity(n, prior) - times(gain, output)
+    rounded = diagonal(((n + 2) * float(np.finfo(prior.dtype).eps)) ** 2 * diagonal_of(prior))
+    left = times(stored, prior_root)
     return symmetric(times(left, transpose(left)) + spread_of(gain, noise)) + rounded
 
 
@@ -186,7 +186,7 @@ def solver(a: jax.Array) -> Callable[[jax.Array], jax.Array]:
     """`solve` of one A for several B, one after another: it is factored once."""
     n = a.shape[0]
     if n > UNROLL_LIMIT:
-        return partial(_each, _long_solve, a)
+        return partial(_over_matrices, _long_solve, a)
     columns, scales = factor(a)
 
     def solved(b: jax.Array) -> jax.Array:
@@ -225,13 +225,13 @@ def _long_solve(a: jax.Array, b: jax.Array) -> jax.Array:
 def root(a: jax.Array) -> jax.Array:
     """R, lower, with R R' = A for a positive semidefinite A, a column of zeros where a component adds nothing."""
     if len(a) > UNROLL_LIMIT:
-        return _each(lambda a, _: long_factor(a), a, a)
+        return _over_matrices(lambda a, _: long_factor(a), a, a)
     return jnp.stack(factor(a)[0], axis=1)
 
 
 def pivots(a: jax.Array) -> jax.Array:
     """Variance of each component given those before it, (n, ...); 0 where these determine it."""
-    return own(a) if len(a) == 1 else own(root(a)) ** 2
+    return diagonal_of(a) if len(a) == 1 else diagonal_of(root(a)) ** 2
 
 
 def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> jax.Array:
@@ -245,7 +245,7 @@ def squared_distance(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> j
 
 def squared_distances(a: jax.Array, x: jax.Array, size: Array | float = 0.0) -> tuple[jax.Array, jax.Array]:
     """The terms of `squared_distance`, each given those before it, and which of them these determine."""
-    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(own(a), 0.0)) + OFF_VALUE * jnp.abs(size)
+    reach = OFF_SUPPORT * jnp.sqrt(jnp.maximum(diagonal_of(a), 0.0)) + OFF_VALUE * jnp.abs(size)
     squares: list[jax.Array] = []
     determined: list[jax.Array] = []
     for i, (rest, scale) in enumerate(_substituted(a, x)):
@@ -266,12 +266,12 @@ def uncorrelated(a: jax.Array, b: jax.Array) -> tuple[jax.Array, jax.Array]:
     b = jnp.broadcast_to(b, (*b.shape[:2], *shape))
     if n > UNROLL_LIMIT:
         lower = root(a)
-        scales = _reciprocals(own(lower))
+        scales = _reciprocals(diagonal_of(lower))
         unit = lower * scales + diagonal(jnp.where(scales == 0, 1.0, 0.0))
-        rows = _each(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
+        rows = _over_matrices(partial(solve_triangular, lower=True, unit_diagonal=True), unit, b)
     else:
-        rests, each = zip(*_substituted(a, b), strict=True)
-        rows, scales = jnp.stack(rests), jnp.stack(each)
+        rests, items = zip(*_substituted(a, b), strict=True)
+        rows, scales = jnp.stack(rests), jnp.stack(items)
     return rows, _reciprocals(scales * scales)
 
 
@@ -285,7 +285,7 @@ def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]
     n = a.shape[0]
     if n > UNROLL_LIMIT:
         lower = root(a)
-        columns, scales = list(jnp.moveaxis(lower, 1, 0)), list(_reciprocals(own(lower)))
+        columns, scales = list(jnp.moveaxis(lower, 1, 0)), list(_reciprocals(diagonal_of(lower)))
     else:
         columns, scales = factor(a)
     forward: list[jax.Array] = []
@@ -296,7 +296,7 @@ def _substituted(a: jax.Array, x: jax.Array) -> list[tuple[jax.Array, jax.Array]
     return list(zip(rests, scales, strict=True))
 
 
-def _each(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
+def _over_matrices(function: Callable[..., jax.Array], a: jax.Array, b: jax.Array) -> jax.Array:
     """A function of two single matrices, for each of the further axes."""
     shape = jnp.broadcast_shapes(a.shape[2:], b.shape[2:])
     a, b = (jnp.broadcast_to(x, (*x.shape[:2], *shape)) for x in (a, b))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from heliograph.linear.arrival import plant_matrices, sensor_matrices
-from heliograph.linear.told_losses import spectral_radius
+from heliograph.linear.known_losses import spectral_radius
 from heliograph.model.channel import Channel, amplify_and_forward, hop
 from heliograph.model.over_time import over_time
 from heliograph.model.plant import LinearPlant

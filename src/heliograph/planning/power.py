@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.fed_back import FedBackFilter
-from heliograph.filters.scheduled import ScheduledFilter
-from heliograph.linear.told_losses import spectral_radius
+from heliograph.filters.linear.scheduled import ScheduledFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
+from heliograph.linear.known_losses import spectral_radius
 from heliograph.model.channel import Channel
 from heliograph.model.over_time import at, first, steps_covered
 from heliograph.model.plant import AnyPlant, LinearPlant
@@ -22,7 +22,7 @@ from heliograph.planning.moments import measurement_moment, moments_over, steady
 from heliograph.planning.transmitters import sent_powers, steady_powers
 from heliograph.relays.design import expected_maps, given_design
 from heliograph.simulation.draws import seed_key
-from heliograph.simulation.network import OWN, Network
+from heliograph.simulation.network import LOCAL, Network
 from heliograph.simulation.node import Node
 
 BATCHES = 20  # of runs, from whose spread the standard errors come
@@ -168,7 +168,7 @@ def _of_relays(network: Network, horizon: int | None) -> dict[str, Float[np.ndar
     """Powers of relays that filter: exact for schedules made as if a relay's estimate were everybody's."""
     relays = network.relays
     assert relays is not None
-    filters = {name: network.nodes[name].filters[OWN] for name in relays.relays}
+    filters = {name: network.nodes[name].filters[LOCAL] for name in relays.relays}
     schedules = {name: item.gains.values for name, item in filters.items() if isinstance(item, ScheduledFilter)}
     known = min(len(schedule.gain) for schedule in schedules.values())
     steps = known if horizon is None else check_horizon(horizon, known)

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from scipy.linalg import block_diag
 
-from heliograph.filters.linear import linear_filter
+from heliograph.filters.linear.linear import linear_filter
 from heliograph.model.channel import parallel
 from heliograph.model.over_time import OverTime, at, first, over_time
 from heliograph.model.sensor import LinearSensor

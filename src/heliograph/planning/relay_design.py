@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.model.relays import RECEIVER, SENSOR, RelayNetwork
 from heliograph.numerics.check import fail
 from heliograph.numerics.types import Float

@@ -23,8 +23,8 @@ from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.delay import Delayed, OfLine, sent
 from heliograph.random_affine.erasure import Erasure
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.modes import Faded, Modes, OneStepLate, Revealed, joint_modes
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.modes import Faded, ModeOutput, Modes, OneStepLate, joint_modes
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 
 UNCHANGED = 1e-12  # change of a law in a step that counts as none
 
@@ -94,7 +94,7 @@ def _visit(channel: AbstractRandomAffine, visit: Visit, place: Place) -> tuple[A
             pairs = [_visit(part, visit, at) for part, at in zip(channel.maps, places, strict=True)]
             parts = [part for part, _ in pairs]
             place = place if several else max((at for _, at in pairs), key=lambda at: at.hops)
-        case Revealed():
+        case ModeOutput():
             return channel, place
         case Erasure() | OneStepLate() | Delayed() | OfLine():
             name = {Erasure: "base", OneStepLate: "base", Delayed: "link", OfLine: "plain"}[type(channel)]

@@ -13,7 +13,7 @@ from .combine import (
     Series as Series,
     Stack as Stack,
 )
-from .lift import (
+from .moments.lift import (
     Lift as Lift,
     square as square,
 )
@@ -28,7 +28,7 @@ from .modes import (
     Modes as Modes,
     joint_modes as joint_modes,
 )
-from .moment_noise import (
+from .moments.moment_noise import (
     NoiseMoments as NoiseMoments,
     recorded_noise as recorded_noise,
 )
@@ -38,7 +38,7 @@ from .noise import (
     Independent as Independent,
     Shaped as Shaped,
 )
-from .second_moments import (
+from .moments.second_moments import (
     second_order as second_order,
 )
 from .base import (

@@ -6,13 +6,13 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, shown
-from heliograph.numerics.kept import kept
 from heliograph.numerics.traced import library, placed, stacked
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.law import AbstractLaw, Constant
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import (
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import (
     count,
     degrees,
     refuse_if_too_large,
@@ -60,14 +60,14 @@ class GainAndNoise(AbstractRandomAffine):
         """It holds no map."""
         return False
 
-    @kept
+    @cached
     def moments(self, order: int) -> Moments:
         """sum_k E[g^k] B_k, with the `gain_coefficients`."""
         gains = gain_moments(self.law, order)
         basis = self.gain_coefficients(order)
         return Moments(library(gains, basis).tensordot(gains, basis, axes=1), self.outputs, self.inputs, order)
 
-    @kept
+    @cached
     def gain_coefficients(self, order: int) -> Float[jax.Array | np.ndarray, "order+1 rows columns"]:
         """B_k: E[prod_i (g (A y)_i + n_i)^a_i] = sum_{b <= a} C(a, b) E[g^|b|] (A y)^b E[n^(a-b)], where |b| = k."""
         rows, columns = count(self.outputs + 1, order), count(self.inputs + 1, order)

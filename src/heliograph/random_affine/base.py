@@ -14,8 +14,8 @@ from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, stacked
 from heliograph.random_affine.chain import AbstractMemory
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import monomials
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import monomials
 
 T = TypeVar("T")
 
@@ -193,12 +193,12 @@ def distinct(held: Iterable[AbstractMemory]) -> dict[str, AbstractMemory]:
     Raises:
         ValueError: one name for memories that differ.
     """
-    found: dict[str, AbstractMemory] = {}
+    results: dict[str, AbstractMemory] = {}
     for memory in held:
-        known = found.setdefault(memory.identity, memory)
+        known = results.setdefault(memory.identity, memory)
         if not (known is memory or is_traced(known, memory) or eqx.tree_equal(known, memory)):
             raise fail(f"memory {known.name!r}", "one transition and one initial law", "several")
-    return found
+    return results
 
 
 def given(channel: T, states: Sequence[int | float | jax.Array | np.ndarray]) -> T:
@@ -221,14 +221,14 @@ def anonymous(channel: T) -> T:
 
 def one_memory(items: Sequence[T]) -> list[T]:
     """The same maps at later steps: unnamed memories of each are those of the first, in order of appearance."""
-    whose = [memories(item) for item in items]
-    if not whose[0] or len({len(held) for held in whose}) > 1:
+    owners = [memories(item) for item in items]
+    if not owners[0] or len({len(held) for held in owners}) > 1:
         return list(items)
     labels = [
-        {identity: label for (identity, m), label in zip(held.items(), whose[0], strict=True) if m.name is None}
-        for held in whose
+        {identity: label for (identity, m), label in zip(held.items(), owners[0], strict=True) if m.name is None}
+        for held in owners
     ]
-    return [_relabelled(item, own) for item, own in zip(items, labels, strict=True)]
+    return [_relabelled(item, label) for item, label in zip(items, labels, strict=True)]
 
 
 def _relabelled(channel: T, labels: Mapping[str, str]) -> T:

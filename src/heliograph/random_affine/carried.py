@@ -33,16 +33,16 @@ def carried(channel: AbstractRandomAffine, sent: Angles) -> Angles:
             return sent
         case Stack():
             starts = np.cumsum([0, *(part.outputs for part in channel.maps)])
-            each = zip(starts, channel.maps, strict=False)
-            return tuple(int(start) + i for start, part in each for i in carried(part, sent))
+            items = zip(starts, channel.maps, strict=False)
+            return tuple(int(start) + i for start, part in items for i in carried(part, sent))
         case Erasure() | OneStepLate():
             return carried(channel.base, sent)
         case Delayed():  # what arrives is one angle that was sent; the delay itself, where it is told, comes after it
             return carried(channel.link, sent)
         case Mixture() | Modes():
-            found = {carried(part, sent) for part in channel.maps}
-            if len(found) == 1:
-                return found.pop()
+            results = {carried(part, sent) for part in channel.maps}
+            if len(results) == 1:
+                return results.pop()
     raise _refused(type(channel).__name__)
 
 

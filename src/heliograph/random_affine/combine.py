@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
+from heliograph.numerics.caching import cached
 from heliograph.numerics.check import fail
-from heliograph.numerics.kept import kept
 from heliograph.numerics.traced import library, stacked
 from heliograph.random_affine.atoms import GainAndNoise
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
 from heliograph.random_affine.law import Constant, Discrete
-from heliograph.random_affine.moments import Moments
-from heliograph.random_affine.monomials import (
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import (
     count,
     exponents,
     multiply,
@@ -88,7 +88,7 @@ class Series(_Parts):
         then = _after if self.erases else jnp.matmul
         return state, reduce(lambda h, part: then(part, h), drawn)
 
-    @kept
+    @cached
     def moments(self, order: int) -> Moments:
         """E[Sym^k(H2 H1)] = E[Sym^k(H2)] E[Sym^k(H1)]."""
         check_forgets("moments of a map", self)
@@ -100,13 +100,13 @@ class Series(_Parts):
         """All combinations of the parts' extremes: moments are linear in the law of each part."""
         return tuple(Series(parts) for parts in product(*(m.extremes() for m in self.maps)))
 
-    @kept
+    @cached
     def corner_moments(self, order: int) -> Corners:
         """Products of the parts' corners."""
         first, *rest = (m.corner_moments(order) for m in self.maps)
         for part in rest:
-            each = part @ first[:, None]
-            first = each.reshape(-1, *each.shape[2:])
+            items = part @ first[:, None]
+            first = items.reshape(-1, *items.shape[2:])
         return first
 
     def corner_count(self) -> int:
@@ -153,7 +153,7 @@ class Mixture(_Parts):
         state, drawn = self._draw_each(state, keys)
         return state, jnp.stack(drawn)[self.choice.sample(choice_key).astype(int)]
 
-    @kept
+    @cached
     def moments(self, order: int) -> Moments:
         """sum_i p_i E[Sym^k(H_i)]."""
         check_forgets("moments of a map", self)
@@ -170,14 +170,14 @@ class Mixture(_Parts):
             for parts in product(*(m.extremes() for m in self.maps))
         )
 
-    @kept
+    @cached
     def corner_moments(self, order: int) -> Corners:
         """The corners of the weights, with every combination of the maps' corners."""
         parts, weights = [m.corner_moments(order) for m in self.maps], self.choice.corners()
         chosen = np.array(list(product(*(range(len(part)) for part in parts)))).T
-        combined = stacked([part[one] for part, one in zip(parts, chosen, strict=True)])
-        each = library(weights, combined).tensordot(weights, combined, axes=1)
-        result: Matrix = each.reshape(-1, *each.shape[2:])
+        combined = stacked([part[item] for part, item in zip(parts, chosen, strict=True)])
+        items = library(weights, combined).tensordot(weights, combined, axes=1)
+        result: Matrix = items.reshape(-1, *items.shape[2:])
         return result
 
     def corner_count(self) -> int:
@@ -220,13 +220,13 @@ class Stack(_Parts):
         rows = [h[:-1] for h in drawn]
         return state, jnp.concatenate([*rows, np.eye(1, self.inputs + 1, self.inputs)], axis=0)
 
-    @kept
+    @cached
     def moments(self, order: int) -> Moments:
         """E[z1^a z2^b | y] = E[z1^a | y] E[z2^b | y], a product of polynomials in y."""
         check_forgets("moments of a map", self)
         refuse_if_too_large(count(self.outputs + 1, order), count(self.inputs + 1, order), f"moments of order {order}")
-        each = [m.moments(order) for m in self.maps]
-        tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in each]
+        items = [m.moments(order) for m in self.maps]
+        tables = [[m.lower(k) if k else None for k in range(order + 1)] for m in items]
         rows = [self._row(powers, tables) for powers in exponents(self.outputs + 1, order)]
         return Moments(stacked(rows), self.outputs, self.inputs, order)
 

@@ -14,7 +14,7 @@ from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.combine import Mixture, Series, Stack
 from heliograph.random_affine.law import Discrete
 from heliograph.random_affine.modes import Modes
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.moments import Moments
 
 Delay = int | Discrete | MarkovChain  # steps; their law at each step; a chain whose mode is the number of steps
 T = TypeVar("T")
@@ -99,26 +99,26 @@ class Delayed(AbstractOfLine):
     link: AbstractRandomAffine
     delay: AbstractRandomAffine  # from the line to what the link hears, and to d where it is told
     times: tuple[int, ...] = eqx.field(static=True)
-    told: bool = eqx.field(static=True)
+    timestamped: bool = eqx.field(static=True)
 
-    def __init__(self, link: AbstractRandomAffine, delay: Delay, told: bool = False):
+    def __init__(self, link: AbstractRandomAffine, delay: Delay, timestamped: bool = False):
         (self.link,) = as_maps("delayed link", [link])
         if link.past:
             raise fail("delayed link", "one that is not late itself", f"one late by up to {link.past} steps")
-        self.times, self.told = _times(delay), instance("told", told, bool, "True or False")
-        each = [_chosen(d, self.past, link.inputs, told) for d in self.times]
+        self.times, self.timestamped = _times(delay), instance("told", timestamped, bool, "True or False")
+        items = [_chosen(d, self.past, link.inputs, timestamped) for d in self.times]
         match delay:
             case Discrete():
-                self.delay = Mixture(each, delay.probabilities, delay.radius)
+                self.delay = Mixture(items, delay.probabilities, delay.radius)
             case MarkovChain():
-                self.delay = Modes(delay, each)
+                self.delay = Modes(delay, items)
             case _:
-                self.delay = each[0]
+                self.delay = items[0]
 
     @property
     def line(self) -> AbstractRandomAffine:
         """The choice, then the link."""
-        if not self.told:
+        if not self.timestamped:
             return Series([self.delay, self.link])
         m = self.link.inputs
         rows = np.eye(m + 1)
@@ -152,10 +152,10 @@ def _times(delay: Delay) -> tuple[int, ...]:
     return tuple(check_count("delay", d, 0) for d in values)
 
 
-def _chosen(d: int, longest: int, size: int, told: bool) -> GainAndNoise:
+def _chosen(d: int, longest: int, size: int, timestamped: bool) -> GainAndNoise:
     """S_d, and below it the number d."""
     rows = np.kron(np.eye(1, longest + 1, d), np.eye(size))
-    if not told:
+    if not timestamped:
         return known(rows)
     return known(np.pad(rows, ((0, 1), (0, 0))), np.append(np.zeros(size), float(d)))
 
@@ -177,7 +177,7 @@ def sent(channel: AbstractRandomAffine) -> int:
 
 def of_part(channel: AbstractRandomAffine, total: int, start: int, past: int) -> AbstractRandomAffine:
     """The channel of y[start:start + sent] as one of all of y, and of a line at least as long as its own."""
-    own, size = channel.past, sent(channel)
-    rows = np.concatenate([t * total + start + np.arange(size) for t in range(own + 1)])
-    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if own else channel])
+    local, size = channel.past, sent(channel)
+    rows = np.concatenate([t * total + start + np.arange(size) for t in range(local + 1)])
+    chosen = Series([known(np.eye((1 + past) * total)[rows]), of_line(channel) if local else channel])
     return OfLine(chosen, past) if past else chosen

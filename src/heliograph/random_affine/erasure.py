@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike
 
 from heliograph.numerics.check import fail, scalar
 from heliograph.random_affine.base import AbstractRandomAffine, as_maps
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.moments import Moments
 
 
 class Erasure(AbstractRandomAffine):

@@ -44,8 +44,8 @@ def long_run(modes: JointModes) -> np.ndarray:
 def laws(steps: Sequence[JointModes]) -> list[np.ndarray]:
     """Law of the mode at each step."""
     result = [np.asarray(steps[0].initial)]
-    for one in steps[:-1]:
-        result.append(result[-1] @ np.asarray(one.transition))
+    for step in steps[:-1]:
+        result.append(result[-1] @ np.asarray(step.transition))
     return result
 
 
@@ -55,17 +55,17 @@ def harmless(steps: Sequence[JointModes], constant: bool) -> bool:
     Hbar_k = E[H_k | mode]. Where nothing varies (`constant`, one step given), the law of the modes must be that of all
     steps, and lags up to the number of modes decide, since Pi^t is a combination of those before.
     """
-    each = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
+    items = list(steps) * (len(steps[0].initial) + 1) if constant else list(steps)
     if constant and not np.allclose(steps[0].initial @ steps[0].transition, steps[0].initial, rtol=0, atol=ROUNDING):
         return False
-    means = [np.array([np.asarray(m.moments(1).mean[:-1]).ravel() for m in one.maps]) for one in steps]
-    means = means * len(each) if constant else means
+    means = [np.array([np.asarray(m.moments(1).mean[:-1]).ravel() for m in step.maps]) for step in steps]
+    means = means * len(items) if constant else means
     size = max(float(np.max(np.abs(m))) for m in means) ** 2
-    starts = 1 if constant else len(each)
-    for k, law in enumerate(laws(each)[:starts]):
+    starts = 1 if constant else len(items)
+    for k, law in enumerate(laws(items)[:starts]):
         apart = law[:, None] * (means[k] - law @ means[k])
-        for one, later in zip(each[k:-1], means[k + 1 :], strict=True):
-            apart = np.asarray(one.transition).T @ apart
+        for item, later in zip(items[k:-1], means[k + 1 :], strict=True):
+            apart = np.asarray(item.transition).T @ apart
             if np.max(np.abs(apart.T @ later)) > ROUNDING * size:
                 return False
     return True

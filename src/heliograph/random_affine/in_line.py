@@ -60,12 +60,13 @@ class Held(AbstractRandomAffine):
         """Draw what is heard now, and put it before what was."""
         inner, before = state
         inner, h = self.base.draw(inner, key)
-        each = jnp.concatenate([h[None, :-1], before])
+        items = jnp.concatenate([h[None, :-1], before])
         rows = [
-            jnp.pad(one[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size))) for t, one in enumerate(each)
+            jnp.pad(item[:, :-1], ((0, 0), (t * self.size, (self.steps - t) * self.size)))
+            for t, item in enumerate(items)
         ]
-        top = jnp.concatenate([jnp.concatenate(rows), each[..., -1].reshape(-1, 1)], axis=1)
-        return (inner, each[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
+        top = jnp.concatenate([jnp.concatenate(rows), items[..., -1].reshape(-1, 1)], axis=1)
+        return (inner, items[:-1]), jnp.concatenate([top, np.eye(1, self.inputs + 1, self.inputs)])
 
 
 class Relayed(AbstractOfLine):
@@ -114,7 +115,7 @@ def in_series(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
             stages[-1].append(link)
     if len(stages) == 1:
         return _stage(stages[0])
-    if any(isinstance(link, Delayed) and link.told for link in links):
+    if any(isinstance(link, Delayed) and link.timestamped for link in links):
         raise fail("delays told", "those of one link", "those of several in series")
     return Relayed(tuple(_stage(stage) for stage in stages))
 
@@ -127,8 +128,8 @@ def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
     if links[0].past and not isinstance(links[0], Delayed):
         raise fail("series", "links that are late each by itself", "a combination of late links")
     start, added = (delays[0], delays[1:]) if isinstance(links[0], Delayed) else (None, delays)
-    told = [link.told for link in delays]
-    if any(told[:-1]) or (told[-1] and len(delays) > 1 and start is not None):
+    timestamped = [link.timestamped for link in delays]
+    if any(timestamped[:-1]) or (timestamped[-1] and len(delays) > 1 and start is not None):
         raise fail("delays told", "those of one link", "those of several in series")
     last = max(i for i, link in enumerate(links) if isinstance(link, Delayed))
     for link in links[:last]:
@@ -136,7 +137,7 @@ def _stage(links: Sequence[AbstractRandomAffine]) -> AbstractRandomAffine:
             raise fail("link before a delay", "one that forgets", f"{type(link).__name__}, which remembers")
     chain = Series([link.link if isinstance(link, Delayed) else link for link in links])
     more = sum(link.times[0] for link in added)
-    return Delayed(chain, more if start is None else _longer(start, more), any(told))
+    return Delayed(chain, more if start is None else _longer(start, more), any(timestamped))
 
 
 def _longer(link: Delayed, more: int) -> Delay:

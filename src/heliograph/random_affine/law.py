@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from heliograph.numerics.caching import cached
 from heliograph.numerics.check import array, fail, probabilities, radii, scalar
-from heliograph.numerics.kept import kept
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, library, plain, scipy_for, stacked
@@ -120,7 +120,7 @@ class Discrete(AbstractLaw):
         corners = self.corners()
         return stacked([corners @ self.values**k for k in range(order + 1)]).T
 
-    @kept
+    @cached
     def corners(self) -> Float[jax.Array | np.ndarray, "corner atom"]:
         """Corners of the polytope of probabilities: each but one at an end of its interval.
 

@@ -27,8 +27,8 @@ from heliograph.random_affine.base import (
 from heliograph.random_affine.chain import AbstractMemory, Autoregression, Law, MarkovChain, Nodes, Rows
 from heliograph.random_affine.combine import Mixture, Stack
 from heliograph.random_affine.law import Constant
-from heliograph.random_affine.lift import Lift
-from heliograph.random_affine.moments import Moments
+from heliograph.random_affine.moments.lift import Lift
+from heliograph.random_affine.moments.moments import Moments
 from heliograph.random_affine.noise import AbstractNoise, Matrix, as_noise
 
 MODES = 1024  # joint modes that are listed: a filter's matrices have as many blocks in a row
@@ -112,7 +112,7 @@ class _Chosen(AbstractRandomAffine):
         return Moments(jnp.stack(matrices)[self.index], self.outputs, self.inputs, order)
 
 
-class Revealed(AbstractModal):
+class ModeOutput(AbstractModal):
     """z = the state of a memory, told as a number; what is sent is not heard."""
 
     memory: AbstractMemory
@@ -249,17 +249,17 @@ def joint_modes(channel: AbstractRandomAffine, nodes: int | None = None, order: 
     check_count("order", order)
     instance("channel", channel, AbstractRandomAffine, "a channel, such as hop(...)")
     held = memories(channel)
-    each = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
-    total = prod(len(one.initial) for one in each)
+    items = [_nodes(m, order * degree_in(channel, identity), nodes) for identity, m in held.items()]
+    total = prod(len(item.initial) for item in items)
     if total > MODES:
         raise fail("memories of a channel", f"at most {MODES:,} modes together", f"{total:,}")
-    xp = library(each)
-    initial = reduce(xp.kron, [one.initial for one in each], np.ones(1))
-    transition = reduce(xp.kron, [one.transition for one in each], np.ones((1, 1)))
-    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(one.states for one in each)))
+    xp = library(items)
+    initial = reduce(xp.kron, [item.initial for item in items], np.ones(1))
+    transition = reduce(xp.kron, [item.transition for item in items], np.ones((1, 1)))
+    maps = tuple(given(channel, [s.item() for s in chosen]) for chosen in product(*(item.states for item in items)))
     for m in maps:
         check_forgets("channel of a filter", m)
-    most = reduce(xp.kron, [one.transition + one.radius for one in each], np.ones((1, 1)))
+    most = reduce(xp.kron, [item.transition + item.radius for item in items], np.ones((1, 1)))
     return JointModes(initial, transition, most - transition, maps)
 
 

@@ -15,7 +15,7 @@ from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.traced import is_traced, is_zero, library, plain, scipy_for, stacked
-from heliograph.random_affine.monomials import Exponents, exponents
+from heliograph.random_affine.moments.monomials import Exponents, exponents
 
 OWN_DIGITS = 1e-10  # of two standard deviations: what a factor may miss of a covariance
 
@@ -162,9 +162,9 @@ class Independent(AbstractNoise):
         value: Number = 1.0
         start = 0
         for part in self.parts:
-            own = tuple(powers[start : start + part.dimension])
+            local = tuple(powers[start : start + part.dimension])
             start += part.dimension
-            value *= part.moment(own) if any(own) else 1.0
+            value *= part.moment(local) if any(local) else 1.0
         return value
 
 

@@ -13,7 +13,7 @@ from heliograph.model.relays import SENSOR, RelayNetwork
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_moments import second_moment_tensor
+from heliograph.random_affine.moments.second_moments import second_moment_tensor
 from heliograph.relays.design import GainsByFilter
 
 
@@ -30,7 +30,7 @@ class Recomputed(NamedTuple):
     correlation: dict[str, Float[np.ndarray, "steps"]]
 
 
-class _Heard(NamedTuple):
+class _Observation(NamedTuple):
     """What one filter hears: mean map and E z z' = raw_ij : (sent, 1)(sent, 1)'."""
 
     mean: Float[np.ndarray, "p sent+1"]
@@ -56,9 +56,9 @@ def recompute(network: RelayNetwork, gains: GainsByFilter) -> Recomputed:
     history, correlation = [raw], []
     by_filter = [np.asarray(gains[name], dtype=np.float64) for name in filters]
     for k in range(len(by_filter[0])):
-        raw, found = _step(network, k, raw, [gain[k] for gain in by_filter], errors)
+        raw, result = _step(network, k, raw, [gain[k] for gain in by_filter], errors)
         history.append(raw)
-        correlation.append(found)
+        correlation.append(result)
     moments = np.array(history)
     means = moments[:, 0, 1 : 1 + n]
     return Recomputed(
@@ -87,35 +87,35 @@ def _step(
     moved[1 : 1 + n, 1 : 1 + n] += plant.noise.covariance
     second = sends @ moved @ sends.T
     second[:m, :m] += sensor.noise.covariance
-    heard = [_hear(network, name, k, len(sends)) for name in network.filters]
-    joint, close, innovations = _joint(moved, sends, second, heard), np.eye(size), []
-    update = np.zeros((size, sum(len(h.mean) for h in heard)))
+    received = [_receive(network, name, k, len(sends)) for name in network.filters]
+    joint, close, innovations = _joint(moved, sends, second, received), np.eye(size), []
+    update = np.zeros((size, sum(len(h.mean) for h in received)))
     place = 0
-    for f, (h, gain) in enumerate(zip(heard, gains, strict=True)):
+    for f, (h, gain) in enumerate(zip(received, gains, strict=True)):
         rows, mine = slice(1 + (1 + f) * n, 1 + (2 + f) * n), slice(place, place + len(h.mean))
         place += len(h.mean)
-        own = np.zeros((len(sends), size))  # what would be sent if this estimate were everybody's
-        own[:m, 0] = c @ plant.noise.mean + sensor.noise.mean
-        own[:m, rows] = c @ plant.matrix
-        own[m:-1, rows] = np.tile(c, (len(network.relays), 1))
-        own[-1, 0] = 1.0
+        values = np.zeros((len(sends), size))  # what would be sent if this estimate were everybody's
+        values[:m, 0] = c @ plant.noise.mean + sensor.noise.mean
+        values[:m, rows] = c @ plant.matrix
+        values[m:-1, rows] = np.tile(c, (len(network.relays), 1))
+        values[-1, 0] = 1.0
         innovation = np.zeros((len(h.mean), size + update.shape[1]))
-        innovation[:, :size], innovation[:, size:][:, mine] = -h.mean @ own, np.eye(len(h.mean))
+        innovation[:, :size], innovation[:, size:][:, mine] = -h.mean @ values, np.eye(len(h.mean))
         innovations.append(innovation)
-        close[rows, rows] = plant.matrix - gain @ h.mean @ own[:, rows]
-        close[rows, 0] = plant.noise.mean - gain @ h.mean @ own[:, 0]
+        close[rows, rows] = plant.matrix - gain @ h.mean @ values[:, rows]
+        close[rows, 0] = plant.noise.mean - gain @ h.mean @ values[:, 0]
         update[rows, mine] = gain
     full = np.concatenate([close, update], axis=1)
-    found = [_correlation(errors[f] @ full, i, joint, heard[f]) for f, i in enumerate(innovations)]
-    return full @ joint @ full.T, found
+    results = [_correlation(errors[f] @ full, i, joint, received[f]) for f, i in enumerate(innovations)]
+    return full @ joint @ full.T, results
 
 
-def _joint(moved: np.ndarray, sends: np.ndarray, second: np.ndarray, heard: list[_Heard]) -> np.ndarray:
+def _joint(moved: np.ndarray, sends: np.ndarray, second: np.ndarray, received: list[_Observation]) -> np.ndarray:
     """E of (1, x+, s, z_1 .. z_F) squared; links to different listeners are independent given what is sent."""
-    mean = np.concatenate([h.mean for h in heard])
+    mean = np.concatenate([h.mean for h in received])
     zz = mean @ second @ mean.T
     place = 0
-    for h in heard:
+    for h in received:
         mine = slice(place, place + len(h.mean))
         place += len(h.mean)
         zz[mine, mine] = np.einsum("ijab,ab->ij", h.raw, second)
@@ -123,7 +123,7 @@ def _joint(moved: np.ndarray, sends: np.ndarray, second: np.ndarray, heard: list
     return np.block([[moved, cross], [cross.T, zz]])
 
 
-def _hear(network: RelayNetwork, name: str, k: int, sent: int) -> _Heard:
+def _receive(network: RelayNetwork, name: str, k: int, sent: int) -> _Observation:
     """Sum of the listener's links: raw moments add, products of different links' means are added twice."""
     slot = network.slots[k % len(network.slots)]
     size = network.received[network.filters.index(name)]
@@ -134,17 +134,17 @@ def _hear(network: RelayNetwork, name: str, k: int, sent: int) -> _Heard:
         columns = np.append((SENSOR, *network.relays).index(sender) * item.inputs + np.arange(item.inputs), sent - 1)
         mean = np.zeros((size, sent))
         mean[:, columns] = moments.mean[:-1]
-        own = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+        separate = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
         rows = np.arange(size)
-        raw[np.ix_(rows, rows, columns, columns)] += own
+        raw[np.ix_(rows, rows, columns, columns)] += separate
         raw += np.einsum("ia,jb->ijab", total, mean) + np.einsum("ia,jb->ijab", mean, total)
         total += mean
-    return _Heard(total, raw)
+    return _Observation(total, raw)
 
 
-def _correlation(error: np.ndarray, innovation: np.ndarray, joint: np.ndarray, heard: _Heard) -> float:
+def _correlation(error: np.ndarray, innovation: np.ndarray, joint: np.ndarray, received: _Observation) -> float:
     """Largest |E e i'| relative to the root of E e e and E i i; zero for a filter that hears nothing."""
-    if not np.any(heard.raw):
+    if not np.any(received.raw):
         return 0.0
     cross = error @ joint @ innovation.T
     e, i = np.diag(error @ joint @ error.T), np.diag(innovation @ joint @ innovation.T)

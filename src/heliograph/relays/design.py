@@ -68,10 +68,10 @@ def join_gains(network: RelayNetwork, gains: GainsByFilter) -> Float[np.ndarray,
     n, first = len(network.states), network.filters[0]
     length = len(array(f"gains of {first!r}", gains[first], (None, None, None)))
     joined, start = np.zeros((length, len(network.filters) * n, sum(network.received))), 0
-    for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
-        value = array(f"gains of {name!r}", gains[name], (length, n, heard))
-        joined[:, f * n : (f + 1) * n, start : start + heard] = value
-        start += heard
+    for f, (name, item) in enumerate(zip(network.filters, network.received, strict=True)):
+        value = array(f"gains of {name!r}", gains[name], (length, n, item))
+        joined[:, f * n : (f + 1) * n, start : start + item] = value
+        start += item
     return joined
 
 
@@ -81,8 +81,8 @@ def split_gains(
     """Gains by filter from block matrices."""
     n, ends = len(network.states), np.cumsum(network.received)
     return {
-        name: np.asarray(joined)[:, f * n : (f + 1) * n, end - heard : end]
-        for f, (name, heard, end) in enumerate(zip(network.filters, network.received, ends, strict=True))
+        name: np.asarray(joined)[:, f * n : (f + 1) * n, end - item : end]
+        for f, (name, item, end) in enumerate(zip(network.filters, network.received, ends, strict=True))
     }
 
 
@@ -124,8 +124,8 @@ def relay_schedules(network: RelayNetwork, design: RelayDesign) -> dict[str, Sch
     d = design.moments.shape[-1]
     ends = dict(zip(network.filters, np.cumsum(network.received), strict=True))
     result = {}
-    for f, (name, heard) in enumerate(zip(network.filters, network.received, strict=True)):
-        mine = slice(ends[name] - heard, ends[name])
+    for f, (name, item) in enumerate(zip(network.filters, network.received, strict=True)):
+        mine = slice(ends[name] - item, ends[name])
         error = slice((1 + f) * n, (2 + f) * n)
         believed = design.covariance[name][1:], before[:, error, error], before[:, d:, d:][:, mine, mine]
         gain, expected, constant = design.gains[name], rows[:, mine], constants[:, mine]

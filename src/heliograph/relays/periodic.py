@@ -22,7 +22,7 @@ HELD = 1e-9  # the same for a covariance that only gives gains: their error ente
 TINY = float(np.finfo(np.float64).tiny)
 INDEFINITE = 1e-9  # relative: a fixed point below this is no covariance, so the moments would diverge
 
-Settling = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
+SteadyState = tuple[jax.Array, jax.Array, jax.Array]  # a value, its last relative change, and the periods so far
 
 
 def periodic_steps(network: RelayNetwork) -> Steps:
@@ -50,7 +50,7 @@ def periodic_own_error_design(network: RelayNetwork) -> RelayDesign:
         ValueError: what `periodic_steps` refuses, or moments that do not settle.
     """
     instance("network", network, RelayNetwork, "a RelayNetwork")
-    result, change = _settle_own(periodic_steps(network), start_moments(network))
+    result, change = _solve_own_steady(periodic_steps(network), start_moments(network))
     if not change <= CONVERGED:
         raise fail("steady state", "moments that settle", f"a change of {float(change):.2g} after {PERIODS} periods")
     return as_design(network, result)
@@ -149,8 +149,10 @@ def steady_behind(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.
         return (after + after.T) / 2, gain
 
     held = jax.lax.stop_gradient(side)
-    settled = _settle(lambda e: jax.lax.scan(best, e, held)[0], jax.lax.stop_gradient(moments[0][:d, :d]), HELD)[0]
-    best_gains = jax.lax.stop_gradient(jax.lax.scan(best, settled, held)[1])
+    converged = _solve_steady(
+        lambda e: jax.lax.scan(best, e, held)[0], jax.lax.stop_gradient(moments[0][:d, :d]), HELD
+    )[0]
+    best_gains = jax.lax.stop_gradient(jax.lax.scan(best, converged, held)[1])
 
     def given(spread: jax.Array, item: tuple[RelaySide, jax.Array]) -> tuple[jax.Array, jax.Array]:
         part, gain = item
@@ -185,24 +187,24 @@ def _growth(steps: Steps, gains: Float[Array, "slots Fn R"]) -> Float[jax.Array,
 
 
 @compiled
-def _settle_own(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
+def _solve_own_steady(steps: Steps, start: Float[Array, "d d"]) -> tuple[Propagated, Float[jax.Array, ""]]:
     """Repeat the period until its moments change by less than CONVERGED."""
 
-    moments, change = _settle(lambda m: propagate_own(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
+    moments, change = _solve_steady(lambda m: propagate_own(steps, m).moments[-1], jnp.asarray(start), CONVERGED)
     return propagate_own(steps, moments), change
 
 
-def _settle(
+def _solve_steady(
     period: Callable[[jax.Array], jax.Array], start: jax.Array, tolerance: float
 ) -> tuple[jax.Array, jax.Array]:
     """Repeat until the relative change is below `tolerance`; returns the last value and its change."""
 
-    def again(carry: Settling) -> Settling:
+    def again(carry: SteadyState) -> SteadyState:
         value, _, count = carry
         after = period(value)
         return after, jnp.max(jnp.abs(after - value)) / jnp.max(jnp.abs(after)), count + 1
 
-    def going(carry: Settling) -> jax.Array:
+    def going(carry: SteadyState) -> jax.Array:
         return (carry[1] > tolerance) & (carry[2] < PERIODS)
 
     value, change, _ = jax.lax.while_loop(going, again, (start, jnp.asarray(jnp.inf), jnp.asarray(0)))

@@ -46,8 +46,8 @@ def periodic_receiver_error_design(
             limit that no gains were found to meet.
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
-    own = periodic_own_error_design(network)
-    gains = join_gains(network, own.gains if start is None else start)
+    design = periodic_own_error_design(network)
+    gains = join_gains(network, design.gains if start is None else start)
     return periodic_given_design(network, split_gains(network, _tune(network, gains, _receiver_cost, power_limit)))
 
 
@@ -92,7 +92,7 @@ def _tune(
 
         x = bfgs(function, x)
         power = np.asarray(cost(x, steps, start, where, unit, limit, multipliers)[2])
-        if _settled(power / (limit * (1 - MARGIN)) - 1, multipliers):
+        if _within_limits(power / (limit * (1 - MARGIN)) - 1, multipliers):
             break
         multipliers = np.maximum(0.0, multipliers + STIFFNESS * (power / (limit * (1 - MARGIN)) - 1))
     if np.any(power > limit * (1 + POWER_TOLERANCE)):
@@ -102,7 +102,7 @@ def _tune(
     return tuned
 
 
-def _settled(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
+def _within_limits(excess: Float[np.ndarray, "slots"], multipliers: Float[np.ndarray, "slots"]) -> bool:
     """Whether no slot is above its limit, and those with a multiplier are at it."""
     return bool(np.all(excess < MARGIN / 2) and np.all(excess[multipliers > 0] > -MARGIN))
 
@@ -114,8 +114,8 @@ def _units(network: RelayNetwork, gains: Float[np.ndarray, "slots Fn R"]) -> Flo
     return join_gains(
         network,
         {
-            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), heard))
-            for (name, value), heard in zip(largest.items(), network.received, strict=True)
+            name: np.broadcast_to(np.maximum(value, floor)[:, None, None], (len(gains), len(network.states), item))
+            for (name, value), item in zip(largest.items(), network.received, strict=True)
         },
     )
 

@@ -76,7 +76,7 @@ def power_forms(steps: Steps, d: int) -> Float[np.ndarray, "time {d} {d}"]:
 
 
 def best_within(
-    problem: Limited, own: Float[np.ndarray, "time Fn R"], iterations: int
+    problem: Limited, local: Float[np.ndarray, "time Fn R"], iterations: int
 ) -> Float[np.ndarray, "time Fn R"]:
     """Gains of small cost that meet the limit; never dearer than `own`, if those meet it.
 
@@ -87,29 +87,29 @@ def best_within(
     Raises:
         ValueError: no such gains, which rounding alone can cause.
     """
-    whole = float(_judge(problem, own)[0])
+    whole = float(_judge(problem, local)[0])
     problem = problem._replace(cost=problem.cost / max(whole, np.finfo(float).tiny))
-    found = [own, _inside(problem, own)]
-    for barrier in BARRIERS / len(own):
-        gains = found[-1]
+    results = [local, _inside(problem, local)]
+    for barrier in BARRIERS / len(local):
+        gains = results[-1]
         units = np.asarray(_units(problem, gains, barrier))
         function = partial(_descended, problem, gains, units, barrier)
         x = lbfgs(function, np.zeros(units[..., 0].size), -(-iterations // len(BARRIERS)), PRECISION)
-        found.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
-    judged = [_judge(problem, gains) for gains in found]
+        results.append(np.asarray(_moved(gains, units, x.reshape(units.shape[:2]), problem.steps)))
+    judged = [_judge(problem, gains) for gains in results]
     costs = [float(cost) if np.all(slack >= 0) else np.inf for cost, slack in judged]
     best = int(np.argmin(costs))
     if not np.isfinite(costs[best]):
         raise fail("power limit", "one that some design meets", "one for which none was found")
-    return found[best]
+    return results[best]
 
 
-def _inside(problem: Limited, own: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
+def _inside(problem: Limited, local: Float[np.ndarray, "time Fn R"]) -> Float[np.ndarray, "time Fn R"]:
     """`own` with the relays' gains smaller by one factor, so that ROOM is left; without gains all of it is."""
-    relays = own.shape[1] - problem.steps.transition.shape[-1]
+    relays = local.shape[1] - problem.steps.transition.shape[-1]
 
     def smaller(factor: float) -> np.ndarray:
-        return np.concatenate([factor * own[:, :relays], own[:, relays:]], axis=1)
+        return np.concatenate([factor * local[:, :relays], local[:, relays:]], axis=1)
 
     low, high = 0.0, 2.0  # the first half is 1, the gains as they are
     for _ in range(HALVINGS):
@@ -117,7 +117,7 @@ def _inside(problem: Limited, own: Float[np.ndarray, "time Fn R"]) -> Float[np.n
         if np.min(_judge(problem, smaller(middle))[1]) < ROOM:
             high = middle
         elif middle == 1.0:
-            return own
+            return local
         else:
             low = middle
     return smaller(low)
@@ -152,8 +152,8 @@ def _barrier(
         logarithms = jnp.log(jnp.where(inside, slack, 1.0))
         return jnp.where(inside, cost - barrier * jnp.sum(logarithms), jnp.inf)
 
-    found: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
-    return found
+    result: tuple[jax.Array, jax.Array] = jax.value_and_grad(value)(x)
+    return result
 
 
 def _descended(

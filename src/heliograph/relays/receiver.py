@@ -45,13 +45,13 @@ def receiver_system(network: RelayNetwork, gains: GainsByFilter) -> LinearSystem
     gains = table("gains", gains, "arrays (steps, n, received)")
     joined = relay_gains(network, gains)
     steps, n = network.steps(len(joined)), len(network.states)
-    known, heard, white = _sides(steps, start_moments(network), joined)
-    d, r = known.shape[-1], heard.shape[1]
+    known, received, white = _sides(steps, start_moments(network), joined)
+    d, r = known.shape[-1], received.shape[1]
     none = np.zeros((len(known), d + r, r))
     drift = np.zeros((len(known), d + r))
     drift[:, :n], drift[:, d:] = steps.drift, expected_maps(steps)[1][:, -r:]
     system = SystemSteps(
-        transition=np.concatenate([np.concatenate([known, heard], axis=1), none], axis=2),
+        transition=np.concatenate([np.concatenate([known, received], axis=1), none], axis=2),
         drift=drift,
         process=np.asarray(white),
         output=np.tile(np.eye(r, d + r, d), (len(known), 1, 1)),
@@ -113,8 +113,8 @@ def relay_side(p: Steps, moments: Float[Array, "d d"], gain: Float[Array, "Fn R"
 def _sides(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> RelaySide:
     """`relay_side` at each step."""
 
-    def one(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
+    def single(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, RelaySide]:
         p, gain = item
         return correct(step_moments(p, moments)[0], gain * p.live), relay_side(p, moments, gain)
 
-    return jax.lax.scan(one, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]
+    return jax.lax.scan(single, jnp.asarray(start), (steps, jnp.asarray(gains)))[1]

@@ -52,13 +52,13 @@ def receiver_error_design(
     """
     instance("relay network", network, RelayNetwork, "a RelayNetwork")
     check_count("sweeps", sweeps)
-    own = own_error_design(network, horizon)
-    weights = 1 / (horizon * own.trace("receiver")[1:]) if weights is None else array("weights", weights, (horizon,))
+    design = own_error_design(network, horizon)
+    weights = 1 / (horizon * design.trace("receiver")[1:]) if weights is None else array("weights", weights, (horizon,))
     if np.any(weights < 0) or sweeps < 1:
         raise fail("weights and sweeps", "no negative weight and at least one sweep", f"{np.min(weights):g}, {sweeps}")
     steps, start = network.steps(horizon), start_moments(network)
     cost = receiver_weight(weights, len(network.filters), len(network.states))
-    first = join_gains(network, own.gains)
+    first = join_gains(network, design.gains)
     if power_limit is None:
         gains = _sweeps(steps, start, cost, first, np.arange(sweeps))
     else:
@@ -90,7 +90,7 @@ def _backward(
 def _forward(steps: Steps, start: Array, gains: jax.Array, ahead: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Best gains step by step and the moments after each step."""
 
-    def one(
+    def single(
         moments: jax.Array, item: tuple[Steps, jax.Array, jax.Array]
     ) -> tuple[jax.Array, tuple[jax.Array, jax.Array]]:
         p, gain, ahead_k = item
@@ -99,7 +99,7 @@ def _forward(steps: Steps, start: Array, gains: jax.Array, ahead: jax.Array) -> 
         after = correct(z, gain)
         return after, (gain, after)
 
-    return jax.lax.scan(one, jnp.asarray(start), (steps, gains, ahead))[1]
+    return jax.lax.scan(single, jnp.asarray(start), (steps, gains, ahead))[1]
 
 
 class Search(NamedTuple):
@@ -115,7 +115,7 @@ def _sweeps(
     steps: Steps,
     start: Float[Array, "d d"],
     cost: Float[Array, "time d d"],
-    own: Float[Array, "time Fn R"],
+    local: Float[Array, "time Fn R"],
     count: Int[Array, "sweeps"],
 ) -> Float[Array, "time Fn R"]:
     """The best gains of sweeps from the own-error gains."""
@@ -127,7 +127,7 @@ def _sweeps(
         best = jnp.where(better, gains, search.best)
         return Search(gains, best, jnp.where(better, value, search.cost)), None
 
-    first = jnp.asarray(own)
+    first = jnp.asarray(local)
     value = jnp.sum(cost * propagate(steps, start, first).moments[1:])
     search, _ = jax.lax.scan(sweep, Search(first, first, value), jnp.asarray(count))
     return search.best

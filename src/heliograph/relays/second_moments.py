@@ -52,8 +52,8 @@ def linear_maps(p: Steps) -> LinearMaps:
     expects = jnp.asarray(p.gain) @ believed.reshape(
         -1, n
     )  # what each row expects to hear, as a map of its filter's estimate
-    own = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
-    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - own, sent)
+    local = jnp.einsum("rn,rnc->rc", expects, estimates[p.owner])
+    return LinearMaps(moved.reshape(d, -1), jnp.asarray(p.gain) @ sent - local, sent)
 
 
 def sent_mean(p: Steps) -> Float[jax.Array, "sent"]:
@@ -81,9 +81,9 @@ def step_moments(p: Steps, moments: Float[Array, "d d"]) -> tuple[Float[jax.Arra
 
 def correct(z: Float[Array, "z z"], gain: Float[Array, "Fn R"]) -> Float[jax.Array, "z-R z-R"]:
     """Covariance of eta+ = eta+ before corrections - (0; K) innovations."""
-    rows, heard = gain.shape
-    d = z.shape[0] - heard
-    full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, heard)), -gain])], axis=1)
+    rows, received = gain.shape
+    d = z.shape[0] - received
+    full = jnp.concatenate([jnp.eye(d), jnp.concatenate([jnp.zeros((d - rows, received)), -gain])], axis=1)
     return symmetrize(full @ z @ full.T)
 
 
@@ -98,9 +98,9 @@ def own_gain(z: Float[jax.Array, "z z"], p: Steps) -> Float[jax.Array, "Fn R"]:
 
     Source: for two alternating relays, filter-and-forward successive relays, Theorems 1 and 2.
     """
-    n, heard = p.transition.shape[-1], sum(p.received)
-    d = z.shape[0] - heard
-    gain, start = jnp.zeros((d - n, heard)), 0
+    n, received = p.transition.shape[-1], sum(p.received)
+    d = z.shape[0] - received
+    gain, start = jnp.zeros((d - n, received)), 0
     for f, length in enumerate(p.received):
         rows = slice(start, start + length)
         inner = z[d:, d:][rows, rows] + jnp.diag(1.0 - p.live[rows])  # a filter that hears nothing: solve with 1
@@ -121,26 +121,26 @@ class Propagated(NamedTuple):
 def propagate_own(steps: Steps, start: Float[Array, "d d"]) -> Propagated:
     """Each filter minimises its own next error; start is the covariance of eta at 0."""
 
-    def one(moments: jax.Array, p: Steps) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def single(moments: jax.Array, p: Steps) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         z, sent = step_moments(p, moments)
         gain = own_gain(z, p)
         after = correct(z, gain)
         return after, (gain, after, sent.power)
 
     start = jnp.asarray(start)
-    _, (gains, moments, power) = jax.lax.scan(one, start, steps)
+    _, (gains, moments, power) = jax.lax.scan(single, start, steps)
     return Propagated(gains, jnp.concatenate([start[None], moments]), power)
 
 
 def propagate(steps: Steps, start: Float[Array, "d d"], gains: Float[Array, "time Fn R"]) -> Propagated:
     """Given gains; entries of rows that hear nothing are not used."""
 
-    def one(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+    def single(moments: jax.Array, item: tuple[Steps, jax.Array]) -> tuple[jax.Array, tuple[jax.Array, ...]]:
         p, gain = item
         z, sent = step_moments(p, moments)
         after = correct(z, gain * p.live)
         return after, (after, sent.power)
 
     start, gains = jnp.asarray(start), jnp.asarray(gains)
-    _, (moments, power) = jax.lax.scan(one, start, (steps, gains))
+    _, (moments, power) = jax.lax.scan(single, start, (steps, gains))
     return Propagated(gains, jnp.concatenate([start[None], moments]), power)

@@ -126,9 +126,9 @@ def label_right(axes: Axes, ends: Mapping[str, tuple[float, str]], gap: float = 
 def legend_above(figure: Figure, axes: Axes, columns: int = 4) -> None:
     """Name the curves of `axes` above all panels, where none of them is."""
     handles, names = axes.get_legend_handles_labels()
-    own = axes.get_legend()
-    if own is not None:
-        own.remove()
+    local = axes.get_legend()
+    if local is not None:
+        local.remove()
     if names:
         figure.legend(handles, names, loc="outside upper center", ncols=min(len(names), columns), frameon=False)
 

@@ -12,7 +12,7 @@ from scipy.stats import binom
 from heliograph.disk.quoting import in_figure, visible
 from heliograph.learning.fitting import Fit
 from heliograph.learning.held_out import Change, Uniformity
-from heliograph.learning.losses import Losses
+from heliograph.learning.losses.losses import Losses
 from heliograph.learning.solution import Row
 from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PALE, STYLE, VERMILION, WIDTH, legend_above
 from heliograph.report.page import Code, KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
@@ -27,7 +27,7 @@ class Learned:
 
     network: str
     measurements: str
-    found: Fit
+    result: Fit
     learned: int
     held_out: int
     changes: list[Change]
@@ -37,37 +37,37 @@ class Learned:
     @property
     def starts(self) -> dict[str, float]:
         """Where each number began."""
-        parameters = self.found.description.parameters
+        parameters = self.result.description.parameters
         return dict(zip([e.name for e in parameters.entries], parameters.entries_at(parameters.start), strict=True))
 
 
 def fit_figures(learned: Learned) -> dict[str, Figure]:
     """Estimates; correlations of innovations before and after; pits, by file name."""
     drawn = {"estimates": _estimates(learned)}
-    tested = [one for one in learned.changes if one.before.test and one.after.test][:MOST]
+    tested = [change for change in learned.changes if change.before.test and change.after.test][:MOST]
     if tested:
         drawn["innovations"] = _correlations(tested)
-    heard = [one for one in learned.uniform if np.any(~np.isnan(one.pit))][:MOST]
-    if heard:
-        drawn["pits"] = _pits(heard)
+    received = [item for item in learned.uniform if np.any(~np.isnan(item.pit))][:MOST]
+    if received:
+        drawn["pits"] = _pits(received)
     return drawn
 
 
 @matplotlib.rc_context(STYLE)
 def _estimates(learned: Learned) -> Figure:
     """A line for each number, on a scale of its own: start, estimates of both forms, intervals."""
-    rows = learned.found.rows()[:MOST]
-    forms = [one.form for one in learned.found.solutions]
-    by_form = {form: learned.found.rows(form=form) for form in forms}
+    rows = learned.result.rows()[:MOST]
+    forms = [solution.form for solution in learned.result.solutions]
+    by_form = {form: learned.result.rows(form=form) for form in forms}
     figure = Figure(figsize=(WIDTH, 0.6 + 0.62 * len(rows)), layout="constrained")
     grid = figure.subplots(len(rows), 1, squeeze=False)[:, 0]
     for i, (axes, row) in enumerate(zip(grid, rows, strict=True)):
         for j, form in enumerate(reversed(forms)):
-            one = by_form[form][i]
+            item = by_form[form][i]
             color = BLUE if j == 0 else MUTED
-            if np.isfinite([one.low, one.high]).all():
-                axes.plot([one.low, one.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
-            axes.plot(one.estimate, -j, "o" if one.identified else "x", color=color, markersize=6)
+            if np.isfinite([item.low, item.high]).all():
+                axes.plot([item.low, item.high], [-j, -j], color=color, linewidth=3 if j == 0 else 1.5, alpha=0.7)
+            axes.plot(item.estimate, -j, "o" if item.identified else "x", color=color, markersize=6)
         axes.plot(learned.starts[row.name], 0.6, "v", color=AMBER, markersize=5, clip_on=False)
         axes.set_ylim(-len(forms) + 0.4, 0.9)
         axes.set_yticks([])
@@ -81,8 +81,8 @@ def _estimates(learned: Learned) -> Figure:
 def _correlations(tested: list[Change]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.7 + 1.6 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
-    for axes, one in zip(grid, tested, strict=True):
-        for shift, color, part, label in ((-0.17, AMBER, one.before, "before"), (0.17, BLUE, one.after, "after")):
+    for axes, item in zip(grid, tested, strict=True):
+        for shift, color, part, label in ((-0.17, AMBER, item.before, "before"), (0.17, BLUE, item.after, "after")):
             assert part.test is not None
             lags = np.arange(1, len(part.test.correlation) + 1)
             axes.bar(lags + shift, part.test.correlation, 0.3, color=color, label=label)
@@ -90,7 +90,7 @@ def _correlations(tested: list[Change]) -> Figure:
                 lags + shift, part.test.correlation, 1.96 * part.test.standard_error, fmt="none", ecolor=MUTED, lw=1
             )
         axes.axhline(0.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(f"{one.node}/{one.filter}"))
+        axes.set_title(in_figure(f"{item.node}/{item.filter}"))
         axes.set_ylabel("correlation")
         axes.set_xticks(lags)
     legend_above(figure, grid[0])
@@ -99,17 +99,17 @@ def _correlations(tested: list[Change]) -> Figure:
 
 
 @matplotlib.rc_context(STYLE)
-def _pits(heard: list[Uniformity]) -> Figure:
-    figure = Figure(figsize=(WIDTH, 0.7 + 1.5 * len(heard)), layout="constrained")
-    grid = figure.subplots(len(heard), 1, squeeze=False, sharex=True)[:, 0]
-    for axes, one in zip(grid, heard, strict=True):
-        values = one.pit[~np.isnan(one.pit)]
+def _pits(received: list[Uniformity]) -> Figure:
+    figure = Figure(figsize=(WIDTH, 0.7 + 1.5 * len(received)), layout="constrained")
+    grid = figure.subplots(len(received), 1, squeeze=False, sharex=True)[:, 0]
+    for axes, item in zip(grid, received, strict=True):
+        values = item.pit[~np.isnan(item.pit)]
         count = len(values)
         low, high = (binom.ppf(p, count, 1 / BINS) / count * BINS for p in (0.025, 0.975))
         axes.hist(values, np.linspace(0, 1, BINS + 1), weights=np.full(count, BINS / count), color=BLUE, alpha=0.8)
         axes.axhspan(low, high, color=PALE, alpha=0.6, linewidth=0, zorder=0)
         axes.axhline(1.0, color=MUTED, linewidth=0.8)
-        axes.set_title(in_figure(one.node))
+        axes.set_title(in_figure(item.node))
         axes.set_ylabel("density")
     grid[-1].set_xlabel("probability of a smaller value")
     return figure
@@ -134,33 +134,33 @@ def fit_page(learned: Learned, drawings: Mapping[str, bytes]) -> Page:
 
 
 def _finding(learned: Learned) -> str:
-    rows = learned.found.rows()
+    rows = learned.result.rows()
     return f"{sum(row.identified for row in rows)} of {len(rows)} free numbers learned from {learned.learned:,} rows"
 
 
 def _lead(learned: Learned) -> str:
     """Whether the filters foretell more of what was held out."""
     whence = f"From `{visible(learned.measurements)}`, for the network `{visible(learned.network)}`."
-    told = [(one, one.gain) for one in learned.changes if one.gain is not None]
-    if not told:
+    outputs = [(change, change.gain) for change in learned.changes if change.gain is not None]
+    if not outputs:
         return whence
-    one, gain = told[0]
+    item, gain = outputs[0]
     error = 1.96 * gain.standard_error
     what = "better" if gain.difference > error else "worse" if gain.difference < -error else "neither better nor worse"
     return (
         f"On the {learned.held_out:,} rows after these, which it was not given, the filter "
-        f"{visible(f'{one.node}/{one.filter}')} predicts {what} with the learned numbers than with those before: its "
+        f"{visible(f'{item.node}/{item.filter}')} predicts {what} with the learned numbers than with those before: its "
         f"log-likelihood changes by {gain.difference:+.3f} ± {error:.3f} a row. {whence}"
     )
 
 
 def _glance(learned: Learned) -> list[KeyFigures]:
-    told = [row for row in learned.found.rows() if row.identified]
+    outputs = [row for row in learned.result.rows() if row.identified]
     keys = [
-        KeyFigure("numbers learned", f"{len(told)}", f"of {len(learned.found.rows())} free ones", BLUE),
+        KeyFigure("numbers learned", f"{len(outputs)}", f"of {len(learned.result.rows())} free ones", BLUE),
         KeyFigure("rows", f"{learned.learned:,}", f"learned from; {learned.held_out:,} held out", GREEN),
     ]
-    gains = [one.gain for one in learned.changes if one.gain is not None]
+    gains = [change.gain for change in learned.changes if change.gain is not None]
     if gains:
         first = gains[0]
         note = f"held-out log-likelihood per row, ± {1.96 * first.standard_error:.3f}"
@@ -172,7 +172,7 @@ def _table(learned: Learned, drawings: Mapping[str, bytes]) -> list[Picture | Ta
     starts = learned.starts
     rows = [
         [visible(row.name), f"{starts[row.name]:.4g}", f"{row.estimate:.4g}", _interval(row), row.form]
-        for row in learned.found.table
+        for row in learned.result.table
     ]
     caption = (
         "95 % intervals that allow for scores that are correlated over time (long-run variance by cosines). **Form**: "
@@ -197,7 +197,7 @@ def _interval(row: Row) -> str:
 
 
 def _words(learned: Learned) -> list[Points | Text]:
-    said = learned.found.sentences
+    said = learned.result.sentences
     if said:
         return [Points([visible(line) for line in said])]
     return [Text(["All free numbers are identified, all starts ended at one maximum, and none is at a boundary."])]
@@ -207,12 +207,14 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
     if not learned.changes:
         return []
     rows = []
-    for one in learned.changes:
-        test = [part.test for part in (one.before, one.after)]
+    for change in learned.changes:
+        test = [part.test for part in (change.before, change.after)]
         sizes = ["–" if t is None else f"{t.power:.2f} ± {1.96 * t.power_error:.2f}" for t in test]
         memory = ["–" if t is None else f"{t.correlation[0]:.2f} (p {t.p_value:.2g})" for t in test]
-        gain = "–" if one.gain is None else f"{one.gain.difference:+.3f} ± {1.96 * one.gain.standard_error:.3f}"
-        rows.append([visible(f"{one.node}/{one.filter}"), gain, *sizes, *memory])
+        gain = (
+            "–" if change.gain is None else f"{change.gain.difference:+.3f} ± {1.96 * change.gain.standard_error:.3f}"
+        )
+        rows.append([visible(f"{change.node}/{change.filter}"), gain, *sizes, *memory])
     headers = ["filter", "gain per row", "size before", "size after", "correlation before", "correlation after"]
     caption = (
         f"On the {learned.held_out:,} rows that were not learned from. **Gain**: of log-likelihood, nats per row, with "
@@ -230,7 +232,7 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
             "all are equally likely: 95 % of the bars end in the grey band. High in the middle: the network expects "
             "too much spread; high at the ends: too little."
         )
-        kinds = {one.by_law for one in learned.uniform}
+        kinds = {item.by_law for item in learned.uniform}
         how = (
             "The laws of the gains are used in full."
             if kinds == {True}
@@ -243,12 +245,12 @@ def _before_and_after(learned: Learned, drawings: Mapping[str, bytes]) -> list[S
 def _losses(learned: Learned) -> list[Section]:
     """How measurements were lost, where some were."""
     rows = []
-    for node, found in learned.losses.items():
-        for name, law in found.laws.items():
-            said = found.held_out.get(name)
+    for node, loss in learned.losses.items():
+        for name, law in loss.laws.items():
+            said = loss.held_out.get(name)
             gain = "–" if said is None else f"{said.gain:+.4f} ± {1.96 * said.gain_error:.4f}"
             shares = [f"{key} {s.estimate:.3g} ({s.low:.3g} to {s.high:.3g})" for key, s in law.shares().items()]
-            best = "best" if name == found.best else ""
+            best = "best" if name == loss.best else ""
             rows.append([visible(node), name, "; ".join(shares[:4]) + (" …" if len(shares) > 4 else ""), gain, best])
     caption = (
         "Laws of the losses that the receiver is told of, with 95 % intervals, and what each predicts of the last "

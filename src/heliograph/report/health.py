@@ -7,8 +7,8 @@ import numpy as np
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.simulation.network import FUSED, Network
-from heliograph.simulation.record import Record
-from heliograph.simulation.whiteness import MemoryTest, memory_of, whitened_innovations
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.whiteness import MemoryTest, memory_of, whitened_innovations
 
 LAGS = 10  # of the test for memory, with ten rows for each at least
 SURE = 2.58  # standard errors: one warning in a hundred is a false one
@@ -69,15 +69,15 @@ class Health:
                 lines.append(
                     f"{name} is missing in {1 - link.share:.1%} of the rows; the network says that it is never lost"
                 )
-        for one in self.filters:
-            lines += _doubts(one)
+        for filter_ in self.filters:
+            lines += _doubts(filter_)
         return lines
 
 
-def _doubts(one: Listening) -> Iterator[str]:
-    if one.test is None:
+def _doubts(item: Listening) -> Iterator[str]:
+    if item.test is None:
         return
-    name, test = f"{one.node}/{one.filter}", one.test
+    name, test = f"{item.node}/{item.filter}", item.test
     if test.power > 1 + SURE * test.power_error:
         yield (
             f"{name} is too sure: the mean square of its innovations is {test.power:.2f} times what it claims; "
@@ -85,7 +85,7 @@ def _doubts(one: Listening) -> Iterator[str]:
         )
     elif test.power < 1 - SURE * test.power_error:
         yield f"{name} is too cautious: the mean square of its innovations is {test.power:.2f} times what it claims"
-    if test.found:
+    if test.result:
         yield (
             f"{name} could know more: its innovations are correlated over one step ({test.correlation[0]:.2f}); "
             "links or the plant remember what the model forgets"
@@ -96,10 +96,10 @@ def examine(
     network: Network, record: Record, inputs: np.ndarray, advance: Callable[[str], object] = lambda what: None
 ) -> Health:
     """Judge links and filters of a recording that was run through the network."""
-    heard = record.measurements
+    received = record.measurements
     links = []
-    for node in heard:
-        z, place = heard[node], network.nodes[node]
+    for node in received:
+        z, place = received[node], network.nodes[node]
         for i, name in enumerate(place.received_names):
             there = ~np.isnan(z[:, i])
             links.append(Link(node, name, there, z[there, i], not place.complete))

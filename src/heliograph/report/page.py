@@ -71,7 +71,7 @@ class Judged:
     text: str
     source: str
     printed: str
-    found: str
+    result: str
     verdict: str
 
     @property
@@ -90,7 +90,7 @@ class Statements:
     @property
     def judged(self) -> list[Judged]:
         """By verdict, else in their own order."""
-        return sorted(self.statements, key=lambda one: list(VERDICTS).index(one.verdict))
+        return sorted(self.statements, key=lambda item: list(VERDICTS).index(item.verdict))
 
 
 @dataclass(frozen=True)
@@ -145,15 +145,15 @@ class Page:
 
 def environment() -> Environment:
     """Where the templates of this room are found; everything that they are given is escaped."""
-    found = Environment(
+    result = Environment(
         loader=PackageLoader("heliograph.report", "."),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    found.filters["rich"] = rich
-    return found
+    result.filters["rich"] = rich
+    return result
 
 
 def rich(text: str) -> Markup:

@@ -51,10 +51,10 @@ def write_results(
         import_module(name)
     check_replaceable(target, SUMMARY)
     with progress(stages + 1) as advance, whole_folder(target) as folder:
-        found = compute(advance)
+        result = compute(advance)
         advance("drawing and writing")
-        _write(tell(found), folder)
-    return found
+        _write(tell(result), folder)
+    return result
 
 
 def report_results(

@@ -14,7 +14,7 @@ from heliograph.report.figures import AMBER, BLUE, GREEN, MUTED, PURPLE, STYLE, 
 from heliograph.report.health import Health, Listening
 from heliograph.report.page import KeyFigure, KeyFigures, Page, Picture, Points, Section, Table, Text
 from heliograph.report.results import Json, Results
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 COLOURS = (BLUE, VERMILION, GREEN, PURPLE, AMBER)
 MOST = 8  # nodes, filters and links that are drawn; tables and summary hold all
@@ -46,7 +46,7 @@ def _nodes(record: Record) -> list[str]:
 
 
 def _tested(health: Health) -> list[Listening]:
-    return [one for one in health.filters if one.white is not None][:MOST]
+    return [filter_ for filter_ in health.filters if filter_.white is not None][:MOST]
 
 
 @matplotlib.rc_context(LOOK)
@@ -63,13 +63,13 @@ def _estimates(health: Health, record: Record, node: str) -> Figure:
 def _innovations(health: Health, tested: list[Listening]) -> Figure:
     figure = Figure(figsize=(WIDTH, 0.6 + 1.5 * len(tested)), layout="constrained")
     grid = figure.subplots(len(tested), 1, squeeze=False, sharex=True)[:, 0]
-    for axes, one in zip(grid, tested, strict=True):
-        white = np.asarray(one.white)
+    for axes, item in zip(grid, tested, strict=True):
+        white = np.asarray(item.white)
         for i, component in enumerate(white.T):
             axes.plot(health.record.time, component, ".", markersize=3, color=COLOURS[i % len(COLOURS)])
         for level in (-BAND, BAND):
             axes.axhline(level, color=MUTED, linewidth=0.8, linestyle=(0, (4, 1.6)))
-        axes.set_title(in_figure(f"{one.node}/{one.filter}"))
+        axes.set_title(in_figure(f"{item.node}/{item.filter}"))
         axes.set_ylabel("in deviations")
     _time_axis(health, grid[-1])
     return figure
@@ -112,8 +112,8 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
     estimates = [
         Picture(drawings[f"{kind}_{i}"], f"Estimates of {visible(node)} over time with bands{added}",
                 f"{visible(node)}: estimates with bands of {BAND:g} claimed standard deviations on each side{added}.")
-        for kind, each, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
-        for i, node in enumerate([] if each is None else _nodes(each))
+        for kind, item, added in (("estimates", record, ""), ("smoothed", record.smoothed, ", given later data too"))
+        for i, node in enumerate([] if item is None else _nodes(item))
     ]  # fmt: skip
     return Page(
         kicker="Heliograph run",
@@ -134,9 +134,9 @@ def run_page(health: Health, network: str, drawings: Mapping[str, bytes]) -> Pag
 def _agreement(health: Health, doubts: list[str]) -> str:
     if doubts:
         return f"The recording speaks against the network in {_counted(len(doubts), 'way')}."
-    tested = any(one.test is not None for one in health.filters)
-    found = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
-    return f"Nothing is lost that the network says cannot be lost, and {found}."
+    tested = any(filter_.test is not None for filter_ in health.filters)
+    result = "the tests of the innovations find nothing" if tested else "there are too few rows to test innovations"
+    return f"Nothing is lost that the network says cannot be lost, and {result}."
 
 
 def _counted(count: int, what: str) -> str:
@@ -155,16 +155,16 @@ def _warned(doubts: list[str]) -> list[Points | Text]:
 
 def _tests(health: Health, drawings: Mapping[str, bytes]) -> list[Text | Table | Picture]:
     rows = []
-    for one in health.filters:
-        test, name = one.test, visible(f"{one.node}/{one.filter}")
+    for filter_ in health.filters:
+        test, name = filter_.test, visible(f"{filter_.node}/{filter_.filter}")
         if test is None:
-            rows.append([name, one.claim, "–", "–", "–"])
+            rows.append([name, filter_.claim, "–", "–", "–"])
         else:
             size = f"{test.power:.2f} ± {1.96 * test.power_error:.2f}"
             rows.append(
                 [
                     name,
-                    one.claim,
+                    filter_.claim,
                     size,
                     f"{test.correlation[0]:.2f} ± {1.96 * test.standard_error[0]:.2f}",
                     f"{test.p_value:.3f}",
@@ -188,9 +188,9 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
     rows = []
     for link in health.links:
         mean, deviation = (f"{link.values.mean():.4g}", f"{link.values.std():.4g}") if len(link.values) else ("–", "–")
-        told = "may be lost" if link.loses else "never lost"
+        known = "may be lost" if link.loses else "never lost"
         name = visible(f"{link.node}: {link.component}")
-        rows.append([name, f"{link.share:.1%}", str(link.longest_gap), told, mean, deviation])
+        rows.append([name, f"{link.share:.1%}", str(link.longest_gap), known, mean, deviation])
     headers = ["received", "arrived", "longest gap (rows)", "the network says", "mean", "std. deviation"]
     caption = "When each component arrived (blue, above) and when it did not (red, below)."
     picture = [Picture(drawings["links"], caption, caption)] if "links" in drawings else []
@@ -200,16 +200,16 @@ def _health(health: Health, drawings: Mapping[str, bytes]) -> list[Table | Pictu
 def run_summary(health: Health) -> dict[str, Json]:
     """All numbers of the page, by node and filter, and by node and component."""
     filters: dict[str, dict[str, Json]] = {}
-    for one in health.filters:
-        found: dict[str, Json] = {"claim": one.claim}
-        if one.test is not None:
-            found |= {
-                "size": one.test.power,
-                "size_error": one.test.power_error,
-                "correlation": float(one.test.correlation[0]),
-                "p_value": one.test.p_value,
+    for filter_ in health.filters:
+        results: dict[str, Json] = {"claim": filter_.claim}
+        if filter_.test is not None:
+            results |= {
+                "size": filter_.test.power,
+                "size_error": filter_.test.power_error,
+                "correlation": float(filter_.test.correlation[0]),
+                "p_value": filter_.test.p_value,
             }
-        filters.setdefault(one.node, {})[one.filter] = found
+        filters.setdefault(filter_.node, {})[filter_.filter] = results
     links: dict[str, dict[str, Json]] = {}
     for link in health.links:
         links.setdefault(link.node, {})[link.component] = {"arrived": link.share, "longest_gap": link.longest_gap}

@@ -18,32 +18,32 @@ from .output import (
     Estimates as Estimates,
     Output as Output,
     Refused as Refused,
-    Told as Told,
+    FilterOutput as FilterOutput,
 )
-from .nowhere import (
-    Nowhere as Nowhere,
+from .storage.in_memory_store import (
+    InMemoryStore as InMemoryStore,
 )
-from .store import (
+from .storage.store import (
     Store as Store,
 )
-from .whose import (
+from .storage.identity import (
     identity as identity,
 )
-from .transport import (
+from .brokers.transport import (
     Batch as Batch,
     Transport as Transport,
 )
-from .pipe import (
+from .brokers.pipe import (
     Pipe as Pipe,
 )
-from .url import (
+from .brokers.url import (
     Address as Address,
     address as address,
 )
-from .broker import (
+from .brokers.broker import (
     connected as connected,
 )
-from .partition import (
+from .brokers.partition import (
     Part as Part,
     part_of as part_of,
     word as word,
@@ -52,11 +52,11 @@ from .loop import (
     keep_running as keep_running,
     serve_until as serve_until,
 )
-from .contract import (
+from .brokers.contract import (
     Broker as Broker,
     check_transport as check_transport,
 )
-from .replay import (
+from .brokers.replay import (
     Link as Link,
     along as along,
     lines as lines,

@@ -32,7 +32,7 @@ class Options(NamedTuple):
     capacity: int = 1000
 
 
-class Settled(NamedTuple):
+class Finalised(NamedTuple):
     """A plant's rows that are final now, and its newest; `left`: slots to give back when these were read."""
 
     plant: Plant
@@ -121,13 +121,13 @@ class Fleet:
         self.pool.give(plant.undo())
         plant.now = now
 
-    def settle(self, touched: Iterable[Plant], all_: bool = False) -> list[Settled]:
+    def finalise(self, touched: Iterable[Plant], all_: bool = False) -> list[Finalised]:
         """Step what is due, and let what is older than the window, or all, become final."""
         plants = list(touched)
         self.step(plants)
         back = -np.inf if all_ else self.options.window
-        ends = [(plant, *plant.settle(plant.now - back)) for plant in plants]
-        return [Settled(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
+        ends = [(plant, *plant.finalise(plant.now - back)) for plant in plants]
+        return [Finalised(plant, final, plant.rows.held[-1], left) for plant, final, left in ends]
 
     def step(self, plants: Iterable[Plant]) -> None:
         """Step what is due, for all plants at once."""
@@ -148,15 +148,15 @@ class Fleet:
         slots = [self._blank if plant is None else plant.rows.held[-1].slot for plant in plants]
         return self.pool.trial(np.array(slots), given, self._end)
 
-    def told(self, slots: list[int]) -> list[list[float]]:
+    def outputs(self, slots: list[int]) -> list[list[float]]:
         """What the filters told after the rows in these slots."""
-        found: list[list[float]] = self.pool.table[slots, self.pool.told].tolist() if slots else []
-        return found
+        results: list[list[float]] = self.pool.table[slots, self.pool.outputs].tolist() if slots else []
+        return results
 
-    def forget(self, settled: Iterable[Settled]) -> None:
+    def forget(self, converged: Iterable[Finalised]) -> None:
         """Give slots back, once what was told there is read."""
-        for each in settled:
-            self.pool.give(each.left)
+        for item in converged:
+            self.pool.give(item.left)
 
 
 def _checked(options: Options) -> Options:
@@ -173,9 +173,9 @@ def _rounds(chains: Iterable[list[HeldRow]], by_steps: bool) -> list[Round]:
     rounds: list[Round] = []
     for chain in chains:
         turn = 0
-        for one, two in pairwise(chain):
-            before, last = one.slot, two.key[0]
-            for at in range(int(one.key[0]) + 1, int(last) + 1) if by_steps else (last,):
+        for item, two in pairwise(chain):
+            before, last = item.slot, two.key[0]
+            for at in range(int(item.key[0]) + 1, int(last) + 1) if by_steps else (last,):
                 if turn == len(rounds):
                     rounds.append(([], [], []))
                 rounds[turn][0].append(before)

@@ -34,8 +34,8 @@ class Judges:
         central = _columns([place for place in places if place.node == FUSED])
         self._columns = {}
         for place, name in enumerate(fleet.network.names):
-            own = _columns([one for one in places if one.node == name and _listens(fleet, one)])
-            self._columns[place] = own if len(own) else central
+            local = _columns([single for single in places if single.node == name and _listens(fleet, single)])
+            self._columns[place] = local if len(local) else central
         self._every = _columns(places)
 
     def implausible_inputs(
@@ -44,8 +44,8 @@ class Judges:
         """Why inputs are implausible, by the prediction over one step or one unit of time that they lead to."""
         if not plants:
             return []
-        told = self.fleet.trial(plants, given)
-        return [why_inputs(row[self._every]) for row in told]
+        outputs = self.fleet.trial(plants, given)
+        return [why_inputs(row[self._every]) for row in outputs]
 
     def implausible(self, taken: Sequence[Candidate]) -> dict[int, str]:
         """Why each of these is implausible, by its place among them, those that are.
@@ -56,23 +56,23 @@ class Judges:
         if not taken:
             return {}
         pool = self.fleet.pool
-        told = pool.table[[one.row.slot for one in taken], pool.told]
-        flagged = (told[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
-        found, spoilt = dict[int, str](), dict[str, int]()
+        outputs = pool.table[[item.row.slot for item in taken], pool.outputs]
+        flagged = (outputs[:, self._every[:, FLAGS]] > 0).any(axis=(1, 2))
+        result, spoilt = dict[int, str](), dict[str, int]()
         for i in np.flatnonzero(flagged).tolist():
-            one = taken[i]
-            if one.event.place >= 0:
-                why = why_values(told[i][self._columns[one.event.place]]) if _size(one.event) >= 0 else None
-            elif why := why_inputs(told[i][self._every]):
-                first = spoilt.setdefault(one.plant.name, i)
-                spoilt[one.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
+            item = taken[i]
+            if item.event.place >= 0:
+                why = why_values(outputs[i][self._columns[item.event.place]]) if _size(item.event) >= 0 else None
+            elif why := why_inputs(outputs[i][self._every]):
+                first = spoilt.setdefault(item.plant.name, i)
+                spoilt[item.plant.name] = min(first, i, key=lambda j: taken[j].row.key)
             if why:
-                found[i] = why
+                result[i] = why
         largest: dict[tuple[int, int], int] = {}
-        for i in found:
+        for i in result:
             place = taken[i].row.slot, taken[i].event.place
             largest[place] = max(largest.get(place, i), i, key=lambda j: _size(taken[j].event))
-        first_of_plant = {i: why for i, why in found.items() if spoilt.get(taken[i].plant.name, i) == i}
+        first_of_plant = {i: why for i, why in result.items() if spoilt.get(taken[i].plant.name, i) == i}
         return {i: why for i, why in first_of_plant.items() if i in largest.values()}
 
 
@@ -83,8 +83,8 @@ def _size(event: Known) -> float:
 
 def _columns(places: Sequence[Place]) -> np.ndarray:
     """Where the judgements of these filters stand, (filter, part)."""
-    found = [list(place.judgement) for place in places if place.judgement is not None]
-    return np.array(found, dtype=int).reshape(-1, len(Judgement._fields))
+    results = [list(place.judgement) for place in places if place.judgement is not None]
+    return np.array(results, dtype=int).reshape(-1, len(Judgement._fields))
 
 
 def _listens(fleet: Fleet, place: Place) -> bool:

@@ -10,17 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.live.mould import Mould, cast
+from heliograph.live.history import NetworkStep
 from heliograph.live.player import player
-from heliograph.live.tape import Ears
+from heliograph.live.static import Static, cast
 from heliograph.model.estimate import Claim
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.types import Float, PyTree
 from heliograph.serving.flat import Flat, flat_like, row_of
-from heliograph.simulation.by_name import by_name
 from heliograph.simulation.judging import implausible
 from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.results.by_name import by_name
 from heliograph.simulation.stepping import AllFilters
 
 TOGETHER = 16  # lanes of one turn of the loop: they fill the vectors of a processor
@@ -65,14 +65,14 @@ class Lanes:
         self.network, self.dt, self.uneven = network, shared.dt, shared.uneven
         self.received, self.given, self.inputs = shared.received, shared.given, len(network.inputs)
         with jax.enable_x64(True):
-            ears = Ears(network, AllFilters(network, judges=True))
-            self._numbers, mould = cast(ears)
+            network_step = NetworkStep(network, AllFilters(network, judges=True))
+            self._numbers, static = cast(network_step)
             self.state, self.start = flat_like(shared.start), np.asarray(row_of(shared.start))
             row = shared.start, np.zeros(self.received), np.zeros(self.inputs), np.asarray(0)
-            like = jax.eval_shape(lambda numbers, *row: mould.filled(numbers).judged(*row)[1], self._numbers, *row)
-        self.told = flat_like(like)
+            like = jax.eval_shape(lambda numbers, *row: static.filled(numbers).judged(*row)[1], self._numbers, *row)
+        self.outputs = flat_like(like)
         self.places = self._places()
-        self._run = _program(mould, self.state, self.told, self.received, self.inputs)
+        self._run = _program(static, self.state, self.outputs, self.received, self.inputs)
 
     def program(self) -> str:
         """What is computed, as a text on which two processes agree."""
@@ -86,22 +86,22 @@ class Lanes:
 
     def step(self, rows: Float[np.ndarray, "lane column"]) -> Float[np.ndarray, "lane column"]:
         """Step each row; (state, told) of each."""
-        done = np.empty((len(rows), self.state.size + self.told.size))
+        done = np.empty((len(rows), self.state.size + self.outputs.size))
         filled = np.zeros((WIDTH, self._columns))
         for begin in range(0, len(rows), WIDTH):
             count = min(WIDTH, len(rows) - begin)
             filled[:count] = rows[begin : begin + count]
             with jax.enable_x64(True):
-                found = self._run(self._numbers, filled, np.int32(-(-count // TOGETHER)))
-            done[begin : begin + count] = np.asarray(found)[:count]
+                result = self._run(self._numbers, filled, np.int32(-(-count // TOGETHER)))
+            done[begin : begin + count] = np.asarray(result)[:count]
         return done
 
     def _places(self) -> tuple[Place, ...]:
         """Where each number is told: a row of the numbers of its columns is named as a row of estimates would be."""
-        found = jax.tree.map(lambda leaf: leaf.astype(int), self.told.tree(np.arange(float(self.told.size))))
-        mean = by_name(self.network, found, lambda part: np.asarray(part.mean), -3)
-        covariance = by_name(self.network, found, lambda part: np.asarray(part.covariance), -4)
-        judged = self._judged(found)
+        result = jax.tree.map(lambda leaf: leaf.astype(int), self.outputs.tree(np.arange(float(self.outputs.size))))
+        mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
+        covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
+        judged = self._judged(result)
         return tuple(
             Place(node, name, claim, int(mean[node][name].flat[0]), int(covariance[node][name].flat[0]),
                   judged[node].get(name))
@@ -109,16 +109,16 @@ class Lanes:
             for name, claim in filters.items()
         )  # fmt: skip
 
-    def _judged(self, found: PyTree) -> dict[str, dict[str, JudgementAt]]:
+    def _judged(self, outcome: PyTree) -> dict[str, dict[str, JudgementAt]]:
         """By node and filter where each part of a judgement stands."""
-        own = {"estimates": found["judged"], "fused": {}}
-        parts = [by_name(self.network, own, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
+        local = {"estimates": outcome["judged"], "fused": {}}
+        parts = [by_name(self.network, local, partial(_part, i), -2) for i in range(len(JudgementAt._fields))]
         result = {
             node: {name: JudgementAt(*(int(part[node][name]) for part in parts)) for name in filters}
             for node, filters in parts[0].items()
         }
-        central = found["judged_centrally"]
-        return result | {FUSED: {name: JudgementAt(*(int(part) for part in one)) for name, one in central.items()}}
+        central = outcome["judged_centrally"]
+        return result | {FUSED: {name: JudgementAt(*(int(part) for part in item)) for name, item in central.items()}}
 
 
 def _part(i: int, judged: PyTree) -> np.ndarray:
@@ -126,11 +126,11 @@ def _part(i: int, judged: PyTree) -> np.ndarray:
 
 
 @lru_cache
-def _program(mould: Mould, state: Flat, told: Flat, received: int, inputs: int) -> PyTree:
+def _program(static: Static, state: Flat, outputs: Flat, received: int, inputs: int) -> PyTree:
     """(numbers, rows, turns) to rows: a loop over TOGETHER lanes, so that what is computed does not depend on turns."""
 
     def run(numbers: list[jax.Array], rows: jax.Array, turns: jax.Array) -> jax.Array:
-        item: Ears = mould.filled(numbers)
+        item: NetworkStep = static.filled(numbers)
 
         def parts(row: jax.Array) -> tuple[PyTree, jax.Array, jax.Array, jax.Array]:
             known, rest = row[: state.size], row[state.size :]
@@ -138,11 +138,11 @@ def _program(mould: Mould, state: Flat, told: Flat, received: int, inputs: int) 
             return state.tree(known), rest[:received], u, k
 
         def judged(row: jax.Array) -> tuple[jax.Array, jax.Array]:
-            after, found = item.judged(*parts(row))
-            return jnp.concatenate([row_of(after), row_of(found)]), implausible(found)
+            after, result = item.judged(*parts(row))
+            return jnp.concatenate([row_of(after), row_of(result)]), implausible(result)
 
         def without(row: jax.Array, stepped: jax.Array) -> jax.Array:
-            first = state.tree(stepped[: state.size]), told.tree(stepped[state.size :])
+            first = state.tree(stepped[: state.size]), outputs.tree(stepped[state.size :])
             return jnp.concatenate([row_of(part) for part in item.without(first, *parts(row))])
 
         def turn(i: jax.Array, done: jax.Array) -> jax.Array:

@@ -6,8 +6,8 @@ from collections.abc import Coroutine, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Protocol, TypeVar
 
+from heliograph.serving.brokers.transport import Transport
 from heliograph.serving.output import Output
-from heliograph.serving.transport import Transport
 
 T = TypeVar("T")
 PATIENCE = (

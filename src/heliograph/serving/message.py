@@ -18,7 +18,7 @@ Date = Annotated[
     WithJsonSchema({"type": "string", "format": "date-time"}),
 ]
 Moment = float | Date
-WANTED = {
+EXPECTED = {
     "plant": "a name of at most 200 characters, without NUL",
     "node": "a name of at most 200 characters, without NUL",
     "sequence": "a whole number from 0 to 2^63 - 1",
@@ -64,11 +64,11 @@ def read_message(payload: bytes) -> Message:
     except ValidationError as error:
         first = error.errors(include_url=False, include_context=False)[0]
         part = str(first["loc"][0]) if first["loc"] else ""
-        if part not in WANTED:  # no JSON object, or one with a field more
-            fields = f"a JSON object with no fields but {', '.join(WANTED)}"
+        if part not in EXPECTED:  # no JSON object, or one with a field more
+            fields = f"a JSON object with no fields but {', '.join(EXPECTED)}"
             raise fail("message", fields, shown(part) if part else f"{shown(payload)} ({first['msg']})") from None
         came = "no such field" if first["type"] == "missing" else shown(first["input"])
-        raise fail(f"message, {part}", WANTED[part], came) from None
+        raise fail(f"message, {part}", EXPECTED[part], came) from None
 
 
 def seconds(moment: float | datetime, origin: datetime | None, plant: str) -> float:

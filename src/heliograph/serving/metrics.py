@@ -51,7 +51,7 @@ def _surprises(watch: Watch) -> Iterable[Metric]:
     )
     low = GaugeMetricFamily("heliograph_nis_low", "Least that is expected of an honest filter.", labels=labels)
     high = GaugeMetricFamily("heliograph_nis_high", "Most that is expected of an honest filter.", labels=labels)
-    for key, one in watch.surprises.items():
-        for metric, value in zip((ratio, low, high), (one.ratio, *one.band()), strict=True):
+    for key, item in watch.surprises.items():
+        for metric, value in zip((ratio, low, high), (item.ratio, *item.band()), strict=True):
             metric.add_metric(list(key), value)
     return ratio, low, high

@@ -18,14 +18,14 @@ class Output(NamedTuple):
     body: bytes
 
 
-class Told(BaseModel):
+class FilterOutput(BaseModel):
     """What one filter knows; null where a number is none."""
 
     mean: list[float | None]
     covariance: list[list[float | None]] | None = Field(description="Null of a filter that claims none.")
     claim: Claim = Field(description="What the covariance is: exact, upper, nominal, or none.")
     nis: float | None = Field(None, description="Normalised innovation squared of what was heard; null if nothing was.")
-    heard: int = Field(0, description="How many numbers were heard: what nis should be on average.")
+    received: int = Field(0, description="How many numbers were heard: what nis should be on average.")
     implausible: str = Field("", description="Why this filter alone did not use what was heard, where it did not.")
 
 
@@ -36,7 +36,7 @@ class Estimates(BaseModel):
     kind: Literal["provisional", "final"] = Field(description="Provisional ones may change by what comes late.")
     plant: str
     time: float | str
-    estimates: dict[str, dict[str, Told]]
+    estimates: dict[str, dict[str, FilterOutput]]
 
 
 class Refused(BaseModel):

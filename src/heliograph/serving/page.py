@@ -108,9 +108,9 @@ async def _events(watch: Watch, request: Request) -> AsyncIterator[str]:
     while not await request.is_disconnected():
         view = await asyncio.to_thread(watch.view, plant, since)
         plant, since = view["plant"] if view["points"] else plant, view["newest"]
-        told = json.dumps(view)
-        yield f"data: {told}\n\n" if told != before else ": \n\n"
-        before = told
+        known = json.dumps(view)
+        yield f"data: {known}\n\n" if known != before else ": \n\n"
+        before = known
         await asyncio.sleep(EVERY)
 
 
@@ -124,12 +124,12 @@ class Guarded:
         if scope["type"] != "http" or self.token is None:
             await self.app(scope, receive, send)
             return
-        asked = HTTPConnection(scope)
-        if self._is(asked.query_params.get("token", "")):
+        requested = HTTPConnection(scope)
+        if self._is(requested.query_params.get("token", "")):
             answer: Response = RedirectResponse("/", 303)
             answer.set_cookie("heliograph", self.token, httponly=True, samesite="strict")
             await answer(scope, receive, send)
-        elif self._is(asked.cookies.get("heliograph", "")) or self._is(_bearer(asked)):
+        elif self._is(requested.cookies.get("heliograph", "")) or self._is(_bearer(requested)):
             await self.app(scope, receive, send)
         else:
             await PlainTextResponse("a token is needed: ?token=", 401)(scope, receive, send)
@@ -138,8 +138,8 @@ class Guarded:
         return hmac.compare_digest(given.encode(), str(self.token).encode())
 
 
-def _bearer(asked: HTTPConnection) -> str:
-    kind, _, token = asked.headers.get("authorization", "").partition(" ")
+def _bearer(requested: HTTPConnection) -> str:
+    kind, _, token = requested.headers.get("authorization", "").partition(" ")
     return token if kind.lower() == "bearer" else ""
 
 

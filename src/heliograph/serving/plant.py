@@ -108,10 +108,10 @@ class Plant:
 
     def link(self, node: str) -> Link:
         """The tally of a node."""
-        found = self.links.get(node)
-        if found is None:
-            found = self.links[node] = Link()
-        return found
+        result = self.links.get(node)
+        if result is None:
+            result = self.links[node] = Link()
+        return result
 
     def chain(self) -> list[HeldRow]:
         """The rows to step over again, after the one that they begin from."""
@@ -119,10 +119,10 @@ class Plant:
         self.dirty = None
         return chain
 
-    def settle(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
+    def finalise(self, watermark: float) -> tuple[list[HeldRow], list[int]]:
         """The rows that are final once this is the watermark, and the slots that are not needed any more."""
         self.changes = []
-        base, forced = self.rows.settle(watermark)
+        base, forced = self.rows.finalise(watermark)
         if not base:
             return [], []
         self.forced += forced

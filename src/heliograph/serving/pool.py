@@ -15,8 +15,8 @@ class Pool:
 
     def __init__(self, lanes: Lanes):
         self.lanes = lanes
-        ends = np.cumsum([lanes.state.size, lanes.told.size, lanes.given, 1, lanes.received + lanes.given + 1])
-        self.state, self.told, self.held, self.at, self.numbers = (
+        ends = np.cumsum([lanes.state.size, lanes.outputs.size, lanes.given, 1, lanes.received + lanes.given + 1])
+        self.state, self.outputs, self.held, self.at, self.numbers = (
             slice(int(begin), int(end)) for begin, end in zip([0, *ends], ends, strict=False)
         )
         self.table = np.zeros((FEWEST, int(ends[-1])))
@@ -63,15 +63,15 @@ class Pool:
         """
         lanes, table = self.lanes, self.table
         numbers, held = table[after, self.numbers], table[before, self.held]
-        heard, given = numbers[:, : lanes.received], numbers[:, lanes.received : -1]
+        received, given = numbers[:, : lanes.received], numbers[:, lanes.received : -1]
         now_held = np.where(np.isnan(given), held, given)
         if lanes.dt is None:
             there = (at == numbers[:, -1])[:, None]
-            heard, u = np.where(there, heard, np.nan), np.where(there, now_held, held)
+            received, u = np.where(there, received, np.nan), np.where(there, now_held, held)
             now_held, k = u, at
         else:
             u = np.insert(held, lanes.dt, numbers[:, -1] - table[before, -1], axis=1)
             k = table[before, self.at.start] + 1
-        done = lanes.step(np.concatenate([table[before, self.state], heard, u, k[:, None]], axis=1))
-        table[after, : self.told.stop] = done
+        done = lanes.step(np.concatenate([table[before, self.state], received, u, k[:, None]], axis=1))
+        table[after, : self.outputs.stop] = done
         table[after, self.held], table[after, self.at.start] = now_held, k

@@ -11,18 +11,18 @@ from pathlib import Path
 from shlex import quote
 
 from heliograph.numerics.check import check_count, fail
-from heliograph.serving.broker import connected
+from heliograph.serving.brokers.broker import connected
+from heliograph.serving.brokers.partition import Part
+from heliograph.serving.brokers.pipe import Pipe
+from heliograph.serving.brokers.url import Address
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.keeping import Damage, Keeps
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import Takes, serve_until, signals
-from heliograph.serving.nowhere import Nowhere
-from heliograph.serving.partition import Part
-from heliograph.serving.pipe import Pipe
 from heliograph.serving.service import Service
 from heliograph.serving.sharing import keep_sharing
-from heliograph.serving.url import Address
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store_protocol import Damage, StoreProtocol
 from heliograph.simulation.network import Network
 
 NOTHING = "none"  # the store that keeps nothing
@@ -30,7 +30,7 @@ LISTED = 10  # damaged plants in one line
 
 
 @dataclass(frozen=True)
-class Wanted:
+class ServiceSettings:
     """What a service is to be; `parts`: how many parts of the plants several processes share among them;
     `anew`: names of plants that begin anew.
 
@@ -75,77 +75,77 @@ def store_of(network: str, given: str | None, parts: int | None) -> str | None:
     return f"{stem}{name}.db"
 
 
-async def run(wanted: Wanted) -> None:
+async def run(settings: ServiceSettings) -> None:
     """Serve until the messages end, or until SIGTERM or SIGINT."""
-    async with _watched(wanted) as look:
-        lanes = Lanes(wanted.network)
+    async with _watched(settings) as look:
+        lanes = Lanes(settings.network)
         if lanes.uneven:
             what = f"predictions depend on when others are asked for: {lanes.uneven}"
             print(f"heliograph: warning: {what}", file=sys.stderr)
-        if wanted.parts is None:
-            await _alone(wanted, lanes, look)
+        if settings.parts is None:
+            await _alone(settings, lanes, look)
         else:
-            await _shared(wanted, lanes, look, wanted.parts)
+            await _shared(settings, lanes, look, settings.parts)
 
 
 Look = Callable[[Service], Takes]
 
 
 @asynccontextmanager
-async def _watched(wanted: Wanted) -> AsyncIterator[Look]:
+async def _watched(settings: ServiceSettings) -> AsyncIterator[Look]:
     """Services as a page shows them, if there is one."""
-    if wanted.page is None:
+    if settings.page is None:
         yield lambda service: service
         return
     from heliograph.serving.page import door, shown
     from heliograph.serving.watch import Watch
 
-    watch = Watch(wanted.network.states)
-    async with shown(watch, door(wanted.page)):
+    watch = Watch(settings.network.states)
+    async with shown(watch, door(settings.page)):
         yield watch.over
 
 
-async def _alone(wanted: Wanted, lanes: Lanes, look: Look) -> None:
+async def _alone(settings: ServiceSettings, lanes: Lanes, look: Look) -> None:
     """One process: all messages."""
     stop = asyncio.Event()
-    fleet = Fleet(lanes, wanted.options)
-    kept = _kept(wanted, fleet)
-    resumed, service = kept.count() > 0, Service(fleet, kept, _say)
+    fleet = Fleet(lanes, settings.options)
+    store = _open_store(settings, fleet)
+    resumed, service = store.count() > 0, Service(fleet, store, _say)
     try:
         with signals(stop):
-            transport = Pipe() if wanted.broker is None else connected(wanted.broker)
+            transport = Pipe() if settings.broker is None else connected(settings.broker)
             await serve_until(stop, look(service), transport)
     finally:
-        kept.close()
+        store.close()
     if resumed and service.known:
-        anew = f"to begin anew, delete {kept.name} or name another --store"
+        anew = f"to begin anew, delete {store.name} or name another --store"
         _say(f"{service.known} messages were known already or came after what was final; {anew}")
 
 
-def _kept(wanted: Wanted, fleet: Fleet) -> Keeps:
+def _open_store(settings: ServiceSettings, fleet: Fleet) -> StoreProtocol:
     """Where the state is kept, with what it begins from."""
-    if wanted.store is None:
-        return Nowhere()
-    from heliograph.serving.store import Store
+    if settings.store is None:
+        return InMemoryStore()
+    from heliograph.serving.storage.store import Store
 
     mine = identity(fleet)
-    kept = Store(wanted.store, mine, wanted.process)
-    if wanted.snapshot is not None:
-        kept.begin_from(str(wanted.snapshot), mine)
-    kept.begin_anew(wanted.anew)
-    if kept.damaged:
-        _say(f"store {kept.name}: {told_damage(kept.damaged)}")
-    _say(f"the state is kept in {kept.name}, plants so far: {kept.count()} (--store {NOTHING} keeps nothing)")
-    return kept
+    store = Store(settings.store, mine, settings.process)
+    if settings.snapshot is not None:
+        store.begin_from(str(settings.snapshot), mine)
+    store.begin_anew(settings.anew)
+    if store.damaged:
+        _say(f"store {store.name}: {report_damage(store.damaged)}")
+    _say(f"the state is kept in {store.name}, plants so far: {store.count()} (--store {NOTHING} keeps nothing)")
+    return store
 
 
-def told_damage(plants: Mapping[str, Damage]) -> str:
+def report_damage(plants: Mapping[str, Damage]) -> str:
     """What a user is told of plants that are damaged: their names, and whether these are as they were written."""
     named = " ".join(f"--anew {quote(name)}" for name in list(plants)[:LISTED])
     more = "" if len(plants) <= LISTED else f" and {len(plants) - LISTED} more"
     new = (
         ""
-        if all(each.named for each in plants.values())
+        if all(plant.named for plant in plants.values())
         else "; one has lost its name, so that no new plant begins before"
     )
     return f"damaged plants, whose messages are refused until they begin anew ({named}{more}){new}"
@@ -155,29 +155,29 @@ def _say(what: str) -> None:
     print(f"heliograph: {what}", file=sys.stderr)
 
 
-async def _shared(wanted: Wanted, lanes: Lanes, look: Look, parts: int) -> None:
+async def _shared(settings: ServiceSettings, lanes: Lanes, look: Look, parts: int) -> None:
     """One process of several: the parts that it leases."""
-    from heliograph.serving.database import engine_at
-    from heliograph.serving.leases import Leases
-    from heliograph.serving.store import Store
+    from heliograph.serving.storage.database import engine_at
+    from heliograph.serving.storage.leases import Leases
+    from heliograph.serving.storage.store import Store
 
-    place, broker = str(wanted.store), wanted.broker
+    place, broker = str(settings.store), settings.broker
     assert broker is not None  # as Wanted checked
-    fleet = Fleet(lanes, wanted.options)
-    first = _kept(wanted, fleet)
+    fleet = Fleet(lanes, settings.options)
+    first = _open_store(settings, fleet)
     assert isinstance(first, Store)  # as Wanted checked
     first.close()
     mine = identity(fleet)
 
     async def serve(number: int, stop: asyncio.Event) -> None:
-        kept = Store(place, mine, f"part {number} of {parts}", opened=first)  # who has it tells what it had to tell
+        store = Store(place, mine, f"part {number} of {parts}", opened=first)  # who has it tells what it had to tell
         try:
-            service = look(Service(Fleet(lanes, wanted.options), kept, _say))
+            service = look(Service(Fleet(lanes, settings.options), store, _say))
             await serve_until(stop, service, connected(broker, Part(number, parts)))
         finally:
-            kept.close()
+            store.close()
 
-    name = wanted.process or f"{socket.gethostname()} {os.getpid()}"
+    name = settings.process or f"{socket.gethostname()} {os.getpid()}"
     engine = engine_at(place)
     try:
         await keep_sharing(Leases(engine, name, parts), serve)

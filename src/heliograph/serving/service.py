@@ -10,13 +10,13 @@ from typing import NamedTuple
 
 from heliograph.live.event import Verdict
 from heliograph.numerics.check import InputError, instance, shown
-from heliograph.serving.fleet import Fleet, Settled
-from heliograph.serving.keeping import ConflictError, Entry, Keeps, Kept
-from heliograph.serving.kept import plant_bytes, plant_from
+from heliograph.serving.fleet import Finalised, Fleet
+from heliograph.serving.json_lines import Teller, line
 from heliograph.serving.message import Message, read_message
 from heliograph.serving.output import Output
 from heliograph.serving.plant import Plant
-from heliograph.serving.telling import Teller, line
+from heliograph.serving.storage.plant_codec import plant_bytes, plant_from
+from heliograph.serving.storage.store_protocol import ConflictError, Entry, StoredPlant, StoreProtocol
 from heliograph.serving.using import Using
 
 ROWS = 200_000  # that are held in memory before plants which were not heard for long leave it for the store
@@ -50,13 +50,13 @@ class Service:
     with a line, when the first message is refused as implausible.
     """
 
-    def __init__(self, fleet: Fleet, store: Keeps, say: Callable[[str], None] | None = None):
+    def __init__(self, fleet: Fleet, store: StoreProtocol, say: Callable[[str], None] | None = None):
         instance("fleet", fleet, Fleet, "a Fleet")
         self.fleet, self.store, self._say = fleet, store, say
         self.plants = OrderedDict[str, Plant]()  # those in memory, the last that was heard last
         self.malformed, self.known, self.last = 0, 0, Taken(0, 0, 0.0, 0.0, 0.0)
         self._teller, self._using = Teller(fleet.lanes), Using(fleet, self.plants)
-        self._told: int | None = None  # up to where, since the last commit
+        self._published: int | None = None  # up to where, since the last commit
         self._damage = dict[str, str]()  # what is wrong with plants of the last batch that the store cannot give
 
     def take(self, payloads: Sequence[bytes]) -> list[Output]:
@@ -78,25 +78,29 @@ class Service:
             except ConflictError:
                 self._load({message.plant for message in messages if isinstance(message, Message)})
         took = perf_counter() - begun
-        dates = [each.time for each in messages if isinstance(each, Message) and isinstance(each.time, datetime)]
+        dates = [
+            message.time for message in messages if isinstance(message, Message) and isinstance(message.time, datetime)
+        ]
         lag = (datetime.now(UTC) - min(dates)).total_seconds() if dates else took
         self.last = Taken(len(payloads), len(outputs), took, committed, lag)
         return outputs
 
     def unpublished(self) -> list[Output]:
         """What was committed before a restart and may not have been told."""
-        return self.store.untold()
+        return self.store.unpublished()
 
     def published(self, outputs: Sequence[Output]) -> None:
         """These were told: remembered with the next commit."""
-        self._told = max((each.number for each in outputs if each.number is not None), default=self._told)
+        self._published = max(
+            (output.number for output in outputs if output.number is not None), default=self._published
+        )
 
     def finish(self, ended: bool) -> list[Output]:
         """Commit all. Where nothing is kept and there will be no more messages, all rows become final."""
         last = list(self.plants.values()) if ended and not self.store.keeps else []
-        settled = self.fleet.settle(last, all_=True)
-        entries = self._finals(settled)
-        self.fleet.forget(settled)
+        converged = self.fleet.finalise(last, all_=True)
+        entries = self._finals(converged)
+        self.fleet.forget(converged)
         return self._commit({}, entries, 0)
 
     def _taken(self, messages: Sequence[Message | str], payloads: Sequence[bytes]) -> tuple[list[Output], float]:
@@ -123,10 +127,10 @@ class Service:
             entries += [_refusal(message, "implausible", note) for note in notes]
             if verdict == "implausible" or notes:
                 self._warn(message, why or notes[0])
-        settled = self.fleet.settle(touched.values())
-        entries += self._finals(settled)
-        provisional = self._provisional([each for each in settled if each.plant.name in used])
-        self.fleet.forget(settled)
+        converged = self.fleet.finalise(touched.values())
+        entries += self._finals(converged)
+        provisional = self._provisional([item for item in converged if item.plant.name in used])
+        self.fleet.forget(converged)
         begun = perf_counter()
         outputs = self._commit(touched, entries, malformed)
         committed = perf_counter() - begun
@@ -144,16 +148,18 @@ class Service:
 
     def _commit(self, touched: dict[str, Plant], entries: Sequence[Entry], malformed: int) -> list[Output]:
         """Keep what changed. If that fails, what is in memory of it is forgotten: the store is right."""
-        kept = {}
+        stored = {}
         if self.store.keeps:
-            kept = {name: Kept(plant.version, plant_bytes(plant, self.fleet)) for name, plant in touched.items()}
+            stored = {
+                name: StoredPlant(plant.version, plant_bytes(plant, self.fleet)) for name, plant in touched.items()
+            }
         try:
-            outputs = self.store.commit(kept, entries, malformed, self._told)
+            outputs = self.store.commit(stored, entries, malformed, self._published)
         except BaseException:
             for name in touched:
                 self.fleet.end(self.plants.pop(name))
             raise
-        self._told = None
+        self._published = None
         for name, plant in touched.items():
             plant.version += 1
             self.plants.move_to_end(name)
@@ -164,33 +170,33 @@ class Service:
     def _load(self, names: Iterable[str]) -> None:
         """Have the plants of these names in memory, where they are kept."""
         self._damage = {}
-        for name, kept in self.store.load([name for name in names if name not in self.plants]).items():
-            if kept.damage:
-                self._damage[name] = kept.damage
+        for name, item in self.store.load([name for name in names if name not in self.plants]).items():
+            if item.damage:
+                self._damage[name] = item.damage
                 continue
-            plant = self.plants[name] = plant_from(name, kept.body, self.fleet)
-            plant.version = kept.version
+            plant = self.plants[name] = plant_from(name, item.body, self.fleet)
+            plant.version = item.version
 
-    def _finals(self, settled: Iterable[Settled]) -> list[Entry]:
+    def _finals(self, converged: Iterable[Finalised]) -> list[Entry]:
         """What is told once: the rows that are final now and in which something was heard."""
-        rows = [(each.plant, row) for each in settled for row in each.final if row.hears()]
-        told = self.fleet.told([row.slot for _, row in rows])
+        rows = [(item.plant, row) for item in converged for row in item.final if row.observe()]
+        outputs = self.fleet.outputs([row.slot for _, row in rows])
         return [
             Entry(plant.name, "final", self._estimates("final", plant, row.key[0], numbers))
-            for (plant, row), numbers in zip(rows, told, strict=True)
+            for (plant, row), numbers in zip(rows, outputs, strict=True)
         ]
 
-    def _provisional(self, settled: Sequence[Settled]) -> list[Output]:
+    def _provisional(self, converged: Sequence[Finalised]) -> list[Output]:
         """What is known now."""
-        told = self.fleet.told([each.newest.slot for each in settled])
+        outputs = self.fleet.outputs([item.newest.slot for item in converged])
         return [
             Output(None, plant.name, "provisional", self._estimates("provisional", plant, newest.key[0], numbers))
-            for (plant, _, newest, _), numbers in zip(settled, told, strict=True)
+            for (plant, _, newest, _), numbers in zip(converged, outputs, strict=True)
         ]
 
-    def _estimates(self, kind: str, plant: Plant, at: float, told: list[float]) -> bytes:
+    def _estimates(self, kind: str, plant: Plant, at: float, outputs: list[float]) -> bytes:
         moment = at if plant.origin is None else (plant.origin + timedelta(seconds=at)).isoformat()
-        return self._teller.estimates(kind, plant.name, moment, told)
+        return self._teller.estimates(kind, plant.name, moment, outputs)
 
 
 @contextmanager
@@ -220,5 +226,5 @@ def _refusal(message: Message, why: str, detail: str) -> Entry:
 
 
 def _refused(plant: str | None, parts: dict[str, object], why: str, detail: str) -> Entry:
-    found = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
-    return Entry(plant or "", "refused", line(found | parts | {"reason": why, "detail": detail}))
+    results = {"kind": "refused", "plant": plant, "node": None, "sequence": None, "time": None}
+    return Entry(plant or "", "refused", line(results | parts | {"reason": why, "detail": detail}))

@@ -6,9 +6,9 @@ from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from typing import Protocol
 
+from heliograph.serving.brokers.retry import LOG
+from heliograph.serving.brokers.transport import TakenOverError
 from heliograph.serving.loop import signals
-from heliograph.serving.retry import LOG
-from heliograph.serving.transport import TakenOverError
 
 Serve = Callable[[int, asyncio.Event], Coroutine[object, object, None]]
 
@@ -70,12 +70,12 @@ async def _adjust(parts: dict[int, _Part], leases: Leased, serve: Serve) -> None
                 part.work.result()
             except TakenOverError as error:
                 LOG.warning("%s", error)
-    wanted = await asyncio.to_thread(leases.renew)
-    gone = [number for number in parts if number not in wanted]
+    expected = await asyncio.to_thread(leases.renew)
+    gone = [number for number in parts if number not in expected]
     await asyncio.gather(*[parts[number].end() for number in gone])
     for number in gone:
         del parts[number]
         await asyncio.to_thread(leases.release, number)
-    for number in sorted(wanted - parts.keys()):
+    for number in sorted(expected - parts.keys()):
         ending = asyncio.Event()
         parts[number] = _Part(asyncio.ensure_future(serve(number, ending)), ending)

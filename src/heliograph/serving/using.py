@@ -60,24 +60,24 @@ class Using:
             self._before, self._taken = {}, []
             for i in left:
                 outcomes[i] = self._outcome(i, messages[i])
-            self.fleet.step(list({one.plant.name: one.plant for one in self._taken}.values()))
-            found = self._judges.implausible(self._taken)
+            self.fleet.step(list({item.plant.name: item.plant for item in self._taken}.values()))
+            result = self._judges.implausible(self._taken)
             spoilt = set()
-            for i, why in found.items():
+            for i, why in result.items():
                 number, plant, event, _ = self._taken[i]
                 self._refused[number, event.place < 0] = why
                 spoilt.add(plant.name)
             for name in spoilt:
                 self._undo(name)
-            left = [i for i in left if isinstance(one := messages[i], Message) and one.plant in spoilt]
+            left = [i for i in left if isinstance(item := messages[i], Message) and item.plant in spoilt]
         return [outcomes[i] for i in range(len(messages))]
 
     def _implausible_inputs(self, messages: Sequence[Message | str]) -> dict[tuple[int, bool], str]:
         """The inputs that lead to no prediction, from what is known before the batch."""
-        given = [(i, one, one.values if one.node == INPUTS else one.inputs)
-                 for i, one in enumerate(messages) if isinstance(one, Message)]  # fmt: skip
-        given = [(i, one, values) for i, one, values in given if values and len(values) == self.fleet.lanes.given]
-        plants = [self.plants.get(one.plant) for _, one, _ in given]
+        given = [(i, message, message.values if message.node == INPUTS else message.inputs)
+                 for i, message in enumerate(messages) if isinstance(message, Message)]  # fmt: skip
+        given = [(i, item, values) for i, item, values in given if values and len(values) == self.fleet.lanes.given]
+        plants = [self.plants.get(item.plant) for _, item, _ in given]
         numbers = np.array([values for *_, values in given], dtype=np.float64)
         why = self._judges.implausible_inputs(plants, numbers)
         return {(i, True): said for (i, _, _), said in zip(given, why, strict=True) if said}

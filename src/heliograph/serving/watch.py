@@ -12,7 +12,7 @@ from pydantic_core import from_json
 from heliograph.live.event import VERDICTS
 from heliograph.serving.loop import Takes
 from heliograph.serving.output import Output
-from heliograph.serving.surprise import Surprise
+from heliograph.serving.running_nis import RunningNis
 
 T = TypeVar("T")
 PLANTS = 200  # plants whose estimates are remembered, those that were heard last
@@ -93,8 +93,8 @@ class Watch:
         self.states = list(states)
         self.lock = threading.Lock()
         self.services: list[Serves] = []
-        self.surprises: dict[tuple[str, str], Surprise] = {}
-        self._own: OrderedDict[str, dict[tuple[str, str], Surprise]] = OrderedDict()
+        self.surprises: dict[tuple[str, str], RunningNis] = {}
+        self._own: OrderedDict[str, dict[tuple[str, str], RunningNis]] = OrderedDict()
         self._points: OrderedDict[str, deque[Point]] = OrderedDict()
         self._count = 0
         self.registry = CollectorRegistry()
@@ -115,27 +115,28 @@ class Watch:
         self.lag.observe(last.lag)
         for output in outputs:
             if output.kind != "refused":
-                told = from_json(output.body)
-                self._keep(output.plant, told)
+                message = from_json(output.body)
+                self._keep(output.plant, message)
                 if output.kind == "final":
-                    self._test(output.plant, told["estimates"])
+                    self._test(output.plant, message["estimates"])
 
     def _test(self, plant: str, estimates: Mapping[str, Mapping[str, Any]]) -> None:
-        own = _newest(self._own, plant, dict)
+        local = _newest(self._own, plant, dict)
         for node, filters in estimates.items():
-            for name, told in filters.items():
-                if told.get("nis") is not None:
-                    for found in (self.surprises, own):
-                        one = found.setdefault((node, name), Surprise(told["claim"]))
-                        one.add(told["nis"], told["heard"])
+            for name, message in filters.items():
+                if message.get("nis") is not None:
+                    for item in (self.surprises, local):
+                        single = item.setdefault((node, name), RunningNis(message["claim"]))
+                        single.add(message["nis"], message["heard"])
 
-    def _keep(self, plant: str, told: Mapping[str, Any]) -> None:
+    def _keep(self, plant: str, message: Mapping[str, Any]) -> None:
         self._count += 1
         estimates = {
-            node: {name: _band(found) for name, found in filters.items()} for node, filters in told["estimates"].items()
+            node: {name: _band(filter_) for name, filter_ in filters.items()}
+            for node, filters in message["estimates"].items()
         }
         points = _newest(self._points, plant, lambda: deque(maxlen=POINTS))
-        points.append(Point(self._count, told["time"], estimates))
+        points.append(Point(self._count, message["time"], estimates))
 
     def plants(self) -> Iterator[tuple[str, Plant]]:
         """All plants of all services."""
@@ -150,7 +151,7 @@ class Watch:
         """What the page shows of a plant (None: of the one heard last): estimates after the point `since`."""
         with self.lock:
             name = next(reversed(self._points), "") if plant is None else plant
-            found = [each for known, each in self.plants() if known == name]
+            results = [item for known, item in self.plants() if known == name]
             points = [point for point in self._points.get(name, ()) if point.number > since]
             tests = self._own.get(name, {})
             names = sorted(known for known, _ in self.plants())
@@ -162,16 +163,16 @@ class Watch:
                 "since": since,
                 "newest": self._count,
                 "points": [point._asdict() for point in points],
-                "links": _added(found),
-                "tests": [_told(node, filter_, one) for (node, filter_), one in tests.items()],
-                "warnings": list(self._warnings(found, tests))[:WARNINGS],
+                "links": _added(results),
+                "tests": [_test_row(node, filter_, test) for (node, filter_), test in tests.items()],
+                "warnings": list(self._warnings(results, tests))[:WARNINGS],
                 "malformed": sum(service.malformed for service in self.services),
-                "all": _added(each for _, each in self.plants()),
+                "all": _added(item for _, item in self.plants()),
             }
 
-    def _warnings(self, plants: Sequence[Plant], tests: Mapping[tuple[str, str], Surprise]) -> Iterator[str]:
-        for (node, filter_), one in tests.items():
-            if doubt := one.doubt():
+    def _warnings(self, plants: Sequence[Plant], tests: Mapping[tuple[str, str], RunningNis]) -> Iterator[str]:
+        for (node, filter_), test in tests.items():
+            if doubt := test.doubt():
                 yield f"{node}/{filter_}: {doubt}"
         for node, link in _added(plants).items():
             if link["late"]:
@@ -213,21 +214,21 @@ class Watched:
             return self.service.finish(ended)
 
 
-def _newest(found: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
+def _newest(result: OrderedDict[str, T], plant: str, make: Callable[[], T]) -> T:
     """What is kept of a plant, which is the newest now; the oldest goes."""
-    if plant not in found:
-        found[plant] = make()
-        if len(found) > PLANTS:
-            found.popitem(last=False)
-    found.move_to_end(plant)
-    return found[plant]
+    if plant not in result:
+        result[plant] = make()
+        if len(result) > PLANTS:
+            result.popitem(last=False)
+    result.move_to_end(plant)
+    return result[plant]
 
 
-def _band(told: Mapping[str, Any]) -> dict[str, object]:
+def _band(message: Mapping[str, Any]) -> dict[str, object]:
     """Means, and deviations where the filter claims any."""
-    rows = told["covariance"]
+    rows = message["covariance"]
     claimed = None if rows is None else [_root(row[i]) for i, row in enumerate(rows)]
-    return {"mean": told["mean"], "deviation": claimed, "claim": told["claim"]}
+    return {"mean": message["mean"], "deviation": claimed, "claim": message["claim"]}
 
 
 def _root(variance: float | None) -> float | None:
@@ -236,16 +237,16 @@ def _root(variance: float | None) -> float | None:
 
 def _added(plants: Iterator[Plant] | Sequence[Plant]) -> dict[str, dict[str, int]]:
     """Tallies of several plants, by node."""
-    found: dict[str, dict[str, int]] = {}
+    results: dict[str, dict[str, int]] = {}
     for plant in plants:
         for node, link in plant.links.items():
-            tally = found.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped"), 0))
+            tally = results.setdefault(node, dict.fromkeys((*VERDICTS, "lost", "dropped"), 0))
             for name in tally:
                 tally[name] += getattr(link, name)
-    return found
+    return results
 
 
-def _told(node: str, filter_: str, one: Surprise) -> dict[str, object]:
-    low, high = one.band()
-    numbers = {"ratio": one.ratio, "low": low, "high": high, "numbers": one.numbers}
-    return {"node": node, "filter": filter_, "claim": one.claim, **numbers, "doubt": one.doubt() is not None}
+def _test_row(node: str, filter_: str, item: RunningNis) -> dict[str, object]:
+    low, high = item.band()
+    numbers = {"ratio": item.ratio, "low": low, "high": high, "numbers": item.numbers}
+    return {"node": node, "filter": filter_, "claim": item.claim, **numbers, "doubt": item.doubt() is not None}

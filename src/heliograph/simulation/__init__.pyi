@@ -3,7 +3,7 @@
 from .arrivals import (
     arrivals as arrivals,
 )
-from .before_data import (
+from .centres.before_data import (
     CrossCovariances as CrossCovariances,
     cross_covariances as cross_covariances,
     fused_covariances as fused_covariances,
@@ -12,13 +12,13 @@ from .boundedness import (
     Boundedness as Boundedness,
     certify_boundedness as certify_boundedness,
 )
-from .compilation_cache import (
+from .runs.compilation_cache import (
     keep_compilations as keep_compilations,
 )
-from .over_runs import (
+from .runs.over_runs import (
     over_runs as over_runs,
 )
-from .reducer import (
+from .results.reducer import (
     AbstractReducer as AbstractReducer,
     OfStep as OfStep,
     Trajectories as Trajectories,
@@ -26,25 +26,25 @@ from .reducer import (
 from .stepping import (
     centre_filter as centre_filter,
 )
-from .uplinks import (
+from .centres.uplinks import (
     SentReports as SentReports,
     Uplink as Uplink,
 )
-from .tree import (
+from .centres.tree import (
     RelayTree as RelayTree,
     relay_tree as relay_tree,
 )
-from .statistics import (
+from .results.statistics import (
     ErrorStatistics as ErrorStatistics,
     pool as pool,
 )
-from .sums import (
+from .results.sums import (
     error_statistics as error_statistics,
 )
-from .statistics_by_name import (
+from .results.statistics_by_name import (
     StatisticsByName as StatisticsByName,
 )
-from .whiteness import (
+from .results.whiteness import (
     memory_test as memory_test,
     MemoryTest as MemoryTest,
     whitened_innovations as whitened_innovations,

@@ -7,7 +7,7 @@ from heliograph.numerics.check import check_count, fail, instance
 from heliograph.random_affine.delay import Delayed
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 
 Arrival = tuple[str, int, float, np.ndarray, float]  # node, sequence, time, values, arrival
 
@@ -26,7 +26,7 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
     instance("network", network, Network, "a Network")
     if set(record.measurements) - set(network.nodes):
         raise fail("network", f"one with the record's nodes {list(record.measurements)}", list(network.nodes))
-    found: list[Arrival] = []
+    results: list[Arrival] = []
     for name, z in record.measurements.items():
         values = z if z.ndim == 2 else z[check_count("run", run, 0)]
         values, late = _timed(name, network.nodes[name], values)
@@ -34,18 +34,18 @@ def arrivals(record: Record, network: Network, run: int = 0) -> list[Arrival]:
         for k in np.flatnonzero(there):
             sent = int(k - late[k])
             if sent >= 0:
-                found.append((name, sent, float(sent), values[k], float(k)))
-    return sorted(found, key=lambda event: event[-1])
+                results.append((name, sent, float(sent), values[k], float(k)))
+    return sorted(results, key=lambda event: event[-1])
 
 
 def _timed(name: str, node: object, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Values (steps, m), and how late each is (steps,)."""
     channel = node.channel if isinstance(node, Node) else None
-    one = at(channel, 0) if isinstance(channel, OverTime) else channel
-    if one is None or not one.past:
+    item = at(channel, 0) if isinstance(channel, OverTime) else channel
+    if item is None or not item.past:
         return z, np.zeros(len(z))
-    if isinstance(one, Delayed) and one.told:
+    if isinstance(item, Delayed) and item.known:
         return z[:, :-1], z[:, -1]
-    if isinstance(one, Delayed) and one.constant:
-        return z, np.full(len(z), float(one.past))
+    if isinstance(item, Delayed) and item.constant:
+        return z, np.full(len(z), float(item.past))
     raise fail(f"delays of node {name!r}", "constant ones, or told ones", "random ones that nobody is told")

@@ -7,10 +7,10 @@ import numpy as np
 import scipy.linalg
 
 from heliograph.linear.arrival import plant_matrices, sensor_matrices
-from heliograph.linear.told_losses import (
-    ONE,
+from heliograph.linear.known_losses import (
+    BELOW_ONE,
     KindGains,
-    ToldSystem,
+    KnownLossSystem,
     certified_radius,
     find_gains,
     long_run_law,
@@ -26,7 +26,7 @@ from heliograph.numerics.types import Float
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain
 from heliograph.random_affine.modes import joint_modes
-from heliograph.random_affine.told import Outcome, outcomes, second_moments
+from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 
@@ -87,15 +87,15 @@ def certify_boundedness(network: Network) -> Boundedness:
     links = _links(network, len(a))
     growing = _unstable(a)
     for space in (np.eye(len(a)), growing):
-        told = _told(a, q, links, space)
-        gains = find_gains(told.system)
-        radius = certified_radius(told.system, gains)
-        if radius < ONE:
-            bound = steady(told.system, gains, told.system.source(gains)).sum(axis=0) if told.exact else None
-            return Boundedness("certified", _certified(a, radius), radius, 0.0, told.gains(gains), bound)
-    unseen = fastest_unseen(a, told.system.chain, [told.system.outputs[s] for s in told.system.told])
-    verdict, reason = _refused(network, links, growing, told, unseen, radius)
-    return Boundedness(verdict, reason, radius, unseen.growth, told.gains(gains), None)
+        known = _known_losses(a, q, links, space)
+        gains = find_gains(known.system)
+        radius = certified_radius(known.system, gains)
+        if radius < BELOW_ONE:
+            bound = steady(known.system, gains, known.system.source(gains)).sum(axis=0) if known.exact else None
+            return Boundedness("certified", _certified(a, radius), radius, 0.0, known.gains(gains), bound)
+    unseen = fastest_unseen(a, known.system.chain, [known.system.outputs[s] for s in known.system.known])
+    verdict, reason = _refused(network, links, growing, known, unseen, radius)
+    return Boundedness(verdict, reason, radius, unseen.growth, known.gains(gains), None)
 
 
 def _links(network: Network, states: int) -> Links:
@@ -113,9 +113,9 @@ def _links(network: Network, states: int) -> Links:
     modes = joint_modes(joint, 2)  # of a gain that drifts two values say that it is random
     initial, chain = np.asarray(modes.initial), np.asarray(modes.transition)
     happens = initial @ np.linalg.matrix_power(np.eye(len(chain)) + chain, len(chain)) > 0
-    told = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
+    outputs = [outcomes(m) for m, ever in zip(modes.maps, happens, strict=True) if ever]
     noise = scipy.linalg.block_diag(*noises)
-    links = initial[happens], chain[np.ix_(happens, happens)], told
+    links = initial[happens], chain[np.ix_(happens, happens)], outputs
     return Links(*links, np.concatenate(matrices), np.concatenate(means), noise)
 
 
@@ -127,14 +127,14 @@ def _constant(channel: Channel) -> AbstractRandomAffine:
 
 def _unstable(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n d"]:
     """An orthonormal basis of the plant's modes that do not decay."""
-    _, basis, count = scipy.linalg.schur(matrix / ONE, sort="ouc")
+    _, basis, count = scipy.linalg.schur(matrix / BELOW_ONE, sort="ouc")
     return np.asarray(basis[:, :count])
 
 
-class Told(NamedTuple):
+class KnownLosses(NamedTuple):
     """What a receiver can rely on, for each of the `kinds` of losses."""
 
-    system: ToldSystem
+    system: KnownLossSystem
     kinds: list[tuple[bool, ...]]
     parts: list["Certain"]
 
@@ -153,22 +153,24 @@ class Told(NamedTuple):
         return {kind: k @ part.combine for kind, k, part in zip(self.kinds, gains, self.parts, strict=True)}
 
 
-def _told(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> Told:
+def _known_losses(a: np.ndarray, q: np.ndarray, links: Links, space: Float[np.ndarray, "n d"]) -> KnownLosses:
     """Each set of losses as a kind, with the sums of what arrives whose gain on a subspace of x is certain.
 
     Modes that tell the same are one kind: a gain that differs between them is not told.
     """
-    kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for each in links.outcomes for o in each))
-    weights = [(i, o, kinds.index(tuple(o.arrived.tolist()))) for i, each in enumerate(links.outcomes) for o in each]
+    kinds = list(dict.fromkeys(tuple(o.arrived.tolist()) for outcome in links.outcomes for o in outcome))
+    weights = [
+        (i, o, kinds.index(tuple(o.arrived.tolist()))) for i, outcome in enumerate(links.outcomes) for o in outcome
+    ]
     parts = [_certain([o for _, o, s in weights if s == kind], links, space) for kind in range(len(kinds))]
-    told = np.array([s for _, _, s in weights])
+    values = np.array([s for _, _, s in weights])
     mode = np.array([i for i, _, _ in weights])
     probability = np.array([o.probability for _, o, _ in weights])
     chain = links.chain[np.ix_(mode, mode)] * probability
     law = long_run_law(links.initial[mode] * probability, chain)
     noises = tuple(parts[s].noise(o, links) for _, o, s in weights)
-    system = ToldSystem(a, q, chain, law, told, tuple(part.rows for part in parts), noises)
-    return Told(system, kinds, parts)
+    system = KnownLossSystem(a, q, chain, law, values, tuple(part.rows for part in parts), noises)
+    return KnownLosses(system, kinds, parts)
 
 
 class Certain(NamedTuple):
@@ -214,46 +216,46 @@ def _certain(alike: Sequence[Outcome], links: Links, space: Float[np.ndarray, "n
 
 
 def _certified(a: Float[np.ndarray, "n n"], radius: float) -> str:
-    if spectral_radius(a) < ONE:
+    if spectral_radius(a) < BELOW_ONE:
         return f"the plant is stable, and fixed gains leave the error a spectral radius of {radius:.6g}"
     return f"fixed gains leave the mean square of the error a spectral radius of {radius:.6g}"
 
 
 def _refused(
-    network: Network, links: Links, growing: np.ndarray, told: Told, unseen: Unseen, radius: float
+    network: Network, links: Links, growing: np.ndarray, channel: KnownLosses, unseen: Unseen, radius: float
 ) -> tuple[Verdict, str]:
     """Impossible if an unseen eigenvector grows and noise keeps reaching it, else undecided."""
     if unseen.growth < 1:
         best = f"no gains are certified: the best that were found leave {radius:.6g}"
         return "undecided", f"{best}, and nothing that losses hide grows: {unseen.growth:.6g} < 1"
-    reason = _why(links, told.system, unseen)
-    if not _excited(network, growing, told, unseen):
+    reason = _why(links, channel.system, unseen)
+    if not _excited(network, growing, channel, unseen):
         return "undecided", f"{reason}; but noise does not reach all that grows, so that it may stay zero"
     return "impossible", reason
 
 
-def _why(links: Links, system: ToldSystem, unseen: Unseen) -> str:
+def _why(links: Links, system: KnownLossSystem, unseen: Unseen) -> str:
     value = unseen.eigenvalue
     mode = f"the plant's mode of eigenvalue {value.real:.6g}" + (f" +- {value.imag:.6g}i" if value.imag else "")
     if len(unseen.modes) < len(system.chain):
         return f"{mode} grows by {unseen.growth:.6g} >= 1 a step in mean square while what would show it is lost"
-    powers = [np.einsum("iiab->ab", second_moments(o.map)[1])[:-1, :-1] for each in links.outcomes for o in each]
+    powers = [np.einsum("iiab->ab", second_moments(o.map)[1])[:-1, :-1] for outcome in links.outcomes for o in outcome]
     seen = links.sensing @ unseen.vectors
     if max(float(np.real(np.einsum("ad,ab,bd->", seen.conj(), power, seen))) for power in powers) > 0:
         return f"{mode} is seen only through random gains that are not told, which make noise as large as the state"
     return f"{mode} is not seen at all"
 
 
-def _excited(network: Network, growing: np.ndarray, told: Told, unseen: Unseen) -> bool:
+def _excited(network: Network, growing: np.ndarray, channel: KnownLosses, unseen: Unseen) -> bool:
     """Whether P stays above eps v v': noise enters along v at once, or reaches it and every measurement has noise.
 
     The noise that random gains make grows only where noise reaches all that is unstable.
     """
-    a, q = told.system.transition, told.system.process
-    wanted = np.concatenate([unseen.vectors, growing], axis=1) if told.random else unseen.vectors
-    if reached(wanted, np.zeros_like(a), q):
+    a, q = channel.system.transition, channel.system.process
+    expected = np.concatenate([unseen.vectors, growing], axis=1) if channel.random else unseen.vectors
+    if reached(expected, np.zeros_like(a), q):
         return True
-    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in told.system.noises):
+    if any(np.linalg.eigvalsh(r).min(initial=np.inf) <= 0 for r in channel.system.noises):
         return False
     start = q + np.asarray(first(network.plant).initial_covariance)
-    return reached(wanted, a, q) or (unseen.growth > 1 and reached(wanted, a, start))
+    return reached(expected, a, q) or (unseen.growth > 1 and reached(expected, a, start))

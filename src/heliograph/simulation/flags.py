@@ -5,13 +5,13 @@ from collections.abc import Iterator, Sequence
 import jax
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.revealed import RevealedFilter
-from heliograph.filters.told import ToldFilter
+from heliograph.filters.modes.mode_observed import ModeObservedFilter
+from heliograph.filters.modes.side_information import SideInformationFilter
 from heliograph.model.over_time import first
 from heliograph.numerics.check import fail
 from heliograph.random_affine.base import AbstractRandomAffine
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.modes import OneStepLate, Revealed
+from heliograph.random_affine.modes import ModeOutput, OneStepLate
 
 NOW, LATE = "hg.model.with_flag(link)", "hg.model.with_flag(link, late=True)"
 
@@ -24,24 +24,26 @@ def check_flags(name: str, item: AbstractFilter, channels: Sequence[AbstractRand
     """
     rows = [part for channel in channels for part in _rows(channel)]
     for reader in _readers(item):
-        if isinstance(reader, RevealedFilter):
-            sent, wanted = first(reader.channel).outputs, LATE if reader.late else NOW
+        if isinstance(reader, ModeObservedFilter):
+            sent, expected = first(reader.channel).outputs, LATE if reader.late else NOW
             wrong = [part for part in rows[sent : reader.received] if not _reveals(part, reader.late)]
         else:
-            wanted = "hg.model.with_flag(link, flags)"
+            expected = "hg.model.with_flag(link, flags)"
             wrong = [part for part in rows[reader.received - 1 : reader.received] if isinstance(part, OneStepLate)]
         if wrong:
             late = isinstance(wrong[0], OneStepLate)
-            plain = "one of this step" if isinstance(wrong[0], Revealed) else f"{type(wrong[0]).__name__}, no mode"
-            raise fail(f"{name}, flags", f"those of {wanted}", "one of the step before" if late else plain)
+            plain = "one of this step" if isinstance(wrong[0], ModeOutput) else f"{type(wrong[0]).__name__}, no mode"
+            raise fail(f"{name}, flags", f"those of {expected}", "one of the step before" if late else plain)
 
 
-def _readers(item: AbstractFilter) -> list[ToldFilter | RevealedFilter]:
+def _readers(item: AbstractFilter) -> list[SideInformationFilter | ModeObservedFilter]:
     """Filters that take flags, at the end of the first numbers that arrive; also inside of others."""
-    kinds = ToldFilter, RevealedFilter
+    kinds = SideInformationFilter, ModeObservedFilter
     leaves = jax.tree.leaves(item, is_leaf=lambda part: isinstance(part, kinds))
     return [
-        part for part in leaves if isinstance(part, RevealedFilter) or (isinstance(part, ToldFilter) and part.flagged)
+        part
+        for part in leaves
+        if isinstance(part, ModeObservedFilter) or (isinstance(part, SideInformationFilter) and part.flagged)
     ]
 
 
@@ -56,5 +58,5 @@ def _rows(channel: AbstractRandomAffine) -> Iterator[AbstractRandomAffine]:
 
 def _reveals(part: AbstractRandomAffine, late: bool) -> bool:
     if late:
-        return isinstance(part, OneStepLate) and isinstance(part.base, Revealed)
-    return isinstance(part, Revealed)
+        return isinstance(part, OneStepLate) and isinstance(part.base, ModeOutput)
+    return isinstance(part, ModeOutput)

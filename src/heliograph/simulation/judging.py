@@ -8,27 +8,29 @@ import numpy as np
 
 from heliograph.filters.plausibility import INPUT, Judgement, in_words, why_inputs, why_values
 from heliograph.numerics.types import Float, PyTree
+from heliograph.simulation.centres.uplinks import Drawn
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.uplinks import Drawn
 
 Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and what is found
 
 
-def implausible(found: Mapping[str, PyTree]) -> jax.Array:
+def implausible(result: Mapping[str, PyTree]) -> jax.Array:
     """Whether some filter finds what it heard implausible."""
-    each = [jnp.any(one.implausible) for one in (*found["judged"], *found["judged_centrally"].values())]
-    return jnp.any(jnp.stack(each)) if each else jnp.asarray(False)
+    items = [jnp.any(item.implausible) for item in (*result["judged"], *result["judged_centrally"].values())]
+    return jnp.any(jnp.stack(items)) if items else jnp.asarray(False)
 
 
-def any_implausible(found: Mapping[str, PyTree]) -> bool:
+def any_implausible(result: Mapping[str, PyTree]) -> bool:
     """The same of what was found before."""
-    return any((one.reason > 0).any() for one in (*found["judged"], *found["judged_centrally"].values()))
+    return any((item.reason > 0).any() for item in (*result["judged"], *result["judged_centrally"].values()))
 
 
-def reasons(found: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
+def reasons(result: Mapping[str, PyTree]) -> tuple[list[jax.Array], dict[str, jax.Array]]:
     """Why each filter should not use what it heard, by kind and by name."""
-    return [one.reason for one in found["judged"]], {n: one.reason for n, one in found["judged_centrally"].items()}
+    return [item.reason for item in result["judged"]], {
+        n: item.reason for n, item in result["judged_centrally"].items()
+    }
 
 
 def step_without(
@@ -41,8 +43,8 @@ def step_without(
     drawn: Mapping[str, Drawn] | None = None,
 ) -> Stepped:
     """The step again, where each filter leaves out what it found implausible in the first."""
-    after, found = filters.step(states, z, u, k, drawn, reasons(first[1]))
-    return after, found | {name: first[1][name] for name in ("judged", "judged_centrally")}
+    after, result = filters.step(states, z, u, k, drawn, reasons(first[1]))
+    return after, result | {name: first[1][name] for name in ("judged", "judged_centrally")}
 
 
 def plausible_step(
@@ -65,35 +67,35 @@ class Judges:
     """Reads the filters' judgements by node: of a step, or of a recording, whose axis comes first."""
 
     def __init__(self, network: Network):
-        self._own: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
+        self._places: dict[str, list[tuple[int, int, int]]] = {name: [] for name in network.names}
         for (node, name), place in network.places().items():
             if network.nodes[node].filters[name].received:
-                self._own[node].append(place)
+                self._places[node].append(place)
 
-    def of_node(self, found: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
+    def of_node(self, result: Mapping[str, PyTree], node: str) -> Float[np.ndarray, "... filters 4"]:
         """The judgements of the filters that hear a node; where it has none, of the central ones."""
-        return self._rows(found, self._own[node], not self._own[node])
+        return self._rows(result, self._places[node], not self._places[node])
 
-    def of_all(self, found: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
+    def of_all(self, result: Mapping[str, PyTree]) -> Float[np.ndarray, "... filters 4"]:
         """The judgements of all filters."""
-        places = [(k, f, i) for k, one in enumerate(found["judged"]) for f, i in np.ndindex(*one[0].shape[-2:])]
-        return self._rows(found, places, True)
+        places = [(k, f, i) for k, item in enumerate(result["judged"]) for f, i in np.ndindex(*item[0].shape[-2:])]
+        return self._rows(result, places, True)
 
     def _rows(
-        self, found: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
+        self, result: Mapping[str, PyTree], places: Sequence[tuple[int, int, int]], central: bool
     ) -> Float[np.ndarray, "... filters 4"]:
-        each = [[part[..., f, i] for part in found["judged"][k]] for k, f, i in places]
-        each += [list(one) for one in found["judged_centrally"].values()] if central else []
-        if not each:
+        items = [[part[..., f, i] for part in result["judged"][k]] for k, f, i in places]
+        items += [list(item) for item in result["judged_centrally"].values()] if central else []
+        if not items:
             return np.zeros((0, len(Judgement._fields)))
-        return np.moveaxis(np.array(each), (0, 1), (-2, -1))
+        return np.moveaxis(np.array(items), (0, 1), (-2, -1))
 
 
-def refused_rows(network: Network, found: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
+def refused_rows(network: Network, outcome: Mapping[str, PyTree]) -> dict[str, dict[int, str]]:
     """By node the rows of a recording that are implausible there, and why."""
     judges, result = Judges(network), dict[str, dict[int, str]]()
     for name in network.names:
-        votes = judges.of_node(found, name)
+        votes = judges.of_node(outcome, name)
         bad = _flagged(votes, "reason")
         why = {k: said for k in bad if (said := why_values(votes[k]))}
         if why:
@@ -101,22 +103,22 @@ def refused_rows(network: Network, found: Mapping[str, PyTree]) -> dict[str, dic
     return result
 
 
-def doubts(network: Network, found: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
+def doubts(network: Network, result: Mapping[str, PyTree], refused: Mapping[str, Mapping[int, str]]) -> list[str]:
     """What is to be said of a recording: rows that are implausible, or to one filter alone, and inputs."""
-    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, each in refused.items()
-             for rows, why in [(list(each), next(iter(each.values())))]]  # fmt: skip
-    each = {(node, name): [part[:, f, i] for part in found["judged"][kind]]
+    lines = [f"node {name!r}: {_rows(rows)} implausible, as if not arrived: {why}" for name, item in refused.items()
+             for rows, why in [(list(item), next(iter(item.values())))]]  # fmt: skip
+    items = {(node, name): [part[:, f, i] for part in result["judged"][kind]]
             for (node, name), (kind, f, i) in network.places().items()}  # fmt: skip
-    every = {(FUSED, name): list(one) for name, one in found["judged_centrally"].items()}
+    every = {(FUSED, name): list(item) for name, item in result["judged_centrally"].items()}
     all_rows = {k: "" for rows in refused.values() for k in rows}
-    for (node, name), (distance, _, reason, _) in (each | every).items():
+    for (node, name), (distance, _, reason, _) in (items | every).items():
         known = all_rows if node == FUSED else refused.get(node, {})
         rows = [int(k) for k in np.flatnonzero(reason > 0) if k not in known]
         if rows:
             why = in_words(reason[rows[0]], distance[rows[0]])
             lines.append(f"filter {name!r} of {node!r} alone: {_rows(rows)} implausible, left out: {why}")
     if network.inputs:
-        votes = Judges(network).of_all(found)
+        votes = Judges(network).of_all(result)
         rows = [k for k in _flagged(votes, "input") if why_inputs(votes[k])]
         lines += [f"inputs: {_rows(rows)} implausible: {INPUT}"] if rows else []
     return lines
@@ -126,8 +128,8 @@ def _flagged(votes: Float[np.ndarray, "steps filters 4"], part: str) -> list[int
     """Rows in which some filter says so."""
     if not votes.size:
         return []
-    found: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(part)] > 0).any(axis=-1)).tolist()
-    return found
+    results: list[int] = np.flatnonzero((votes[..., Judgement._fields.index(part)] > 0).any(axis=-1)).tolist()
+    return results
 
 
 def _rows(rows: Sequence[int]) -> str:

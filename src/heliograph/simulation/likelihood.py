@@ -40,20 +40,20 @@ def rows(name: str, value: ArrayLike | None, steps: int | None, length: int, mis
     if isinstance(value, jax.core.Tracer):
         return value
     try:
-        found = np.asarray(value, dtype=np.float64)
+        values = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise fail(name, "an array of numbers", repr(value)[:60]) from None
-    found = found[:, None] if found.ndim == 1 and length == 1 else found
-    gaps = np.isnan(found) & missing
-    return np.where(gaps, np.nan, array(name, np.where(gaps, 0.0, found), (steps, length)))
+    values = values[:, None] if values.ndim == 1 and length == 1 else values
+    gaps = np.isnan(values) & missing
+    return np.where(gaps, np.nan, array(name, np.where(gaps, 0.0, values), (steps, length)))
 
 
 @compiled
 def _sum(item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]) -> jax.Array:
     def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, jax.Array]:
         k, z_k, u_k = row
-        after, heard = item.correct(item.predict(state, u_k, k), z_k, k)
-        return after, jnp.asarray(heard.log_likelihood)
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        return after, jnp.asarray(innovation.log_likelihood)
 
     start = jax.tree.map(jnp.asarray, item.init())
     return jnp.sum(jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1])

@@ -9,7 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.scheduled import ScheduledFilter
+from heliograph.filters.linear.scheduled import ScheduledFilter
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.linear.schedule import Schedule
@@ -24,14 +24,14 @@ from heliograph.numerics.check import check_horizon, fail, table
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.random_affine.base import anonymous, check_forgets
-from heliograph.simulation.centre import along_estimates, informed_claim, reported_claim
+from heliograph.simulation.centres.centre import along_estimates, informed_claim, reported_claim
 from heliograph.simulation.flags import check_flags
 from heliograph.simulation.node import Common, Listener, Node, check_filters, check_received, check_sizes, check_type
 
 Claims = dict[str, dict[str, Claim]]  # by node and filter
 
 FUSED = "fused"  # the name under which results of several nodes stand
-OWN = "own"  # a relay's one filter
+LOCAL = "own"  # a relay's one filter
 
 
 class Kind(NamedTuple):
@@ -85,8 +85,8 @@ class Network(Module):
         states, inputs = self.states, self.inputs
         for name, node in self.nodes.items():
             check_type(f"node {name!r}", node, Node if relays is None and common is None else Listener)
-            for filter_, one in node.filters.items():
-                check_sizes(f"filter {filter_!r} of node {name!r}", one, states, inputs)
+            for filter_, element in node.filters.items():
+                check_sizes(f"filter {filter_!r} of node {name!r}", element, states, inputs)
         if len({crc32(name.encode()) for name in self.nodes}) != len(self.nodes):
             raise fail("node names", "names with distinct checksums", list(self.nodes))
         if self.fused and FUSED in self.nodes:
@@ -135,17 +135,17 @@ class Network(Module):
             raise fail("relay schedules", f"those of {list(relays.relays)}", list(schedules))
         filters: dict[str, dict[str, AbstractFilter]] = {}
         n = len(relays.states)
-        for name, heard in zip(relays.relays, relays.received, strict=False):
+        for name, item in zip(relays.relays, relays.received, strict=False):
             shape = schedules[name].gains.direct.shape[1:]
-            if shape != (n, heard):
-                raise fail(f"schedule of {name!r}", f"gains of shape {(n, heard)}", f"shape {shape}")
-            filters[name] = {OWN: ScheduledFilter(schedules[name])}
+            if shape != (n, item):
+                raise fail(f"schedule of {name!r}", f"gains of shape {(n, item)}", f"shape {shape}")
+            filters[name] = {LOCAL: ScheduledFilter(schedules[name])}
         filters[RECEIVER] = dict(receivers)
         check_filters(filters[RECEIVER], relays.received[-1])
         outputs = tuple(first(relays.sensor).outputs)
         nodes = {
-            name: Listener(filters[name], heard, outputs, relays.hears_always(name))
-            for name, heard in zip(relays.filters, relays.received, strict=True)
+            name: Listener(filters[name], item, outputs, relays.always_receives(name))
+            for name, item in zip(relays.filters, relays.received, strict=True)
         }
         return Network(relays.plant, nodes, relays=relays)
 
@@ -167,13 +167,17 @@ class Network(Module):
         check_link(first(sensor), first(channel), len(first(plant).states), late=True)
         received_angles(plant, sensor, channel)
         check_forgets("channel of nodes that share it", first(channel))
-        heard = {name: max((item.received for item in own.values()), default=0) for name, own in filters.items()}
-        if sum(heard.values()) != first(channel).outputs:
-            raise fail("nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", heard)
+        received = {
+            name: max((item.received for item in filter_.values()), default=0) for name, filter_ in filters.items()
+        }
+        if sum(received.values()) != first(channel).outputs:
+            raise fail(
+                "nodes that share a channel", f"to hear its {first(channel).outputs} outputs, each once", received
+            )
         names, complete = tuple(first(sensor).outputs), not first(channel).erases
-        for name, own in filters.items():
-            check_filters(own, heard[name])
-        nodes = {name: Listener(dict(own), heard[name], names, complete) for name, own in filters.items()}
+        for name, filter_ in filters.items():
+            check_filters(filter_, received[name])
+        nodes = {name: Listener(dict(filter_), received[name], names, complete) for name, filter_ in filters.items()}
         return Network(plant, nodes, fused, common=Common(sensor, channel))
 
     def rows(self) -> dict[str, np.ndarray]:
@@ -203,11 +207,11 @@ class Network(Module):
         Raises:
             ValueError: none has it.
         """
-        found = [node for node in self.names if name in self.nodes[node].filters]
-        if not found:
+        results = [node for node in self.names if name in self.nodes[node].filters]
+        if not results:
             known = sorted({f for node in self.nodes.values() for f in node.filters})
             raise fail("fusion", f"a filter that some node has {known}", repr(name))
-        return found
+        return results
 
     def places(self) -> dict[tuple[str, str], tuple[int, int, int]]:
         """Where the estimate of a node's filter stands, as (kind, filter, node), by node and filter."""
@@ -249,11 +253,11 @@ class Network(Module):
         names = self.nodes_with(item.filter)
         if not isinstance(item.rule, AbstractInformedFusion):
             return item.claim([self.nodes[n].filters[item.filter].claim for n in names])
-        rule, own = type(item.rule).__name__, {n: self.nodes[n] for n in names}
+        rule, local = type(item.rule).__name__, {n: self.nodes[n] for n in names}
         if item.quantizer is not None and not item.by_report:
             raise fail(f"fusion by {rule}", "uplinks that deliver what is sent", "a quantizer")
         known = self.parts_of(item.filter)
-        if len(known) < len(own):
+        if len(known) < len(local):
             raise fail(f"fusion by {rule}", "nodes that hear sensors through channels", "relays")
         if (item.by_report or item.rule.needs_plant_moments) and along_estimates(known):
             raise fail(f"fusion by {rule}", "filters whose gains depend on no data, for the plant's own moments",
@@ -261,13 +265,13 @@ class Network(Module):
         claim = informed_claim(rule, self.plant, known, self.common is not None)
         if not item.by_report:
             return claim
-        return reported_claim(rule, claim, item, {n: node.complete for n, node in own.items()})
+        return reported_claim(rule, claim, item, {n: node.complete for n, node in local.items()})
 
     def parts_of(self, name: str) -> dict[str, tuple[AnySensor, Channel, AbstractFilter]]:
         """Sensor, channel and the filter `name` of each node that has it and hears a sensor through a channel."""
-        own = {node: self.nodes[node] for node in self.nodes_with(name)}
-        worlds = {n: v if isinstance(v, Node) else self.common for n, v in own.items()}
-        return {n: (w.sensor, w.channel, own[n].filters[name]) for n, w in worlds.items() if w is not None}
+        local = {node: self.nodes[node] for node in self.nodes_with(name)}
+        worlds = {n: v if isinstance(v, Node) else self.common for n, v in local.items()}
+        return {n: (w.sensor, w.channel, local[n].filters[name]) for n, w in worlds.items() if w is not None}
 
     def check_horizon(self, horizon: int) -> None:
         """Raise ValueError if something that varies over time ends before `horizon` steps."""
@@ -278,21 +282,21 @@ class Network(Module):
 def _world(node: Node | Listener) -> object:
     """What decides how a node hears."""
     if isinstance(node, Node):
-        return node.sensor, anonymous(node.channel), node.told_by
+        return node.sensor, anonymous(node.channel), node.informed_by
     return node.received, node.complete
 
 
 def lowered(claims: Claims) -> Claims:
     """Nominal, whatever is claimed more."""
     return {
-        node: {name: "none" if claim == "none" else "nominal" for name, claim in each.items()}
-        for node, each in claims.items()
+        node: {name: "none" if claim == "none" else "nominal" for name, claim in element.items()}
+        for node, element in claims.items()
     }
 
 
 def _grouped(items: Iterable[tuple[str, object]]) -> tuple[tuple[str, ...], ...]:
     """Names of what shares a structure, in order of first appearance."""
-    found: dict[object, list[str]] = {}
+    results: dict[object, list[str]] = {}
     for name, item in items:
-        found.setdefault(structure(item), []).append(name)
-    return tuple(tuple(names) for names in found.values())
+        results.setdefault(structure(item), []).append(name)
+    return tuple(tuple(names) for names in results.values())

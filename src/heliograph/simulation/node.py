@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import equinox as eqx
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.fed_back import FedBackFilter
+from heliograph.filters.wrappers.fed_back import FedBackFilter
 from heliograph.model.channel import Channel, check_sent
 from heliograph.model.limits import Limits, LimitsLike, limits_of
 from heliograph.model.over_time import first
@@ -55,9 +55,9 @@ class Node(Module):
         self.limits = limits_of(self.received, limits, invalid)
         for name, item in self.filters.items():
             check_flags(f"filter {name!r}", item, [first(channel)])
-        hearing = [name for name, item in self.filters.items() if item.received]
-        if self.told_by is not None and hearing != [self.told_by]:
-            raise fail("node whose sensor hears back", f"no filter that hears beside {self.told_by!r}", hearing)
+        observation = [name for name, item in self.filters.items() if item.received]
+        if self.informed_by is not None and observation != [self.informed_by]:
+            raise fail("node whose sensor hears back", f"no filter that hears beside {self.informed_by!r}", observation)
 
     @property
     def received(self) -> int:
@@ -65,7 +65,7 @@ class Node(Module):
         return int(first(self.channel).outputs)
 
     @property
-    def told_by(self) -> str | None:
+    def informed_by(self) -> str | None:
         """Name of the filter whose estimates the sensor hears back; None where it hears none."""
         return next((name for name, item in self.filters.items() if isinstance(item, FedBackFilter)), None)
 
@@ -128,9 +128,9 @@ def check_received(name: str, item: AbstractFilter, received: int) -> None:
 
 def check_sizes(name: str, item: AbstractFilter, states: tuple[str, ...], inputs: tuple[str, ...]) -> None:
     """A filter of as many states and inputs as the plant has."""
-    for what, own, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
-        if len(own) != len(theirs):
-            raise fail(name, f"the plant's {len(own)} {what} {list(own)}", f"{len(theirs)} {list(theirs)}")
+    for what, single, theirs in (("states", states, item.states), ("inputs", inputs, item.inputs)):
+        if len(single) != len(theirs):
+            raise fail(name, f"the plant's {len(single)} {what} {list(single)}", f"{len(theirs)} {list(theirs)}")
 
 
 def check_filters(filters: Mapping[str, object], received: int) -> None:

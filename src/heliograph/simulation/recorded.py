@@ -15,14 +15,14 @@ from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.types import Float
-from heliograph.simulation.given import inputs_of, measurement_of
+from heliograph.simulation.arguments import inputs_of, measurement_of
+from heliograph.simulation.centres.uplinks import Drawn, SentReports
 from heliograph.simulation.judging import any_implausible, doubts, plausible_step, refused_rows
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Listener, Node
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 from heliograph.simulation.smoothed import Smoother, found_record, one_run, smoothed_part
 from heliograph.simulation.stepping import AllFilters
-from heliograph.simulation.uplinks import Drawn, SentReports
 from heliograph.smoothing.modes import AbstractSmoothing
 
 Rest = tuple[AllFilters, Smoother | None, np.ndarray, dict[str, Drawn]]  # what a recording is filtered with
@@ -73,8 +73,8 @@ def run(
             name: item.uplinks.recorded(name, item.nodes, given.get(name), steps)
             for name, item in filters.reporting.items()
         }
-        found = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
-    return found_record(network, part, found, clock)
+        result = _plausible(network, z, (filters, part and part.smoother(filters), u, arrivals))
+    return found_record(network, part, result, clock)
 
 
 def _within(name: str, node: Node | Listener, z: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, "steps m"]:
@@ -99,21 +99,21 @@ def _plausible(network: Network, z: dict[str, np.ndarray], rest: Rest) -> PyTree
     def grouped() -> tuple[np.ndarray, ...]:
         return tuple(np.stack([z[name] for name in names], axis=1) for names in network.groups)
 
-    found = _filtered(*rest, grouped(), False)
-    if not any_implausible(found):
-        said = doubts(network, found, {})
+    result = _filtered(*rest, grouped(), False)
+    if not any_implausible(result):
+        said = doubts(network, result, {})
     else:
-        found = _filtered(*rest, grouped(), True)
-        refused = refused_rows(network, found)
-        said = doubts(network, found, refused)
+        result = _filtered(*rest, grouped(), True)
+        refused = refused_rows(network, result)
+        said = doubts(network, result, refused)
         for name, rows in refused.items():
             z[name] = z[name].copy()
             z[name][list(rows)] = np.nan
         again = _filtered(*rest, grouped(), False)
-        found = _filtered(*rest, grouped(), True) if any_implausible(again) else again
+        result = _filtered(*rest, grouped(), True) if any_implausible(again) else again
     for line in said:
         warnings.warn(line, stacklevel=3)
-    return {name: part for name, part in found.items() if not name.startswith("judged")}
+    return {name: part for name, part in result.items() if not name.startswith("judged")}
 
 
 def _filtered(*arguments: PyTree) -> PyTree:
@@ -137,9 +137,9 @@ def _run_filters(
         return filters.step(states, z_k, u_k, k, drawn)
 
     rows = jnp.arange(len(u)), u, z, arrivals
-    found = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
-    judged = {name: found.pop(name) for name in ("judged", "judged_centrally")}
-    return (found if later is None else one_run(later.both, found)) | judged
+    results = {"measurements": z, **jax.lax.scan(body, filters.init(), rows)[1]}
+    judged = {name: results.pop(name) for name in ("judged", "judged_centrally")}
+    return (results if later is None else one_run(later.both, results)) | judged
 
 
 _by_xla = quickly_compiled(_run_filters)

@@ -10,39 +10,39 @@ from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
 from heliograph.filters.plausibility import Judgement, Reason
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.module import Module
 
 
-class Told(NamedTuple):
+class StepOutput(NamedTuple):
     """What a filter tells of a step: its estimate, and what it retains of the step or says of the data, if asked."""
 
     estimate: Estimate
-    retained: AbstractRetained | None = None
+    steps: AbstractSmootherStep | None = None
     judgement: Judgement | None = None
 
 
-def told_step(
+def filter_step(
     item: AbstractFilter,
     state: PyTree,
     z: jax.Array,
     u: jax.Array,
     k: jax.Array,
-    retains: bool,
+    smooths: bool,
     judges: bool = False,
     skip: jax.Array | None = None,
-) -> tuple[PyTree, Told]:
+) -> tuple[PyTree, StepOutput]:
     """One step of a filter, and what is told of it.
 
     `skip`: the reason not to use z, where there is one: then nothing of it arrived, and where the prediction itself is
     no number the state before it stays.
     """
     z = z if skip is None else jnp.where(skip > 0, jnp.nan, z)
-    if retains:
+    if smooths:
         judgement = item.step_judged(state, z, u, k)[2] if judges else None
-        after, retained = item.step_retained(state, z, u, k)
-        return after, Told(item.after_step(after, k), retained, judgement)
+        after, steps = item.step_with_smoother(state, z, u, k)
+        return after, StepOutput(item.after_step(after, k), steps, judgement)
     if judges:
         after, estimate, judgement = item.step_judged(state, z, u, k)
     else:
@@ -50,7 +50,7 @@ def told_step(
     if skip is not None:
         stays, known = skip == Reason.PREDICTION, (state, item.estimate(state))
         after, estimate = jax.tree.map(lambda old, new: jnp.where(stays, old, new), known, (after, estimate))
-    return after, Told(estimate, judgement=judgement)
+    return after, StepOutput(estimate, judgement=judgement)
 
 
 class Alike(Module):
@@ -64,7 +64,7 @@ class Alike(Module):
     group: int = eqx.field(static=True)
     count: int = eqx.field(static=True)
     nodes: int = eqx.field(static=True)
-    retains: bool = eqx.field(static=True, default=False)
+    smooths: bool = eqx.field(static=True, default=False)
     judges: bool = eqx.field(static=True, default=False)
 
     def init(self) -> PyTree:
@@ -73,19 +73,21 @@ class Alike(Module):
 
     def step(
         self, states: PyTree, z: jax.Array, u: jax.Array, k: jax.Array, skip: jax.Array | None = None
-    ) -> tuple[PyTree, Told]:
+    ) -> tuple[PyTree, StepOutput]:
         """One step of each from the nodes' measurements (node, received); what is told of it, (filter, node, ...).
 
         `skip` (filter, node): reasons not to use them.
         """
 
-        def one(item: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None) -> tuple[PyTree, Told]:
-            return told_step(item, state, z, u, k, self.retains, self.judges, skip)
+        def single(
+            item: AbstractFilter, state: PyTree, z: jax.Array, skip: jax.Array | None
+        ) -> tuple[PyTree, StepOutput]:
+            return filter_step(item, state, z, u, k, self.smooths, self.judges, skip)
 
         reasons = None if skip is None else skip.reshape(-1)
-        both = eqx.filter_vmap(one, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0)))
-        after, told = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
-        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), told)
+        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0, eqx.if_array(0)))
+        after, known = both(self.filters, states, jnp.tile(z, (self.count, 1)), reasons)
+        return after, jax.tree.map(lambda leaf: leaf.reshape(self.count, len(z), *leaf.shape[1:]), known)
 
     def matrices(
         self, read: Callable[..., object], states: PyTree, f: int, z: jax.Array, u: jax.Array, k: jax.Array
@@ -93,8 +95,8 @@ class Alike(Module):
         """What `read` gives of this step of filter f at each node, from the states before it; (node, ...)."""
         mine = slice(f * self.nodes, (f + 1) * self.nodes)
         filters, states = jax.tree.map(lambda leaf: leaf[mine] if eqx.is_array(leaf) else leaf, (self.filters, states))
-        each = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
-        return each(filters, states, z)
+        items = eqx.filter_vmap(lambda item, state, z: read(item, state, z, u, k), in_axes=(eqx.if_array(0), 0, 0))
+        return items(filters, states, z)
 
 
 def started(item: AbstractFilter) -> PyTree:

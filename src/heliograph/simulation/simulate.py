@@ -15,15 +15,15 @@ from heliograph.numerics.check import check_count, fail, instance, shown
 from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.forked import check_process
 from heliograph.numerics.module import Module
-from heliograph.simulation.air import air_of
-from heliograph.simulation.by_run import trajectories
-from heliograph.simulation.given import inputs_of, key_of
-from heliograph.simulation.lanes import BLOCK, Lanes, one_processor
-from heliograph.simulation.native_runs import natively
+from heliograph.simulation.arguments import inputs_of, key_of
+from heliograph.simulation.medium import medium_of
 from heliograph.simulation.network import Network, lowered
-from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer, Result, Trajectories
-from heliograph.simulation.smoothed import Beside, Smoother, smoothed_part
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.reducer import AbstractReducer, Result, Trajectories
+from heliograph.simulation.runs.by_run import trajectories
+from heliograph.simulation.runs.lanes import BLOCK, Lanes, one_processor
+from heliograph.simulation.runs.native_runs import natively
+from heliograph.simulation.smoothed import Smoother, WithSmoothed, smoothed_part
 from heliograph.simulation.stepping import AllFilters, plan, plans
 from heliograph.simulation.world import World
 from heliograph.smoothing.modes import AbstractSmoothing
@@ -118,17 +118,17 @@ def monte_carlo(
         if made is not None:
             return made
     filters = AllFilters(network, part and part.kinds)
-    world = World(network.plant, air_of(network), plan(filters, u) if plans(filters) else filters)
-    both: Beside[PyTree] = Beside(reducer)
+    world = World(network.plant, medium_of(network), plan(filters, u) if plans(filters) else filters)
+    both: WithSmoothed[PyTree] = WithSmoothed(reducer)
     keeper = reducer if part is None else both
     job = _Job(world, part and part.smoother(filters), u, base, np.asarray(first_run + runs), keeper, single)
-    kept = _kept(job, first_run, runs, chunk, progress)
-    told = network.in_single_precision() if single else network
+    recorded = _recorded(job, first_run, runs, chunk, progress)
+    known = network.in_single_precision() if single else network
     if part is not None:
         claims = lowered(part.claims) if single else part.claims
-        result: Record | Result = both.finished(*kept, told, part._replace(claims=claims))
+        result: Record | Result = both.finished(*recorded, known, part._replace(claims=claims))
         return result
-    return reducer.finish(*kept, told)
+    return reducer.finish(*recorded, known)
 
 
 class _Job(Module):
@@ -143,7 +143,7 @@ class _Job(Module):
     single: bool = eqx.field(static=True)
 
 
-def _kept(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:
+def _recorded(job: _Job, first_run: int, runs: int, chunk: int, progress: Progress | None) -> tuple[PyTree, PyTree]:
     """What the reducer holds after all runs, and what it collected of them, chunk by chunk."""
     parts = []
     with jax.enable_x64(True):
@@ -195,8 +195,8 @@ def _block(job: _Job, runs: jax.Array) -> PyTree:
         return _trajectories(job.world, job.later, job.inputs, job.key, runs)
     with jax.enable_x64(False):
         world, later, inputs = jax.tree.map(_single, (job.world, job.later, job.inputs))
-        found = _trajectories(world, later, inputs, job.key, runs)
-    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, found)
+        result = _trajectories(world, later, inputs, job.key, runs)
+    return jax.tree.map(lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, result)
 
 
 def _single(leaf: PyTree) -> PyTree:
@@ -205,8 +205,8 @@ def _single(leaf: PyTree) -> PyTree:
 
 def _simulated(world: World, later: Smoother | None, u: PyTree, key: jax.Array, runs: jax.Array) -> PyTree:
     keys = jax.vmap(lambda run: jax.random.fold_in(key, run))(runs)
-    found = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
-    return found if later is None else later.both(found)
+    result = trajectories(world.init, world.step, keys, (jnp.arange(len(u)), jnp.asarray(u)))
+    return result if later is None else later.both(result)
 
 
 # Traced once, for its shapes and for the program alike: tracing is half of what a first call takes.

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.informed import AbstractInformedFusion
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Claim, Estimate
@@ -19,13 +19,13 @@ from heliograph.numerics.angle import Angles, nearest
 from heliograph.numerics.check import fail, instance
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import PyTree
-from heliograph.simulation.by_run import each_run
-from heliograph.simulation.gathering import Fused
+from heliograph.simulation.centres.gathering import Fused
 from heliograph.simulation.network import FUSED, Claims, Network
-from heliograph.simulation.record import Record
-from heliograph.simulation.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
+from heliograph.simulation.results.record import Record
+from heliograph.simulation.results.reducer import AbstractReducer, OfStep, Result, Trajectories, trajectories_record
+from heliograph.simulation.runs.by_run import each_run
 from heliograph.simulation.stepping import AllFilters
-from heliograph.smoothing.consistency import surprise_sums, warn_of
+from heliograph.smoothing.consistency import nis_sums, warn_of
 from heliograph.smoothing.modes import AbstractSmoothing
 
 
@@ -40,43 +40,43 @@ class Smoother(Module):
     kinds: tuple[int, ...] = eqx.field(static=True)
     groups: tuple[int, ...] = eqx.field(static=True)
 
-    def both(self, found: PyTree) -> PyTree:
+    def both(self, result: PyTree) -> PyTree:
         """What a reducer takes of runs (run, time, ...), "filtered" and "smoothed", and sums of surprise."""
-        retained = [found["retained"][k] for k in self.kinds]
-        filtered = {name: part for name, part in found.items() if name not in ("retained", "retained_centrally")}
-        surprised = jax.vmap(jax.vmap(surprise_sums, in_axes=1), in_axes=1)
-        estimates = tuple(self._estimates(steps, 2) for steps in retained)
-        fused = {name: self._estimates(steps, 0) for name, steps in found["retained_centrally"].items()}
+        steps_ = [result["retained"][k] for k in self.kinds]
+        filtered = {name: part for name, part in result.items() if name not in ("retained", "retained_centrally")}
+        surprised = jax.vmap(jax.vmap(nis_sums, in_axes=1), in_axes=1)
+        estimates = tuple(self._estimates(steps, 2) for steps in steps_)
+        fused = {name: self._estimates(steps, 0) for name, steps in result["retained_centrally"].items()}
         for item in self.fusions:
             fused |= each_run(partial(_combined, item), estimates)
         length = jax.tree.leaves((estimates, fused))[0].shape[1]
         smoothed = {
-            "measurements": tuple(found["measurements"][g][:, -length:] for g in self.groups),
+            "measurements": tuple(result["measurements"][g][:, -length:] for g in self.groups),
             "estimates": estimates,
             "fused": fused,
             "uplinks": {},
             "reports": {},
         }
-        if "truth" in found:
-            truth = self.smoothing.about(found["truth"])
-            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in retained])}
-        surprise = tuple(each_run(surprised, steps) for steps in retained)
-        centrally = {name: each_run(surprise_sums, steps) for name, steps in found["retained_centrally"].items()}
-        return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": surprise, "fused": centrally}}
+        if "truth" in result:
+            truth = self.smoothing.about(result["truth"])
+            smoothed |= {"truth": truth, **self._near(truth, smoothed, [steps.angles for steps in steps_])}
+        nis = tuple(each_run(surprised, steps) for steps in steps_)
+        centrally = {name: each_run(nis_sums, steps) for name, steps in result["retained_centrally"].items()}
+        return {"filtered": filtered, "smoothed": smoothed, "surprise": {"estimates": nis, "fused": centrally}}
 
-    def _near(self, truth: jax.Array, told: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
+    def _near(self, truth: jax.Array, known: Mapping[str, PyTree], angles: Sequence[Angles]) -> dict[str, PyTree]:
         """Estimates with their angles within half a turn of the truth, so that x - xhat is the error."""
 
-        def near(one: Estimate, which: Angles) -> Estimate:
-            mean = jnp.asarray(one.mean)
-            beside = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), truth.shape[-1])
-            return Estimate(nearest(mean, beside, which), one.covariance, one.claim)
+        def near(estimate: Estimate, which: Angles) -> Estimate:
+            mean = jnp.asarray(estimate.mean)
+            others = truth.reshape(*truth.shape[:2], *[1] * (mean.ndim - 3), truth.shape[-1])
+            return Estimate(nearest(mean, others, which), estimate.covariance, estimate.claim)
 
         every = next((which for which in angles if which), ())
-        estimates = tuple(near(one, which) for one, which in zip(told["estimates"], angles, strict=True))
-        return {"estimates": estimates, "fused": {name: near(one, every) for name, one in told["fused"].items()}}
+        estimates = tuple(near(item, which) for item, which in zip(known["estimates"], angles, strict=True))
+        return {"estimates": estimates, "fused": {name: near(item, every) for name, item in known["fused"].items()}}
 
-    def _estimates(self, steps: AbstractRetained, axes: int) -> Estimate:
+    def _estimates(self, steps: AbstractSmootherStep, axes: int) -> Estimate:
         """Of runs (run, time, ...), with so many axes after time; where runs share all matrices, covariances once."""
 
         def over(function: Callable[[PyTree], PyTree]) -> Callable[[PyTree], PyTree]:
@@ -136,7 +136,7 @@ def _smoothed_claim(item: AbstractFilter) -> Claim:
     u, z = np.zeros(len(item.inputs)), np.zeros(item.received)
     with jax.enable_x64(True):
         state = jax.tree.map(jnp.asarray, item.init())
-        _, step = eqx.filter_eval_shape(lambda one, state: one.step_retained(state, z, u, 0), item, state)
+        _, step = eqx.filter_eval_shape(lambda single, state: single.step_with_smoother(state, z, u, 0), item, state)
     claim: Claim = step.claim
     return claim
 
@@ -152,13 +152,13 @@ def _fused_claim(network: Network, name: str, item: Fusion | AbstractFilter, cla
     return item.claim([claims[node][item.filter] for node in network.nodes_with(item.filter)])
 
 
-def _warn_of_surprise(network: Network, surprise: PyTree) -> None:
+def _warn_of_nis(network: Network, nis: PyTree) -> None:
     """Warn of filters whose innovations are larger than they believe, from sums over blocks and runs."""
-    for (group, names), sums in zip(network.kinds, surprise["estimates"], strict=True):
+    for (group, names), sums in zip(network.kinds, nis["estimates"], strict=True):
         for f, name in enumerate(names):
             for i, node in enumerate(network.groups[group]):
                 warn_of(f"{node}/{name}", np.asarray(sums[f, i]))
-    for name, sums in surprise["fused"].items():
+    for name, sums in nis["fused"].items():
         warn_of(f"{FUSED}/{name}", np.asarray(sums))
 
 
@@ -167,18 +167,18 @@ def one_run(function: Callable[[PyTree], PyTree], values: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[0], function(jax.tree.map(lambda leaf: leaf[None], values)))
 
 
-def found_record(network: Network, part: Part | None, found: PyTree, time: np.ndarray) -> Record:
+def found_record(network: Network, part: Part | None, result: PyTree, time: np.ndarray) -> Record:
     """The record of a recording, with what was smoothed beside it."""
     if part is None:
-        return trajectories_record(network, {"truth": None, **found}, time)
-    _warn_of_surprise(part.network, found["surprise"])
-    filtered = trajectories_record(network, {"truth": None, **found["filtered"]}, time)
-    length = found["smoothed"]["measurements"][0].shape[0]
-    smoothed = trajectories_record(part.network, {"truth": None, **found["smoothed"]}, time[-length:])
-    return Trajectories().beside(filtered, smoothed, part.claims)
+        return trajectories_record(network, {"truth": None, **result}, time)
+    _warn_of_nis(part.network, result["surprise"])
+    filtered = trajectories_record(network, {"truth": None, **result["filtered"]}, time)
+    length = result["smoothed"]["measurements"][0].shape[0]
+    smoothed = trajectories_record(part.network, {"truth": None, **result["smoothed"]}, time[-length:])
+    return Trajectories().others(filtered, smoothed, part.claims)
 
 
-class Beside(AbstractReducer[Result]):
+class WithSmoothed(AbstractReducer[Result]):
     """What is kept of filtered estimates, the same of smoothed ones, and sums of surprise.
 
     A block is {"filtered", "smoothed", "surprise"}; the first two are such as the reducer takes.
@@ -188,21 +188,21 @@ class Beside(AbstractReducer[Result]):
 
     def initial(self, shapes: PyTree) -> PyTree:
         """Both carries, and no surprise."""
-        surprise = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["surprise"])
-        return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), surprise
+        nis = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), shapes["surprise"])
+        return self.reducer.initial(shapes["filtered"]), self.reducer.initial(shapes["smoothed"]), nis
 
     def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
         """Both."""
-        filtered, smoothed, surprise = carry
-        filtered, kept = self.reducer.reduce(filtered, batch["filtered"], runs, valid)
+        filtered, smoothed, nis = carry
+        filtered, recorded = self.reducer.reduce(filtered, batch["filtered"], runs, valid)
         smoothed, kept_later = self.reducer.reduce(smoothed, batch["smoothed"], runs, valid)
 
         def added(total: jax.Array, part: jax.Array) -> jax.Array:
-            each = jnp.broadcast_to(part, (len(valid), *part.shape[1:]))
-            return total + jnp.sum(jnp.where(valid.reshape(-1, *[1] * (each.ndim - 1)), each, 0.0), axis=0)
+            values = jnp.broadcast_to(part, (len(valid), *part.shape[1:]))
+            return total + jnp.sum(jnp.where(valid.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0), axis=0)
 
-        surprise = jax.tree.map(added, surprise, batch["surprise"])
-        return (filtered, smoothed, surprise), (kept, kept_later)
+        nis = jax.tree.map(added, nis, batch["surprise"])
+        return (filtered, smoothed, nis), (recorded, kept_later)
 
     def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
         """Both, of pairs; and surprise."""
@@ -210,10 +210,10 @@ class Beside(AbstractReducer[Result]):
             self.reducer.summed(OfStep(sums.sums[i], sums.ever[i]), OfStep(common.sums[i], common.ever[i]), count)
             for i in (0, 1)
         )
-        surprise = jax.tree.map(
+        nis = jax.tree.map(
             lambda leaf, same: leaf * count.sum() if same else leaf.sum(axis=-1), sums.sums[2], common.sums[2]
         )
-        return filtered, smoothed, surprise
+        return filtered, smoothed, nis
 
     def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
         """The filtered one alone; `finished` makes both."""
@@ -221,6 +221,6 @@ class Beside(AbstractReducer[Result]):
 
     def finished(self, carry: PyTree, collected: PyTree, network: Network, part: Part) -> Result:
         """The result of the network with that of its smoothed part beside it; warns of filters not worth smoothing."""
-        _warn_of_surprise(part.network, carry[2])
+        _warn_of_nis(part.network, carry[2])
         smoothed = self.reducer.finish(carry[1], collected[1], part.network)
-        return self.reducer.beside(self.finish(carry, collected, network), smoothed, part.claims)
+        return self.reducer.others(self.finish(carry, collected, network), smoothed, part.claims)

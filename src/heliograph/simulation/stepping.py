@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.plan import Plan
+from heliograph.filters.linear.plan import Plan
 from heliograph.fusion.all_reports import AllReports
 from heliograph.fusion.rules import Fusion
 from heliograph.model.estimate import Estimate
@@ -22,17 +22,17 @@ from heliograph.numerics.compiler import quickly_compiled
 from heliograph.numerics.float64 import to_numpy
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, Float
-from heliograph.simulation.centre import (
+from heliograph.simulation.centres.centre import (
     Centre,
     CentreState,
 )
-from heliograph.simulation.gathering import Fused, Reporting, centres_of, fusions_of, gathering
-from heliograph.simulation.hearing import CentreFilter
-from heliograph.simulation.linearised import Followed, LinearisedCentre
+from heliograph.simulation.centres.fusion_centre import CentreFilter
+from heliograph.simulation.centres.gathering import Fused, Reporting, centres_of, fusions_of, gathering
+from heliograph.simulation.centres.linearised import Followed, LinearisedCentre
+from heliograph.simulation.centres.uplinks import Drawn, uplinks_of
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Listener, Node
-from heliograph.simulation.side_by_side import Alike, over_all, started, told_step
-from heliograph.simulation.uplinks import Drawn, uplinks_of
+from heliograph.simulation.side_by_side import Alike, filter_step, over_all, started
 from heliograph.smoothing.sweep import planned_with_past
 
 
@@ -51,22 +51,22 @@ class AllFilters(Module):
     order: np.ndarray | None
     complete: tuple[bool, ...] = eqx.field(static=True)  # of each group: nothing is ever missing
     n: int = eqx.field(static=True)
-    retains: bool = eqx.field(static=True)
+    smooths: bool = eqx.field(static=True)
     judges: bool = eqx.field(static=True)
 
-    def __init__(self, network: Network, retaining: Collection[int] | None = None, judges: bool = False):
+    def __init__(self, network: Network, smoothed_groups: Collection[int] | None = None, judges: bool = False):
         """`retaining`: which kinds are to be smoothed, and the central filters with them; None if nothing is.
 
         `judges`: filters say what is implausible, and leave it out where they are told so; none of them retains.
         """
-        self.retains, self.judges = retaining is not None, judges
+        self.smooths, self.judges = smoothed_groups is not None, judges
         self.alike = tuple(
             Alike(
                 stack([network.nodes[name].filters[f] for f in names for name in network.groups[g]]),
                 g,
                 len(names),
                 len(network.groups[g]),
-                retaining is not None and kind in retaining,
+                smoothed_groups is not None and kind in smoothed_groups,
                 judges,
             )
             for kind, (g, names) in enumerate(network.kinds)
@@ -84,13 +84,13 @@ class AllFilters(Module):
     def init(self) -> PyTree:
         """States before the first step: of nodes' filters, central filters, quantizers, centres, reports."""
         central = {name: started(item) for name, item in self.central.items()}
-        own = tuple(item.init() for item in self.alike)
+        local = tuple(item.init() for item in self.alike)
         sent = tuple(item.init(self.n) for item in self.fusions)
         reporting = {name: item.init() for name, item in self.reporting.items()}
-        return own, central, sent, tuple(self._started(item, own) for item in self.centres), reporting
+        return local, central, sent, tuple(self._started(item, local) for item in self.centres), reporting
 
-    def _started(self, centre: Centre | LinearisedCentre, own: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
-        means = [own[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
+    def _started(self, centre: Centre | LinearisedCentre, local: Sequence[PyTree]) -> CentreState | dict[str, Followed]:
+        means = [local[kind].mean.reshape(self.alike[kind].count, -1, self.n)[f] for kind, f in centre.sources]
         return centre.init(means)
 
     @property
@@ -98,13 +98,13 @@ class AllFilters(Module):
         """The centres of filters whose gains depend on no data."""
         return tuple(centre for centre in self.centres if isinstance(centre, Centre))
 
-    def matrices(self, centre: Centre, own: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
+    def matrices(self, centre: Centre, local: PyTree, u: jax.Array, k: jax.Array) -> list[Plan]:
         """Of a centre's sources at step k: nothing but covariances counts, so what is heard may be zero."""
-        return [self.alike[i].matrices(centre.read, own[i], f, self._quiet(i), u, k) for i, f in centre.sources]
+        return [self.alike[i].matrices(centre.read, local[i], f, self._quiet(i), u, k) for i, f in centre.sources]
 
-    def followed(self, own: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+    def followed(self, local: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
         """The nodes' states after step k, where what is heard is zero."""
-        pairs = zip(self.alike, own, strict=True)
+        pairs = zip(self.alike, local, strict=True)
         return tuple(item.step(state, self._quiet(i), u, k)[0] for i, (item, state) in enumerate(pairs))
 
     def _quiet(self, kind: int) -> jax.Array:
@@ -126,53 +126,53 @@ class AllFilters(Module):
         "retained" by kind and "retained_centrally" by name; "judged" and "judged_centrally" if filters judge, and
         `skip` has the reasons of the same form not to use data.
         """
-        own, central, sent, known, reporting = states
-        reasons = [None] * len(own) if skip is None else skip[0]
+        local, central, sent, known, reporting = states
+        reasons = [None] * len(local) if skip is None else skip[0]
         results = [
             item.step(state, z[item.group], u, k, why)
-            for item, state, why in zip(self.alike, own, reasons, strict=True)
+            for item, state, why in zip(self.alike, local, reasons, strict=True)
         ]
-        estimates = tuple(one.estimate for _, one in results)
+        estimates = tuple(single.estimate for _, single in results)
         joined = jnp.concatenate([jnp.ravel(part) for part in z])
         joined = joined if self.order is None else joined[self.order]
-        heard = {
-            name: told_step(item, central[name], joined, u, k, self.retains, self.judges, skip and skip[1][name])
+        received = {
+            name: filter_step(item, central[name], joined, u, k, self.smooths, self.judges, skip and skip[1][name])
             for name, item in self.central.items()
         }
-        fused = {name: one.estimate for name, (_, one) in heard.items()}
+        fused = {name: single.estimate for name, (_, single) in received.items()}
         uplinks: dict[str, PyTree] = {}
         after = []
         for item, state in zip(self.fusions, sent, strict=True):
-            following, found, traffic = item.step(state, estimates, k)
+            following, outcome, traffic = item.step(state, estimates, k)
             after.append(following)
-            fused |= found
+            fused |= outcome
             uplinks |= traffic
         learned = []
         for centre, state in zip(self.centres, known, strict=True):
-            following, found = self._centred(centre, state, own, z, estimates, u, k)
+            following, outcome = self._centred(centre, state, local, z, estimates, u, k)
             learned.append(following)
-            fused |= found
-        told, reports = {}, {}
+            fused |= outcome
+        published, reports = {}, {}
         for name, link in self.reporting.items():
             happens = link.uplinks.undrawn() if drawn is None or name not in drawn else drawn[name]
-            told[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
+            published[name], fused[name], traffic, reports[name] = link.step(reporting[name], estimates, happens, u, k)
             uplinks |= {name: traffic} if traffic else {}
-        own, central = tuple(state for state, _ in results), {name: state for name, (state, _) in heard.items()}
-        following = own, central, tuple(after), tuple(learned), told
+        local, central = tuple(state for state, _ in results), {name: state for name, (state, _) in received.items()}
+        following = local, central, tuple(after), tuple(learned), published
         result: dict[str, PyTree] = {"estimates": estimates, "fused": fused, "uplinks": uplinks, "reports": reports}
-        if self.retains:
-            result["retained"] = tuple(one.retained for _, one in results)
-            result["retained_centrally"] = {name: one.retained for name, (_, one) in heard.items()}
+        if self.smooths:
+            result["retained"] = tuple(single.steps for _, single in results)
+            result["retained_centrally"] = {name: single.steps for name, (_, single) in received.items()}
         if self.judges:
-            result["judged"] = tuple(one.judgement for _, one in results)
-            result["judged_centrally"] = {name: one.judgement for name, (_, one) in heard.items()}
+            result["judged"] = tuple(single.judgement for _, single in results)
+            result["judged_centrally"] = {name: single.judgement for name, (_, single) in received.items()}
         return following, result
 
     def _centred(
         self,
         centre: Centre | LinearisedCentre,
         state: PyTree,
-        own: PyTree,
+        local: PyTree,
         z: Sequence[jax.Array],
         estimates: Sequence[Estimate],
         u: jax.Array,
@@ -180,7 +180,7 @@ class AllFilters(Module):
     ) -> tuple[PyTree, dict[str, Estimate]]:
         """A centre's step, which reads the matrices of its sources' steps before they are taken."""
         parts = [
-            self.alike[i].matrices(centre.read, own[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
+            self.alike[i].matrices(centre.read, local[i], f, z[self.alike[i].group], u, k) for i, f in centre.sources
         ]
         means = [jnp.asarray(estimates[i].mean)[f] for i, f in centre.sources]
         return centre.step(state, parts, means, u, k)
@@ -197,7 +197,7 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
     ahead = {i: item for i, item in enumerate(filters.alike) if filters.complete[item.group]}
     central = filters.central if all(filters.complete) else {}
     with jax.enable_x64(True):
-        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.retains, np.asarray(u)))
+        planned, central = to_numpy(_plan(tuple(ahead.values()), central, filters.smooths, np.asarray(u)))
     done = dict(zip(ahead, planned, strict=True))
     alike = tuple(done.get(i, item) for i, item in enumerate(filters.alike))
     result = eqx.tree_at(lambda f: (f.alike, f.central), filters, (alike, filters.central | central))
@@ -206,18 +206,18 @@ def plan(filters: AllFilters, u: Float[Array, "horizon inputs"]) -> AllFilters:
 
 @quickly_compiled
 def _plan(
-    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], retains: bool, u: jax.Array | np.ndarray
+    alike: tuple[Alike, ...], central: dict[str, AbstractFilter], smooths: bool, u: jax.Array | np.ndarray
 ) -> tuple[tuple[Alike, ...], dict[str, AbstractFilter]]:
     """Of these filters alone: whatever a network's fusions are, it is one program."""
 
-    def one(item: AbstractFilter, retains: bool) -> AbstractFilter:
-        return planned_with_past(item, u) if retains else item.planned(u)
+    def single(item: AbstractFilter, smooths: bool) -> AbstractFilter:
+        return planned_with_past(item, u) if smooths else item.planned(u)
 
     planned = tuple(
-        replace(item, filters=over_all(partial(one, retains=item.retains), item.count * item.nodes)(item.filters))
+        replace(item, filters=over_all(partial(single, smooths=item.smooths), item.count * item.nodes)(item.filters))
         for item in alike
     )
-    return planned, {name: one(item, retains) for name, item in central.items()}
+    return planned, {name: single(item, smooths) for name, item in central.items()}
 
 
 def plans(filters: AllFilters) -> bool:
@@ -230,15 +230,15 @@ def plans(filters: AllFilters) -> bool:
 
 def _reporting(network: Network) -> dict[str, Reporting]:
     """The fusions that hear reports."""
-    found = {}
+    results = {}
     for name, item in network.fused.items():
         if isinstance(item, Fusion) and item.by_report:
             centre = centre_filter(network, name)
             places, mine = network.places(), network.nodes_with(item.filter)
             sources, order = gathering(network, places, mine, item.filter)
             uplinks = uplinks_of(item, mine, len(network.states))
-            found[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
-    return found
+            results[name] = Reporting(uplinks, centre, order, sources, tuple(mine))
+    return results
 
 
 def centre_filter(network: Network, name: str) -> CentreFilter:
@@ -255,13 +255,13 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
     instance("network", network, Network, "a Network")
     text("fusion", name)
     fusion = network.fused.get(name)
-    if not isinstance(fusion, Fusion) or not fusion.rule.hears_reports:
-        hearing = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.hears_reports]
-        raise fail("fusion", f"one of {hearing}, which hear reports", repr(name))
+    if not isinstance(fusion, Fusion) or not fusion.rule.uses_reports:
+        observation = [n for n, f in network.fused.items() if isinstance(f, Fusion) and f.rule.uses_reports]
+        raise fail("fusion", f"one of {observation}, which hear reports", repr(name))
     names = network.nodes_with(fusion.filter)
     alone = Network(
         network.plant,
-        {one: _with_only(network.nodes[one], fusion.filter) for one in network.names},
+        {single: _with_only(network.nodes[single], fusion.filter) for single in network.names},
         {"all": Fusion(fusion.filter, AllReports())},
         network.relays,
         network.common,
@@ -283,7 +283,7 @@ def centre_filter(network: Network, name: str) -> CentreFilter:
 
 def _with_only(node: Node | Listener, name: str) -> Node | Listener:
     """A node with one of its filters."""
-    filters = {one: item for one, item in node.filters.items() if one == name}
+    filters = {single: item for single, item in node.filters.items() if single == name}
     if isinstance(node, Node):
         return Node(node.sensor, node.channel, filters)
     return replace(node, filters=filters)

@@ -4,14 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from heliograph.codegen.arrived import arrived
+from heliograph.codegen.rules.arrived import arrived
 from heliograph.model.estimate import Estimate
 from heliograph.model.over_time import at
 from heliograph.model.plant import AbstractPlant, AnyPlant
 from heliograph.numerics.angle import wrapped
 from heliograph.numerics.module import Module
-from heliograph.simulation.air import AbstractAir
 from heliograph.simulation.draws import INITIAL, PROCESS, WORLD, draw_key
+from heliograph.simulation.medium import AbstractMedium
 from heliograph.simulation.stepping import AllFilters
 
 
@@ -19,34 +19,34 @@ class World(Module):
     """A network as it is simulated: the plant, what is between it and the nodes, and all filters."""
 
     plant: AnyPlant
-    air: AbstractAir
+    medium: AbstractMedium
     filters: AllFilters
 
     def init(self, key: jax.Array) -> PyTree:
         """Before the first step of the run with this key."""
         x = at(self.plant, 0).sample_initial(draw_key(key, 0, WORLD, INITIAL))
-        return x, self.air.init(key), self.filters.init()
+        return x, self.medium.init(key), self.filters.init()
 
     def step(self, carry: PyTree, key: jax.Array, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
         """After step k with the input u, and what there is to see of it: truth (n,), measurements, estimates."""
-        (x, air, states), (k, u) = carry, row
+        (x, medium, states), (k, u) = carry, row
         plant = at(self.plant, k)
         x = wrapped(plant.transition(x, u) + plant.sample_noise(draw_key(key, k, WORLD, PROCESS), u), plant.angles)
-        air, z = self.air.hear(air, x, u, key, k)
-        z = tuple(arrived(one) if whole else one for one, whole in zip(z, self.filters.complete, strict=True))
+        medium, z = self.medium.receive(medium, x, u, key, k)
+        z = tuple(arrived(item) if whole else item for item, whole in zip(z, self.filters.complete, strict=True))
         drawn = {name: item.uplinks.draw(key, k) for name, item in self.filters.reporting.items()}
-        states, found = self.filters.step(states, z, u, k, drawn)
-        after = x, self.air.told(air, found["estimates"]), states
-        return after, {"truth": x, "measurements": z, **_near(plant, x, found)}
+        states, result = self.filters.step(states, z, u, k, drawn)
+        after = x, self.medium.feed_back(medium, result["estimates"]), states
+        return after, {"truth": x, "measurements": z, **_near(plant, x, result)}
 
 
-def _near(plant: AbstractPlant, x: jax.Array, found: dict[str, PyTree]) -> dict[str, PyTree]:
+def _near(plant: AbstractPlant, x: jax.Array, result: dict[str, PyTree]) -> dict[str, PyTree]:
     """What was estimated, angles within half a turn of the truth: then x - xhat is the error, whoever subtracts."""
     if not plant.circular:
-        return found
+        return result
 
-    def near(one: Estimate) -> Estimate:
-        return Estimate(plant.near(jnp.asarray(one.mean), x), one.covariance, one.claim)
+    def near(estimate: Estimate) -> Estimate:
+        return Estimate(plant.near(jnp.asarray(estimate.mean), x), estimate.covariance, estimate.claim)
 
-    each = {key: found[key] for key in ("estimates", "fused")}
-    return {**found, **jax.tree.map(near, each, is_leaf=lambda leaf: isinstance(leaf, Estimate))}
+    items = {key: result[key] for key in ("estimates", "fused")}
+    return {**result, **jax.tree.map(near, items, is_leaf=lambda leaf: isinstance(leaf, Estimate))}

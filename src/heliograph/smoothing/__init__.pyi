@@ -11,5 +11,5 @@ from .planned import (
     planned_smoother as planned_smoother,
 )
 from .sweep import (
-    retained_steps as retained_steps,
+    smoother_steps as smoother_steps,
 )

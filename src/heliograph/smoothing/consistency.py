@@ -6,7 +6,7 @@ from itertools import pairwise
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.types import Array, Float
 
@@ -16,18 +16,18 @@ EXCESS = 1.05  # times what is expected: less does little harm
 
 
 @in_float64
-def surprise_sums(steps: AbstractRetained) -> Float[Array, "5"]:
+def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
     """Of the blocks of one run, with surprise s = sum e' S^-1 e and h components: sums of s, h, s^2, s h, h^2."""
-    if steps.surprise is None or steps.heard is None:
+    if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
     time = len(steps.mean)
     count = min(BLOCKS, time)
     edges = [-(-time * i // count) for i in range(count + 1)]
-    s, h = (jnp.stack([jnp.sum(part[a:b]) for a, b in pairwise(edges)]) for part in (steps.surprise, steps.heard))
+    s, h = (jnp.stack([jnp.sum(part[a:b]) for a, b in pairwise(edges)]) for part in (steps.nis, steps.received))
     return jnp.stack([jnp.sum(part) for part in (s, h, s * s, s * h, h * h)])
 
 
-def surprise(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
+def nis_test(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
     """Mean surprise of a component, 1 if the filter is consistent, and its standard error from the blocks' scatter."""
     s, h, ss, sh, hh = (float(part) for part in sums)
     if not h:
@@ -38,7 +38,7 @@ def surprise(sums: Float[np.ndarray, "5"]) -> tuple[float, float]:
 
 def warn_of(name: str, sums: Float[np.ndarray, "5"]) -> None:
     """Warn if a filter's innovations are larger than it believes, by more than chance."""
-    ratio, error = surprise(sums)
+    ratio, error = nis_test(sums)
     if ratio > EXCESS and ratio - 1 > DEVIATIONS * error:
         warnings.warn(
             f"{name}: squared innovations are {ratio:.3g} +- {error:.1g} times what the filter believes; of a filter "

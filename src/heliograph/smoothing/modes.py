@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.retained import AbstractRetained
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.float64 import compiled
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
-from heliograph.smoothing.consistency import surprise_sums, warn_of
+from heliograph.smoothing.consistency import nis_sums, warn_of
 from heliograph.smoothing.sweep import carried_ahead, swept, swept_means, swept_over_lag
 
 A = TypeVar("A", jax.Array, np.ndarray)
@@ -23,23 +23,23 @@ A = TypeVar("A", jax.Array, np.ndarray)
 class AbstractSmoothing(Module):
     """Which states are estimated from which later data, given what a filter retained of a run."""
 
-    def estimates(self, steps: AbstractRetained) -> Estimate:
+    def estimates(self, steps: AbstractSmootherStep) -> Estimate:
         """From steps stacked along time: estimates along time, with the claim that is left.
 
         Warns where the filter's innovations say that it is not consistent: later data then make estimates worse.
         """
-        warn_of("smoothing", np.asarray(surprise_sums(steps)))
+        warn_of("smoothing", np.asarray(nis_sums(steps)))
         return _swept(self, steps)
 
-    def sweep(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
         """The estimates, as `estimates`, of one run inside a compiled computation."""
         raise NotImplementedError
 
-    def means(self, steps: AbstractRetained) -> jax.Array:
+    def means(self, steps: AbstractSmootherStep) -> jax.Array:
         """Means alone, where covariances are known from elsewhere."""
         return jnp.asarray(self.sweep(steps).mean)
 
-    def covariances(self, steps: AbstractRetained) -> jax.Array:
+    def covariances(self, steps: AbstractSmootherStep) -> jax.Array:
         """Covariances alone, whatever the data were."""
         return jnp.asarray(self.sweep(steps.without_data()).covariance)
 
@@ -52,18 +52,18 @@ class AbstractSmoothing(Module):
 
 
 @compiled
-def _swept(smoothing: AbstractSmoothing, steps: AbstractRetained) -> Estimate:
+def _swept(smoothing: AbstractSmoothing, steps: AbstractSmootherStep) -> Estimate:
     return smoothing.sweep(steps)
 
 
 class FixedInterval(AbstractSmoothing):
     """Every state given all data of the run."""
 
-    def sweep(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
         """(time, ...)."""
         return swept(steps)
 
-    def means(self, steps: AbstractRetained) -> jax.Array:
+    def means(self, steps: AbstractSmootherStep) -> jax.Array:
         """(time, ...)."""
         return swept_means(steps)
 
@@ -80,7 +80,7 @@ class FixedLag(AbstractSmoothing):
     def __init__(self, lag: int):
         self.lag = check_count("lag", lag, 0)
 
-    def sweep(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
         """(time, ...)."""
         return swept_over_lag(steps, self.lag)
 
@@ -97,7 +97,7 @@ class FixedPoint(AbstractSmoothing):
     def __init__(self, step: int):
         self.step = check_count("step of a fixed point", step, 0)
 
-    def sweep(self, steps: AbstractRetained) -> Estimate:
+    def sweep(self, steps: AbstractSmootherStep) -> Estimate:
         """(time from that step on, ...)."""
         return carried_ahead(steps, self.step)
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.retained import AbstractRetained, Moments, Point
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import array, check_count, instance
 from heliograph.numerics.float64 import compiled
@@ -17,13 +17,13 @@ from heliograph.numerics.types import Array, ArrayLike, Int, PyTree
 T = TypeVar("T")
 
 
-def retained_steps(
+def smoother_steps(
     filter: AbstractFilter,
     measurements: ArrayLike,
     inputs: ArrayLike | None = None,
     state: PyTree | None = None,
     first_step: int = 0,
-) -> tuple[PyTree, AbstractRetained]:
+) -> tuple[PyTree, AbstractSmootherStep]:
     """Step a filter over rows of data: its state after them, and what it retained of each, stacked along time.
 
     From `state`, the filter's start unless given, at the step number `first_step`.
@@ -42,11 +42,13 @@ def retained_steps(
 
 
 @compiled
-def stepped(item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array) -> tuple[PyTree, AbstractRetained]:
+def stepped(
+    item: AbstractFilter, z: Array, u: Array, state: PyTree, first: Array
+) -> tuple[PyTree, AbstractSmootherStep]:
     """The same inside a compiled computation."""
 
-    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractRetained]:
-        return item.step_retained(state, *row)
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, AbstractSmootherStep]:
+        return item.step_with_smoother(state, *row)
 
     rows = jnp.asarray(z), jnp.asarray(u), jnp.asarray(first + jnp.arange(len(z)))
     return jax.lax.scan(body, jax.tree.map(jnp.asarray, state), rows)
@@ -60,65 +62,67 @@ def planned_with_past(item: AbstractFilter, inputs: Array) -> AbstractFilter:
     return planned.with_past(quiet_steps(item, inputs))
 
 
-def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractRetained:
+def quiet_steps(item: AbstractFilter, inputs: Array) -> AbstractSmootherStep:
     """What a filter retains of data that say nothing: for one whose gains no data change, all but means is right."""
     quiet = jnp.zeros((len(inputs), item.received))
-    steps: AbstractRetained = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
+    steps: AbstractSmootherStep = stepped(item, quiet, inputs, item.init(), np.asarray(0))[1]
     return steps
 
 
-def swept(steps: AbstractRetained) -> Estimate:
+def swept(steps: AbstractSmootherStep) -> Estimate:
     """Each step's state given all data: one sweep back."""
     return Estimate(*_both(steps), steps.claim)
 
 
-def swept_means(steps: AbstractRetained) -> jax.Array:
+def swept_means(steps: AbstractSmootherStep) -> jax.Array:
     """Its means alone."""
     return _means(steps)
 
 
 @runs_last
-def _both(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+def _both(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
     return _back(steps)
 
 
 @runs_last
-def _means(steps: AbstractRetained) -> jax.Array:
+def _means(steps: AbstractSmootherStep) -> jax.Array:
     return _back(steps)[0]
 
 
-def _back(steps: AbstractRetained) -> tuple[jax.Array, jax.Array]:
+def _back(steps: AbstractSmootherStep) -> tuple[jax.Array, jax.Array]:
     """Smoothed means and covariances; any further axes are carried along, so that runs may be the last."""
 
-    def told(step: AbstractRetained, moments: Moments) -> tuple[jax.Array, jax.Array]:
-        found = step.told(moments)
-        return jnp.asarray(found.mean), jnp.asarray(found.covariance)
+    def estimate_from(step: AbstractSmootherStep, moments: Moments) -> tuple[jax.Array, jax.Array]:
+        result = step.estimate_from(moments)
+        return jnp.asarray(result.mean), jnp.asarray(result.covariance)
 
-    def body(carry: PyTree, item: tuple[AbstractRetained, AbstractRetained]) -> tuple[PyTree, PyTree]:
+    def body(carry: PyTree, item: tuple[AbstractSmootherStep, AbstractSmootherStep]) -> tuple[PyTree, PyTree]:
         (later, known), (before, step) = carry, item
         earlier = step.back(later, before.mean, before.covariance)
         moments = step.before(before, earlier, known)
-        return (earlier, moments), told(before, moments)
+        return (earlier, moments), estimate_from(before, moments)
 
     last = row(steps, -1)
     rows = rows_of(steps, slice(None, -1)), rows_of(steps, slice(1, None))
     start = last.end(), last.smoothed(last.end())
     shapes, _ = jax.eval_shape(body, start, row(rows, -1))  # of what runs share, their axis is 1 long
     end = jax.tree.map(lambda leaf, like: jnp.broadcast_to(leaf, like.shape), start, shapes)
-    _, found = jax.lax.scan(body, end, rows, reverse=True)
-    mean, covariance = (jnp.concatenate([part, one[None]]) for part, one in zip(found, told(last, end[1]), strict=True))
+    _, result = jax.lax.scan(body, end, rows, reverse=True)
+    mean, covariance = (
+        jnp.concatenate([part, item[None]]) for part, item in zip(result, estimate_from(last, end[1]), strict=True)
+    )
     return mean, covariance
 
 
-def swept_over_lag(steps: AbstractRetained, lag: int | Int[Array, ""]) -> Estimate:
+def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Estimate:
     """Each step's state given the data of up to `lag` later steps: as many short sweeps, side by side."""
     last = len(steps.mean) - 1
-    each = jnp.arange(last + 1)
-    newest = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(each + lag, last)))
+    items = jnp.arange(last + 1)
+    newest = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(items + lag, last)))
 
     def body(done: jax.Array, later: PyTree) -> PyTree:
         """From after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
-        ahead = each + lag - done
+        ahead = items + lag - done
         place = jnp.minimum(ahead, last)
         before = jnp.maximum(place - 1, 0)
         earlier = jax.vmap(lambda step, *rest: step.back(*rest))(
@@ -126,10 +130,10 @@ def swept_over_lag(steps: AbstractRetained, lag: int | Int[Array, ""]) -> Estima
         )
         return jax.tree.map(lambda a, b: jnp.where(_column(ahead <= last, a), a, b), earlier, later)
 
-    return _told(steps, jax.lax.fori_loop(0, lag, body, newest))
+    return _estimates_from(steps, jax.lax.fori_loop(0, lag, body, newest))
 
 
-def carried_ahead(steps: AbstractRetained, step: int) -> Estimate:
+def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
     """The state after one step given the data up to it, and up to each later one."""
     start = row(steps, step)
 
@@ -137,15 +141,15 @@ def carried_ahead(steps: AbstractRetained, step: int) -> Estimate:
         after = item.ahead(point)
         return after, Moments(after.mean, after.covariance)
 
-    _, found = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
+    _, outcome = jax.lax.scan(body, start.start(), rows_of(steps, slice(step + 1, None)))
     first = Moments(start.mean, start.covariance)
-    whole = jax.tree.map(lambda one, rest: jnp.concatenate([one[None], rest]), first, found)
-    result: Estimate = jax.vmap(start.told)(whole)
+    whole = jax.tree.map(lambda item, rest: jnp.concatenate([item[None], rest]), first, outcome)
+    result: Estimate = jax.vmap(start.estimate_from)(whole)
     return result
 
 
-def _told(steps: AbstractRetained, later: PyTree) -> Estimate:
-    result: Estimate = jax.vmap(lambda step, later: step.told(step.smoothed(later)))(steps, later)
+def _estimates_from(steps: AbstractSmootherStep, later: PyTree) -> Estimate:
+    result: Estimate = jax.vmap(lambda step, later: step.estimate_from(step.smoothed(later)))(steps, later)
     return result
 
 

@@ -9,7 +9,7 @@ from scipy import stats
 
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.modes import JointModes, joint_modes
-from heliograph.random_affine.monomials import monomials
+from heliograph.random_affine.moments.monomials import monomials
 
 FALSE_ALARM = 1e-6  # probability that a correct object fails, shared by all numbers compared (Bonferroni)
 
@@ -62,8 +62,8 @@ def _compare_modes(
     given = {
         order: [modes.moments(order) @ monomials(y, order) for y in points] for order in range(1, highest + 1)
     }  # E[mono(z) | mode], (mode, monomials)
-    for order, (one, two) in given.items():
-        worst = max(worst, _compare(f"order {order}, first draw", begin @ one, _monomials(now, order)))
+    for order, (item, two) in given.items():
+        worst = max(worst, _compare(f"order {order}, first draw", begin @ item, _monomials(now, order)))
         worst = max(worst, _compare(f"order {order}, second draw", begin @ rows @ two, _monomials(later, order)))
     for i, j in product(range(1, highest // 2 + 1), repeat=2):
         expected = np.einsum("a,ab,am,bl->ml", begin, rows, given[i][0], given[j][1]).reshape(-1)

@@ -125,8 +125,8 @@ def _check_innovation(innovation: Innovation, z: np.ndarray, item: AbstractFilte
         assert np.array_equal(np.isnan(covariance), unknown), f"step {k}: expected a covariance where z arrived"
 
 
-def _same(what: str, found: Estimate, expected: Estimate) -> None:
+def _same(what: str, estimate: Estimate, expected: Estimate) -> None:
     for name in ("mean", "covariance"):
-        a, b = np.asarray(getattr(found, name)), np.asarray(getattr(expected, name))
+        a, b = np.asarray(getattr(estimate, name)), np.asarray(getattr(expected, name))
         same = np.allclose(a, b, rtol=ROUNDING, atol=ROUNDING * np.nanmax(np.abs(b), initial=0.0), equal_nan=True)
         assert same, f"{what}: expected the {name} of step"

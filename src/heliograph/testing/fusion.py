@@ -48,6 +48,6 @@ def _fused(rule: AbstractFusion, means: np.ndarray, bounds: np.ndarray) -> Estim
     return fuse(rule, [Estimate(m, b, "upper") for m, b in zip(means, bounds, strict=True)])
 
 
-def _close(what: str, found: Array, expected: Array) -> None:
-    gap = np.abs(np.asarray(found) - expected).max()
+def _close(what: str, result: Array, expected: Array) -> None:
+    gap = np.abs(np.asarray(result) - expected).max()
     assert gap <= SEARCHED * np.abs(expected).max(), f"{what}: expected the same back, off by {gap:g}"

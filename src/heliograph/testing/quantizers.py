@@ -34,9 +34,9 @@ def check_quantizer(quantizer: AbstractQuantizer, n: int = 2, steps: int = 20, s
         with jax.enable_x64(True):
             batch = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), (state, jnp.asarray(value)))
             _, twice = compiled(*batch)
-        for name, one in sent._asdict().items():
+        for name, item in sent._asdict().items():
             both = np.asarray(getattr(twice, name))
-            same = np.allclose(both, one, rtol=ROUNDING, atol=0, equal_nan=True)
+            same = np.allclose(both, item, rtol=ROUNDING, atol=0, equal_nan=True)
             assert same, f"step {k}, {name}: expected the same under jit and vmap"
         state = following
 

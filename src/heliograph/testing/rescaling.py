@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.centre import Centre
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.linear import LinearFilter
-from heliograph.filters.mixture import Components, MixtureFilter
-from heliograph.filters.modal import Heard, ModalFilter
-from heliograph.filters.multiple_model import MultipleModelFilter
-from heliograph.filters.open_loop import OpenLoop
-from heliograph.filters.polynomial import PolynomialFilter
-from heliograph.filters.prediction import PredictionFilter
-from heliograph.filters.scheduled import LinearSystemFilter
-from heliograph.filters.sequential import SequentialFilter
-from heliograph.filters.told import Told, ToldFilter
-from heliograph.filters.uncertain import UncertainModalFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.linear.centre import Centre
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.linear.open_loop import OpenLoop
+from heliograph.filters.linear.polynomial import PolynomialFilter
+from heliograph.filters.linear.scheduled import LinearSystemFilter
+from heliograph.filters.modes.mixture import Components, MixtureFilter
+from heliograph.filters.modes.modal import ModalFilter, ObservationModel
+from heliograph.filters.modes.multiple_model import MultipleModelFilter
+from heliograph.filters.modes.side_information import SideInformation, SideInformationFilter
+from heliograph.filters.modes.uncertain import UncertainModalFilter
+from heliograph.filters.wrappers.prediction import PredictionFilter
 from heliograph.linear.system import LinearSystem, Steps
 from heliograph.model.over_time import OverTime, first, over_time, unstack
 from heliograph.model.plant import AnyPlant, LinearPlant, Plant
@@ -29,11 +29,11 @@ from heliograph.model.sensor import AnySensor, LinearSensor, Sensor
 from heliograph.numerics.check import fail
 from heliograph.numerics.module import Module
 from heliograph.numerics.types import Array, ArrayLike, Float
-from heliograph.random_affine.monomials import exponents
+from heliograph.random_affine.moments.monomials import exponents
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder
 from heliograph.random_affine.noise import AbstractNoise, Gaussian, Shaped
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder
 
-Modes = TypeVar("Modes", Told, Heard)  # a channel at one step, mode by mode
+Modes = TypeVar("Modes", SideInformation, ObservationModel)  # a channel at one step, mode by mode
 
 
 class InUnits(Module):
@@ -96,7 +96,7 @@ def rescaled(item: AbstractFilter, units: Units) -> AbstractFilter:
         case ModalFilter() | UncertainModalFilter():
             plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
             return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
-        case ToldFilter(flagged=False) | MultipleModelFilter():
+        case SideInformationFilter(flagged=False) | MultipleModelFilter():
             plant, sensor = rescaled_plant(item.plant, units), rescaled_sensor(item.sensor, units)
             return replace(item, plant=plant, sensor=sensor, channel=_by_mode(item.channel, units))
         case PredictionFilter():
@@ -114,12 +114,12 @@ def _gaussian(item: AbstractFilter) -> GaussianFilter:
 
 def _in_turn(item: SequentialFilter, units: Units) -> list[AbstractFilter]:
     """Each part with its own outputs and measurements, which stand in `units` one after the other."""
-    result, heard, said = [], 0, 0
+    result, received, said = [], 0, 0
     for part in item.filters:
         m, p = part.received, len(first(part.sensor).outputs)
-        own = units._replace(outputs=units.outputs[said : said + p], received=units.received[heard : heard + m])
-        result.append(rescaled(part, own))
-        heard, said = heard + m, said + p
+        local = units._replace(outputs=units.outputs[said : said + p], received=units.received[received : received + m])
+        result.append(rescaled(part, local))
+        received, said = received + m, said + p
     return result
 
 
@@ -132,7 +132,7 @@ def _noise(law: AbstractNoise, factors: Float[np.ndarray, " n"]) -> AbstractNois
 def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
     """The plant of S x, given U u."""
     if isinstance(item, OverTime):
-        return over_time([rescaled_plant(one, units) for one in unstack(item)])
+        return over_time([rescaled_plant(single, units) for single in unstack(item)])
     s, u = units.states, units.inputs
     law = _noise(item.deviation, s) if item.deviation is not None else np.outer(s, s) * item.initial_covariance
     center = s * (item.initial_mean - (item.deviation.mean if item.deviation is not None else 0.0))
@@ -149,7 +149,7 @@ def rescaled_plant(item: AnyPlant, units: Units) -> AnyPlant:
 def rescaled_sensor(item: AnySensor, units: Units) -> AnySensor:
     """The sensor that measures R y of S x."""
     if isinstance(item, OverTime):
-        return over_time([rescaled_sensor(one, units) for one in unstack(item)])
+        return over_time([rescaled_sensor(single, units) for single in unstack(item)])
     s, r = units.states, units.outputs
     if isinstance(item, LinearSensor):
         return LinearSensor(r[:, None] * item.matrix / s, _noise(item.noise, r), item.outputs, item.circular)
@@ -158,7 +158,7 @@ def rescaled_sensor(item: AnySensor, units: Units) -> AnySensor:
 
 def _channel(item: SecondOrder | OverTime, units: Units) -> SecondOrder | OverTime:
     if isinstance(item, OverTime):
-        return over_time([rescaled_channel(one, units) for one in unstack(item)])
+        return over_time([rescaled_channel(single, units) for single in unstack(item)])
     return rescaled_channel(item, units)
 
 
@@ -210,8 +210,8 @@ def _centre(item: Centre | None, units: Units) -> Centre | None:
     def scaled(part: Array | OverTime, factors: np.ndarray) -> Array | OverTime:
         return OverTime(factors * part.values) if isinstance(part, OverTime) else factors * part
 
-    heard = scaled(item.heard, units.received[:, None] / s)
-    return Centre(s * item.start, scaled(item.transition, s[:, None] / s), scaled(item.drift, s), heard)
+    received = scaled(item.received, units.received[:, None] / s)
+    return Centre(s * item.start, scaled(item.transition, s[:, None] / s), scaled(item.drift, s), received)
 
 
 def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystemFilter:
@@ -226,8 +226,8 @@ def _system(item: LinearSystemFilter, degree: int, units: Units) -> LinearSystem
         z * s.offset,
         np.outer(z, z) * s.noise,
     )
-    want = units.states[:, None] * item.want / y
-    system = LinearSystem(steps, y * item.mean, np.outer(y, y) * item.covariance, want)
+    projection = units.states[:, None] * item.projection / y
+    system = LinearSystem(steps, y * item.mean, np.outer(y, y) * item.covariance, projection)
     return LinearSystemFilter(system, item.claim, item.states)
 
 

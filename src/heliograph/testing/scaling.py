@@ -5,10 +5,10 @@ from collections.abc import Callable
 import numpy as np
 
 from heliograph.filters.base import AbstractFilter
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.linear import LinearFilter
-from heliograph.filters.prediction import PredictionFilter
-from heliograph.filters.sequential import SequentialFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.sequential import SequentialFilter
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.filters.wrappers.prediction import PredictionFilter
 from heliograph.fusion.informed import ScalarWeights
 from heliograph.fusion.rules import CovarianceIntersection, Fusion, InverseCovarianceIntersection
 from heliograph.model.channel import Channel
@@ -18,8 +18,8 @@ from heliograph.numerics.check import check_count, fail
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.atoms import known
 from heliograph.random_affine.combine import Series
-from heliograph.random_affine.second_moments import QuadraticMap, SecondOrder, second_order
-from heliograph.random_affine.told import outcomes
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, second_order
+from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
@@ -51,7 +51,7 @@ def check_scaling(
     """
     check_count("steps", steps)
     random = np.random.default_rng(seed)
-    world = monte_carlo(_unheard(network), steps, 1, seed, inputs=inputs)
+    world = monte_carlo(_unreceived(network), steps, 1, seed, inputs=inputs)
     z = {name: np.array(rows[0]) for name, rows in world.measurements.items()}
     for rows in z.values():
         rows[random.random(rows.shape) < MISSING] = np.nan
@@ -65,16 +65,16 @@ def check_scaling(
 
 def _nodes(network: Network) -> dict[str, Node]:
     """The nodes, all of which hear the plant themselves."""
-    found = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
-    if len(found) < len(network.nodes):
+    results = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    if len(results) < len(network.nodes):
         raise fail("network to rescale", "nodes that hear the plant themselves", "a network of relays")
-    return found
+    return results
 
 
-def _unheard(network: Network) -> Network:
+def _unreceived(network: Network) -> Network:
     """The network without its filters, of which what is measured does not depend, unless a sensor hears back."""
-    told = {name: node.told_by is not None for name, node in _nodes(network).items()}
-    nodes = {n: node if told[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
+    published = {name: node.informed_by is not None for name, node in _nodes(network).items()}
+    nodes = {n: node if published[n] else Node(node.sensor, node.channel, {}) for n, node in _nodes(network).items()}
     return Network(network.plant, nodes)
 
 
@@ -106,13 +106,13 @@ def _compared(
     fused = {name: _fused(name, item, units[FUSED]) for name, item in network.fused.items()}
     scaled = Network(rescaled_plant(network.plant, units[FUSED]), nodes, fused)
     shared = units[FUSED].inputs
-    found = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
+    result = run(scaled, {name: rows * units[name].received for name, rows in z.items()}, u * shared).estimates
     worst = 0.0
     for node, filters in plain.items():
         for name, estimate in filters.items():
             searches = _searches(network, node, name)
             if common or not searches:
-                difference = _difference(estimate, found[node][name], units[node].states) / DIGITS
+                difference = _difference(estimate, result[node][name], units[node].states) / DIGITS
                 worst = max(worst, _judged(f"{node}/{name}", difference * (DIGITS / SEARCHED if searches else 1.0)))
     return worst
 
@@ -142,7 +142,7 @@ def _difference(a: Estimate, b: Estimate, s: np.ndarray) -> np.ndarray:
 
 def _node(name: str, node: Node, units: Units) -> Node:
     channel = first(node.channel)
-    for part in [] if channel.remembers else [one.map for one in outcomes(channel)]:
+    for part in [] if channel.remembers else [outcome.map for outcome in outcomes(channel)]:
         turned = Series([known(np.diag(1 / units.outputs)), part, known(np.diag(units.received))])
         off = _apart(rescaled_channel(second_order(part), units), second_order(turned))
         assert off <= DIGITS, f"{name}: expected the channel's moments in other units, off by {off:.3g}"
@@ -153,20 +153,20 @@ def _node(name: str, node: Node, units: Units) -> Node:
 def _between(channel: Channel, units: Units) -> Channel:
     """The channel that has Q z where this one, given y, has z, and that one R y."""
     if isinstance(channel, OverTime):
-        return over_time([_between(one, units) for one in unstack(channel)])
+        return over_time([_between(item, units) for item in unstack(channel)])
     return Series([known(np.diag(1 / units.outputs)), channel, known(np.diag(units.received))])
 
 
 def _apart(a: SecondOrder, b: SecondOrder) -> float:
     """Largest difference of two descriptions, of each entry's own scale: two reaches of z_i times two of y_a."""
-    each: list[Callable[[SecondOrder], np.ndarray]] = [
+    items: list[Callable[[SecondOrder], np.ndarray]] = [
         lambda d: _ends(d.spread), lambda d: _ends(d.shift), lambda d: _ends(d.power), lambda d: _ends(d.nominal)
     ]  # fmt: skip
-    power = np.einsum("iiaa->ia", np.abs(each[0](a)) + np.abs(each[2](a)))
+    power = np.einsum("iiaa->ia", np.abs(items[0](a)) + np.abs(items[2](a)))
     reach = np.sqrt(power + np.abs(np.concatenate([a.mean_gain, a.offset[:, None]], axis=1)) ** 2)
     size = np.einsum("ia,jb->ijab", reach, reach)
     size = size + size.swapaxes(2, 3)
-    return max(float(np.max(np.abs(one(a) - one(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for one in each)
+    return max(float(np.max(np.abs(item(a) - item(b)) / np.where(size > 0, size, 1.0), initial=0.0)) for item in items)
 
 
 def _ends(part: QuadraticMap) -> np.ndarray:

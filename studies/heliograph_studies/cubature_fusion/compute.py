@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.update import AbstractUpdate
+from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph_studies.outcome import Unlisted
 from heliograph_studies.stages import Stages
 

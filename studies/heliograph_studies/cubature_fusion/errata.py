@@ -35,8 +35,8 @@ def rmse(outcome: Runs, name: str) -> str:
 
 def worst(outcome: Runs, name: str) -> Sampled:
     """Actual over claimed covariance in the worst direction."""
-    found = outcome.pooled(name).worst_direction()
-    return Sampled(found.ratio, found.standard_error)
+    result = outcome.pooled(name).worst_direction()
+    return Sampled(result.ratio, result.standard_error)
 
 
 def ratio(outcome: Runs, name: str) -> str:
@@ -188,8 +188,8 @@ def _offset(result: Outcome) -> Statement:
     gaps = []
     for rule in (hg.filters.Cubature(), hg.filters.PolynomialMoments(2)):
         moved, straight = (
-            np.array([one_step.predicted(result.printed.scenario, each, c)[0] for c in claimed])
-            for each in (rule, hg.filters.Linearization())
+            np.array([one_step.predicted(result.printed.scenario, item, c)[0] for c in claimed])
+            for item in (rule, hg.filters.Linearization())
         )
         gaps.append(moved - straight)
     size = np.linalg.norm(gaps[0], axis=1)

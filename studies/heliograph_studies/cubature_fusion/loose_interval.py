@@ -4,9 +4,9 @@ import jax
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.correction import Signal, as_array, as_scalars, young_correction
-from heliograph.filters.update import AbstractUpdate, interval_description
-from heliograph.random_affine.second_moments import SecondOrder
+from heliograph.filters.gaussian.correction import Signal, as_array, as_scalars, young_correction
+from heliograph.filters.gaussian.update import AbstractUpdate, interval_description
+from heliograph.random_affine.moments.second_moments import SecondOrder
 
 
 class LooseInterval(AbstractUpdate):

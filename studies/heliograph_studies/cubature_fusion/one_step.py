@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.transform import AbstractTransform
+from heliograph.filters.gaussian.transform import AbstractTransform
 from heliograph.numerics.float64 import compiled, to_numpy
 from heliograph_studies.cubature_fusion.setting import OUTPUTS, Scenario, Transition, transition
 
@@ -100,8 +100,8 @@ def predicted(s: Scenario, rule: AbstractTransform, covariance: Array | None = N
 @compiled
 def _moved(f: Transition, rule: AbstractTransform, mean: Array, covariance: Array) -> tuple[Any, Any]:
     """Mean and covariance of f(x); compiled once for f and rule."""
-    found = rule.apply(lambda x: f(x, ()), jnp.asarray(mean), jnp.asarray(covariance))
-    return found.mean, found.covariance
+    result = rule.apply(lambda x: f(x, ()), jnp.asarray(mean), jnp.asarray(covariance))
+    return result.mean, result.covariance
 
 
 def output(node: int) -> Array:
@@ -186,8 +186,8 @@ def trace_gradient(v: Innovation, b: tuple[float, float], t: Terms, ch: Channel)
 
 def perfect_channel_excess(s: Scenario) -> float:
     """Relative excess of the printed bound's one-step trace over the right one through a perfect channel."""
-    one = hg.Discrete([1.0], [1.0])
-    ch = Channel(1.0, 1.0, s.relay_noise * np.eye(2), s.receiver_noise * np.eye(2), one, one)
+    item = hg.Discrete([1.0], [1.0])
+    ch = Channel(1.0, 1.0, s.relay_noise * np.eye(2), s.receiver_noise * np.eye(2), item, item)
     v = innovation(s, hg.filters.Cubature())
     traces = []
     for sign in (1, -1):

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.transform import AbstractTransform
-from heliograph.filters.update import AbstractUpdate
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.transform import AbstractTransform
+from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.numerics.check import check_count, check_seed
 from heliograph_studies.cubature_fusion.loose_interval import LooseInterval
 

@@ -69,20 +69,20 @@ def _gain(s: Scenario) -> Statement:
 def _boundedness(o: Runs) -> Statement:
     assert o.shown.truth is not None
     states = np.concatenate([o.shown.truth[0], *(np.asarray(o.shown.estimates[n][METHOD].mean)[0] for n in NODES)])
-    found = growth_condition(plant(o.scenario), states, o.scenario.beta[0])
+    result = growth_condition(plant(o.scenario), states, o.scenario.beta[0])
     statistics = [o.statistics[node][METHOD] for node in NODES]
     claimed, actual = (
-        max(float(np.linalg.eigvalsh(each)[:, -1].max()) for each in covariances)
+        max(float(np.linalg.eigvalsh(covariance)[:, -1].max()) for covariance in covariances)
         for covariances in ([s.claimed() for s in statistics], [s.actual() for s in statistics])
     )
     ours = (
-        f"θ ≤ ϑ needs (1 + β₁)(1 + ε) σ²max(Φ) < 1. Over the states of a run it is at least {found.factor:.3f}, so it "
-        f"fails by {found.excess:.3f}; σ²max(Φ) is {found.gains.min():.3f} to {found.gains.max():.3f}, and never below "
+        f"θ ≤ ϑ needs (1 + β₁)(1 + ε) σ²max(Φ) < 1. Over the states of a run it is at least {result.factor:.3f}, so it "
+        f"fails by {result.excess:.3f}; σ²max(Φ) is {result.gains.min():.3f} to {result.gains.max():.3f}, and never below "
         f"1, since Φ₅₅ = 1. In its place, empirical over 40 steps: largest eigenvalue claimed {claimed:.3f}, actual "
         f"{actual:.4f}"
     )
     return Statement("Ξ stays below ϑI for all time", f"{THEOREM}, Theorem 3", "“sufficient conditions”", ours,
-                     {"factor": found.factor}, lambda factor: if_met(factor < 1))  # fmt: skip
+                     {"factor": result.factor}, lambda factor: if_met(factor < 1))  # fmt: skip
 
 
 def figures(o: Runs) -> list[Statement]:
@@ -198,10 +198,10 @@ def findings(result: Outcome) -> list[Statement]:
 
 def _is_bound(o: Runs, name: str, text: str, reason: str = "") -> Statement:
     """Whether the actual covariance stays below the claimed one but for sampling."""
-    found = f"Actual over claimed in the worst direction {ratio(o, name)}, {o.steps} steps, {o.runs:,} runs, strong"
-    judged = Statement(text, OURS, "", found, {"actual_over_claimed": worst(o, name)},
+    result = f"Actual over claimed in the worst direction {ratio(o, name)}, {o.steps} steps, {o.runs:,} runs, strong"
+    judged = Statement(text, OURS, "", result, {"actual_over_claimed": worst(o, name)},
                        lambda actual_over_claimed: holds(actual_over_claimed.at_most(1)))  # fmt: skip
-    return judged._replace(ours=f"{found}: {reason}") if reason and judged.verdict == "fails" else judged
+    return judged._replace(ours=f"{result}: {reason}") if reason and judged.verdict == "fails" else judged
 
 
 def _weights(o: Runs) -> Statement:
@@ -223,6 +223,6 @@ def better(o: Runs) -> list[Statement]:
         Statement(f"The RMSE of {name.replace('_', ' ')} is below that of the paper's bound (strong)", OURS, "",
                   f"{rmse(o, name)}; {base}",
                   {"own": Sampled(*o.pooled(name).rmse()), "papers": Sampled(*o.pooled(METHOD).rmse())},
-                  lambda own, papers: holds(own.below(papers.value)))
+                  lambda local, papers: holds(local.below(papers.value)))
         for name in BETTER
     ]  # fmt: skip

@@ -8,16 +8,16 @@ import jax.numpy as jnp
 
 import heliograph as hg
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
-from heliograph.filters.belief import Belief
-from heliograph.filters.correction import Signal
-from heliograph.filters.gaussian import GaussianFilter, corrected
-from heliograph.filters.update import AbstractUpdate
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected
+from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.estimate import Claim, Estimate, Innovation
 from heliograph.model.over_time import at
 from heliograph.numerics.linalg import cholesky
 from heliograph.numerics.types import ArrayLike
 from heliograph.random_affine.base import AbstractRandomAffine
-from heliograph.random_affine.second_moments import SecondOrder
+from heliograph.random_affine.moments.second_moments import SecondOrder
 from heliograph_studies.cubature_fusion.loose_interval import LooseInterval
 from heliograph_studies.cubature_fusion.setting import Scenario, cubature
 
@@ -115,8 +115,8 @@ class MixedCross(AbstractFilter):
         spread = (y - mean).T @ (y - mean) / count + sensor.noise.covariance
         cross = (state.points - prior.mean).T @ (y - mean) / count
         signal = Signal(mean, spread, cross, spread + jnp.outer(mean, mean))
-        after, heard = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
-        return Propagated(*after, state.points), heard
+        after, innovation = corrected(prior, signal, channel, self.base.update, jnp.asarray(z))
+        return Propagated(*after, state.points), innovation
 
     def estimate(self, state: Propagated) -> Estimate:
         """The belief."""

@@ -16,7 +16,7 @@ SENSOR = hg.LinearSensor([[1.0, 0.0]], 0.3)
 LINK = hg.hop(1.0, 0.05)
 LINKS: Mapping[str, hg.random_affine.AbstractRandomAffine] = {
     "untold": hg.model.delayed(LINK, LAW),
-    "told": hg.model.delayed(LINK, LAW, told=True),
+    "told": hg.model.delayed(LINK, LAW, timestamped=True),
     "constant": hg.model.delayed(LINK, 1),
     "none": LINK,
 }

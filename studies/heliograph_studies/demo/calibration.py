@@ -30,8 +30,8 @@ def calibrate(recording: PlazaRecording) -> Calibration:
 
 def calibrate_ranges(recording: PlazaRecording) -> tuple[float, float]:
     """Scale s and variance of range = s distance + noise: regression through the origin, mean squared residual."""
-    heard = ~np.isnan(recording.ranges)
-    distance, measured = recording.distances()[heard], recording.ranges[heard]
+    received = ~np.isnan(recording.ranges)
+    distance, measured = recording.distances()[received], recording.ranges[received]
     scale = float(distance @ measured / (distance @ distance))
     return scale, float(np.mean((measured - scale * distance) ** 2))
 

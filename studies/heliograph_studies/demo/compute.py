@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from heliograph.filters.gaussian import cubature_filter
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.channel import hop, perfect
 from heliograph.model.estimate import Estimate
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import compiled
 from heliograph.random_affine.base import AbstractRandomAffine, apply
-from heliograph.random_affine.second_moments import second_order
+from heliograph.random_affine.moments.second_moments import second_order
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Node
 from heliograph.simulation.recorded import run
@@ -117,8 +117,8 @@ def table_rows(outcome: Outcome) -> list[list[str]]:
     for name in NAMES:
         shown, scores = outcome.trials[0].scores[name], [t.scores[name] for t in outcome.trials]
         errors, nees = [s.position_rmse_m for s in scores], [s.nees_per_dimension for s in scores]
-        one = shown.position_rmse_m, shown.claimed_rmse_m, shown.nees_per_dimension
-        rows.append([name, *map(_short, one), f"{100 * shown.inside_95:.1f} %", _spread(errors), _spread(nees)])
+        item = shown.position_rmse_m, shown.claimed_rmse_m, shown.nees_per_dimension
+        rows.append([name, *map(_short, item), f"{100 * shown.inside_95:.1f} %", _spread(errors), _spread(nees)])
     return rows
 
 

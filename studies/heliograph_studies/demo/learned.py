@@ -29,7 +29,7 @@ class Learned:
     """
 
     rows: int
-    found: Fit
+    result: Fit
     second_half: Score
     second_half_calibrated: Score
     rest: float
@@ -40,8 +40,8 @@ def direct(drive: robot.Drive) -> hg.Network:
     """The robot whose ranges arrive as they are, with all five constants free."""
     guess = FIRST_GUESS._asdict()
     kinds: dict[str, Kind] = {"gyro_rate": "real", "range_scale": "real"}
-    found = {name: hg.free(value, name, kinds.get(name, "positive")) for name, value in guess.items()}
-    return heard_by_one(drive, robot.Constants(**found), hg.perfect(len(drive.beacons)))
+    results = {name: hg.free(value, name, kinds.get(name, "positive")) for name, value in guess.items()}
+    return received_by_one(drive, robot.Constants(**results), hg.perfect(len(drive.beacons)))
 
 
 def relayed(drive: robot.Drive) -> hg.Network:
@@ -54,10 +54,10 @@ def relayed(drive: robot.Drive) -> hg.Network:
         hg.free(FIRST_GUESS.position_walk, "position_walk", "positive"),
         HELD,
     )
-    return heard_by_one(drive, constants, hg.parallel([hg.hop(gain, RELAY_NOISE)] * len(drive.beacons)))
+    return received_by_one(drive, constants, hg.parallel([hg.hop(gain, RELAY_NOISE)] * len(drive.beacons)))
 
 
-def heard_by_one(
+def received_by_one(
     drive: robot.Drive, constants: robot.Constants, channel: hg.random_affine.AbstractRandomAffine
 ) -> hg.Network:
     """A network of one filter."""
@@ -70,29 +70,29 @@ def learn(recording: PlazaRecording, advance: Callable[[str], None] = lambda wha
     """Fit the direct ranges of the first half, and judge on the second."""
     advance("learning the constants without the truth")
     drive, half = robot.DRIVES[recording.name], len(recording.time) // 2
-    found = fitted(partial(direct, drive), recording, recording.ranges, half)
-    calibrated = heard_by_one(drive, robot.Constants(drive.gyro_rate), hg.perfect(len(drive.beacons)))
-    after, before = (judged(n, recording, recording.ranges, half) for n in (found.network, calibrated))
+    outcome = fitted(partial(direct, drive), recording, recording.ranges, half)
+    calibrated = received_by_one(drive, robot.Constants(drive.gyro_rate), hg.perfect(len(drive.beacons)))
+    after, before = (judged(n, recording, recording.ranges, half) for n in (outcome.network, calibrated))
     turned = recording.truth[-1, 2] - recording.start_pose[2]
     _, turn, duration = recording.odometry.sum(axis=0)
-    return Learned(half, found, after, before, recording.gyro_rate, float((turn - turned) / duration))
+    return Learned(half, outcome, after, before, recording.gyro_rate, float((turn - turned) / duration))
 
 
-def fitted(build: Callable[[], hg.Network], recording: PlazaRecording, heard: np.ndarray, rows: int) -> Fit:
+def fitted(build: Callable[[], hg.Network], recording: PlazaRecording, received: np.ndarray, rows: int) -> Fit:
     """Learn from the first rows of what was heard."""
-    return hg.fit(build, {"robot": heard[:rows]}, recording.odometry[:rows], starts=STARTS)
+    return hg.fit(build, {"robot": received[:rows]}, recording.odometry[:rows], starts=STARTS)
 
 
-def judged(network: hg.Network, recording: PlazaRecording, heard: np.ndarray, first: int = 0) -> Score:
+def judged(network: hg.Network, recording: PlazaRecording, received: np.ndarray, first: int = 0) -> Score:
     """The filter over all rows, its score from row `first` on."""
-    record = hg.run(network, {"robot": heard}, recording.odometry, recording.time)
+    record = hg.run(network, {"robot": received}, recording.odometry, recording.time)
     return score(record.estimates["robot"]["learned"], recording.truth, first)
 
 
-def said(found: Learned) -> str:
+def said(result: Learned) -> str:
     """What was found, in words."""
-    row = next(row for row in found.found.rows() if row.name == "gyro_rate")
-    apart = not row.low <= found.rest <= row.high
+    row = next(row for row in result.result.rows() if row.name == "gyro_rate")
+    apart = not row.low <= result.rest <= row.high
     verdict = (
         "That is not what it reads at rest, so the rate at rest is wrong while driving"
         if apart
@@ -100,16 +100,16 @@ def said(found: Learned) -> str:
     )
     return (
         f"While driving the gyro is off by {row.estimate:.2e} rad/s ({row.low:.2e} to {row.high:.2e}). {verdict} "
-        f"({found.rest:.2e}); the true turns, which nobody learned from, say {found.drift:.2e}."
+        f"({result.rest:.2e}); the true turns, which nobody learned from, say {result.drift:.2e}."
     )
 
 
-def learned_line(found: Learned) -> str:
+def learned_line(result: Learned) -> str:
     """One line for the terminal."""
-    own, calibrated = found.second_half.position_rmse_m, found.second_half_calibrated.position_rmse_m
+    local, calibrated = result.second_half.position_rmse_m, result.second_half_calibrated.position_rmse_m
     return (
-        f"Learned without the truth from the first {found.rows} rows: {own:.3f} m on the second half without a relay, "
-        f"where the calibrated filter has {calibrated:.3f} m. {said(found)}"
+        f"Learned without the truth from the first {result.rows} rows: {local:.3f} m on the second half without a relay, "
+        f"where the calibrated filter has {calibrated:.3f} m. {said(result)}"
     )
 
 
@@ -120,20 +120,20 @@ def interval(row: Row) -> str:
     return f"{row.low:.4g} to {row.high:.4g}" if row.identified else "not told"
 
 
-def learned_summary(found: Learned) -> dict[str, Json]:
+def learned_summary(result: Learned) -> dict[str, Json]:
     """All numbers."""
     return {
-        "rows": found.rows,
-        "second_half": found.second_half.position_rmse_m,
-        "second_half_calibrated": found.second_half_calibrated.position_rmse_m,
-        "second_half_nees": found.second_half.nees_per_dimension,
-        "gyro_rate_at_rest": found.rest,
-        "gyro_rate_of_truth": found.drift,
-        "parameters": parameters(found.found),
+        "rows": result.rows,
+        "second_half": result.second_half.position_rmse_m,
+        "second_half_calibrated": result.second_half_calibrated.position_rmse_m,
+        "second_half_nees": result.second_half.nees_per_dimension,
+        "gyro_rate_at_rest": result.rest,
+        "gyro_rate_of_truth": result.drift,
+        "parameters": parameters(result.result),
     }
 
 
-def parameters(found: Fit) -> dict[str, Json]:
+def parameters(outcome: Fit) -> dict[str, Json]:
     """Estimates with their intervals, by name; null where there is none."""
 
     def finite(value: float) -> float | None:
@@ -141,5 +141,5 @@ def parameters(found: Fit) -> dict[str, Json]:
 
     return {
         row.name: {"estimate": row.estimate, "low": finite(row.low), "high": finite(row.high), "boundary": row.boundary}
-        for row in found.rows()
+        for row in outcome.rows()
     }

@@ -143,8 +143,8 @@ def _honesty(drawings: Mapping[str, bytes], outcome: Outcome) -> Section:
 def _designed(designs: Mapping[str, Design]) -> Section:
     plain, less, least = (designs[name] for name in DESIGNED)
     rows = [
-        [what, f"{one.sensor:.4g}", f"{one.relay:.4g}", f"{one.rmse:.2f}", f"{one.claimed:.2f}"]
-        for what, one in zip(DESIGNED.values(), (plain, less, least), strict=True)
+        [what, f"{item.sensor:.4g}", f"{item.relay:.4g}", f"{item.rmse:.2f}", f"{item.claimed:.2f}"]
+        for what, item in zip(DESIGNED.values(), (plain, less, least), strict=True)
     ]
     text = (
         "Where the robot starts is known, so that the ranges there are too. A sensor that takes them off before it "
@@ -226,25 +226,25 @@ def _constants(outcome: Outcome) -> Section:
 
 
 def _learned(outcome: Outcome) -> list[Section]:
-    found = outcome.learned
-    if found is None:
+    result = outcome.learned
+    if result is None:
         return []
     calibrated = robot.Constants(robot.DRIVES[outcome.recording.name].gyro_rate)._asdict()
     rows = [
         [row.name.replace("_", " "), f"{calibrated[row.name]:.4g}", f"{row.estimate:.4g}", interval(row)]
-        for row in found.found.rows()
+        for row in result.result.rows()
     ]
     caption = (
         "Each constant as it was measured with the truth (the gyro's rate: at rest), and as the likelihood of the "
         "ranges alone finds it, with its 95 % interval."
     )
-    after, before = (one.position_rmse_m for one in (found.second_half, found.second_half_calibrated))
+    after, before = (item.position_rmse_m for item in (result.second_half, result.second_half_calibrated))
     return [Section("What the ranges alone say", [
         Text([
-            f"The same constants can be learned without the truth, by `hg.fit`: here from the first {found.rows} rows. "
+            f"The same constants can be learned without the truth, by `hg.fit`: here from the first {result.rows} rows. "
             "The filter with the learned constants hears the ranges without a relay, and is judged on the second half "
             f"of the drive: it is off by **{after:.3f} m** where the calibrated one is off by {before:.3f} m.",
-            said(found),
+            said(result),
         ]),
         Table(["constant", "calibrated", "learned", "95 %"], rows, caption),
     ])]  # fmt: skip
@@ -256,12 +256,12 @@ def _in_sample(outcome: Outcome) -> bool:
 
 
 def _limits(outcome: Outcome) -> Section:
-    own, always = [], [
+    local, always = [], [
         "One drive, one map. The spread over seeds is that of the simulated relay alone, not of other drives.",
         "A cubature covariance is an approximation, not a bound; NEES near 1 is found here, not guaranteed.",
     ]  # fmt: skip
     if _in_sample(outcome):
-        own = [
+        local = [
                 "The five constants come from the recording that is scored (in-sample). They describe the robot and "
                 "its radios, not the relay, and all filters share them.",
                 "The recorded odometry distance agrees with the true path almost exactly, so dead reckoning "
@@ -272,7 +272,7 @@ def _limits(outcome: Outcome) -> Section:
                 "filter takes it for forward motion: hence the rise at the end of the perfect channel's NEES.",
         ]  # fmt: skip
     else:
-        own = [
+        local = [
             "The constants come from another drive; only the gyro's rate at rest, the places of the beacons and the "
             "first pose are this drive's.",
             "The recorded turns add up to the true ones almost exactly, as no gyro's do: they seem to have been "
@@ -281,7 +281,7 @@ def _limits(outcome: Outcome) -> Section:
             "Twice the file goes back by about a minute. The ranges fit the truth where their time stamps say, so they "
             "are used in that order.",
         ]  # fmt: skip
-    return Section("What to keep in mind", [Points([*own, *always])])
+    return Section("What to keep in mind", [Points([*local, *always])])
 
 
 def _rerun(outcome: Outcome) -> Section:

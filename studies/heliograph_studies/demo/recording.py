@@ -82,12 +82,12 @@ def read_recording(name: str = "plaza2") -> PlazaRecording:
         ValueError: no recording of this name, or the installed gtsam comes without it.
     """
     tables = loadmat(find_recording(name), variable_names=["GT", "DR", "TD", "TL"])
-    truth, odometry, heard, beacons = (tables[key] for key in ("GT", "DR", "TD", "TL"))
+    truth, odometry, received, beacons = (tables[key] for key in ("GT", "DR", "TD", "TL"))
     clock = truth[:, 0]  # odometry row i is the increment from clock[i] to clock[i + 1]
-    heard = heard[np.argsort(heard[:, 0], kind="stable")]
-    between = _without_ranges(clock, heard[:, 0])
-    rows = np.argsort(np.concatenate([heard[:, 0], between]), kind="stable")
-    time = np.concatenate([clock[:1], np.concatenate([heard[:, 0], between])[rows]])
+    received = received[np.argsort(received[:, 0], kind="stable")]
+    between = _without_ranges(clock, received[:, 0])
+    rows = np.argsort(np.concatenate([received[:, 0], between]), kind="stable")
+    time = np.concatenate([clock[:1], np.concatenate([received[:, 0], between])[rows]])
     sums = [np.interp(time, clock, np.concatenate([[0.0], np.cumsum(odometry[:, c])])) for c in (1, 2)]
     pose = np.column_stack([
         np.interp(time, clock, truth[:, 1]),
@@ -96,7 +96,7 @@ def read_recording(name: str = "plaza2") -> PlazaRecording:
     ])  # fmt: skip
     columns = {beacon: c for c, beacon in enumerate(beacons[:, 0])}
     ranges = np.full((len(rows), len(beacons)), np.nan)
-    ranges[np.arange(len(heard)), [columns[beacon] for beacon in heard[:, 2]]] = heard[:, 3]
+    ranges[np.arange(len(received)), [columns[beacon] for beacon in received[:, 2]]] = received[:, 3]
     ranges = ranges[rows]
     departure = int(np.argmax(odometry[:, 1] > MOVING))
     rate = float(odometry[:departure, 2].sum() / (clock[departure] - clock[0]))
@@ -104,9 +104,9 @@ def read_recording(name: str = "plaza2") -> PlazaRecording:
     return PlazaRecording(name, float(time[0]), pose[0], time[1:], pose[1:], steps, ranges, beacons[:, 1:], rate)
 
 
-def _without_ranges(clock: np.ndarray, heard: np.ndarray) -> np.ndarray:
+def _without_ranges(clock: np.ndarray, received: np.ndarray) -> np.ndarray:
     """Times of the odometry in every stretch of more than LONGEST without a range."""
-    ends = np.concatenate([clock[:1], heard, clock[-1:]])
+    ends = np.concatenate([clock[:1], received, clock[-1:]])
     long = np.flatnonzero(np.diff(ends) > LONGEST)
     inside = [clock[(clock > ends[i]) & (clock < ends[i + 1])] for i in long]
     return np.concatenate([np.zeros(0), *inside])

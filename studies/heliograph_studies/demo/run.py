@@ -16,7 +16,7 @@ from heliograph.files.table import write_table
 from heliograph.numerics.check import check_seed
 from heliograph.report.progress import Advance
 from heliograph.report.results import Json, Results, write_results
-from heliograph.simulation.record import Record
+from heliograph.simulation.results.record import Record
 from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import NAMES, SEEDS, TABLE_HEADERS, Outcome, compute, table_rows
 from heliograph_studies.demo.learned import learn, learned_line, learned_summary
@@ -28,7 +28,7 @@ NAME = "demo"
 STAGES = 2 * SEEDS + 2  # of reading, computing and learning
 
 
-class Found(NamedTuple):
+class Evaluation(NamedTuple):
     """The filters behind the relays as they are, and behind relays that were designed."""
 
     outcome: Outcome
@@ -47,12 +47,12 @@ def example(out: Path, seed: int = 0, recording: str = "plaza2") -> None:
     check_seed(f"last of {SEEDS} seeds", check_seed("seed", seed) + SEEDS - 1)
     find_recording(recording)  # a missing extra is told before the work starts
 
-    def work(advance: Advance) -> Found:
+    def work(advance: Advance) -> Evaluation:
         advance("reading the recording")
         drive = read_recording(recording)
         outcome = compute(drive, seed, advance)
         learned = learn(drive, advance)
-        return Found(replace(outcome, learned=learned), designs(outcome, advance))
+        return Evaluation(replace(outcome, learned=learned), designs(outcome, advance))
 
     target = Path(out) / NAME
     print_table(write_results(target, STAGES, work, results, ("pyarrow",)).outcome, target)
@@ -65,13 +65,13 @@ def designs(outcome: Outcome, advance: Callable[[str], None] = lambda what: None
     return {"as_it_is": plain, **twins(outcome.recording, range(trials[0].seed, trials[-1].seed + 1), advance)}
 
 
-def results(found: Found) -> Results:
+def results(evaluation: Evaluation) -> Results:
     """Everything that the folder holds."""
     from heliograph_studies.demo.page import demo_figures, demo_page
 
-    outcome = found.outcome
-    told = {**summary(outcome), "designs": {name: numbers(one) for name, one in found.designs.items()}}
-    return Results(demo_figures(outcome), partial(demo_page, *found), told, partial(write_data, outcome))
+    outcome = evaluation.outcome
+    known = {**summary(outcome), "designs": {name: numbers(design) for name, design in evaluation.designs.items()}}
+    return Results(demo_figures(outcome), partial(demo_page, *evaluation), known, partial(write_data, outcome))
 
 
 def numbers(design: Design) -> dict[str, Json]:

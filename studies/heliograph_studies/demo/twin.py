@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from heliograph.filters.gaussian import cubature_filter
+from heliograph.filters.gaussian.gaussian import cubature_filter
 from heliograph.model.centred import centred
 from heliograph.model.channel import amplify_and_forward, hop, parallel
 from heliograph.numerics.check import fail
@@ -49,8 +49,8 @@ class Design(NamedTuple):
 
 def at_start(drive: robot.Drive) -> np.ndarray:
     """The ranges that filter and sender expect at the known start, (4,) m."""
-    found: np.ndarray = robot.RANGE_SCALE * np.linalg.norm(drive.start[:2] - drive.beacons, axis=1)
-    return found
+    result: np.ndarray = robot.RANGE_SCALE * np.linalg.norm(drive.start[:2] - drive.beacons, axis=1)
+    return result
 
 
 def channel_less(reference: np.ndarray, power: float) -> AbstractRandomAffine:
@@ -79,7 +79,7 @@ def twins(
     channels = {name: channel_less(reference, power) for name, power in DESIGNS.items()}
     filters = {name: {name: cubature_filter(plant, sensor, channel)} for name, channel in channels.items()}
     network = Network(plant, {name: Node(sensor, channels[name], filters[name]) for name in DESIGNS})
-    found: dict[str, list[Score]] = {name: [] for name in DESIGNS}
+    results: dict[str, list[Score]] = {name: [] for name in DESIGNS}
     for seed in seeds:
         advance(f"designed relays, seed {seed}")
         received = {name: relay(channel, recording.ranges, seed) for name, channel in channels.items()}
@@ -87,5 +87,5 @@ def twins(
         if failures := record.failures():
             raise fail("designed relays", "sound estimates", "; ".join(failures))
         for name in DESIGNS:
-            found[name].append(score(record.estimates[name][name], recording.truth))
-    return {name: Design(*powers(recording.ranges, reference, power), found[name]) for name, power in DESIGNS.items()}
+            results[name].append(score(record.estimates[name][name], recording.truth))
+    return {name: Design(*powers(recording.ranges, reference, power), results[name]) for name, power in DESIGNS.items()}

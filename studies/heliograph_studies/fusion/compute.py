@@ -44,7 +44,7 @@ class Outcome:
 def compute(setting: Setting, stages: Stages) -> Outcome:
     """Everything."""
     # First: what memory the process has had at most is of all that came before.
-    of_many = stages(f"{setting.tree_nodes} nodes in a tree, {setting.many} nodes", lambda: scale(setting))
+    of_many = stages(f"{setting.tree_nodes} nodes in a tree, {setting.crossed_nodes} nodes", lambda: scale(setting))
     cases = {name: stages(what, partial(one_case, name, setting.steps)) for name, what in CASES.items()}
     simulated = stages("simulating three rooms", lambda: measured(setting))
     of_tree, levels, root = stages("a tree of relays", lambda: tree(setting))
@@ -99,10 +99,10 @@ def measured(setting: Setting) -> dict[str, dict[str, float]]:
     """Three rooms simulated: E |x - xhat|^2 at the last step with its standard error, beside the claim."""
     record = hg.monte_carlo(network(*described("three_rooms")), setting.measured_steps, setting.runs, setting.seed)
     claims = {name: np.asarray(estimate.covariance)[0, -1] for name, estimate in record.estimates["fused"].items()}
-    return {name: beside(np.trace(claim), record.errors("fused", name)[:, -1]) for name, claim in claims.items()}
+    return {name: against_peers(np.trace(claim), record.errors("fused", name)[:, -1]) for name, claim in claims.items()}
 
 
-def beside(claimed: float, errors: np.ndarray) -> dict[str, float]:
+def against_peers(claimed: float, errors: np.ndarray) -> dict[str, float]:
     """The mean of squared errors (runs, n) with its standard error, beside what is claimed of it."""
     square = np.sum(errors**2, axis=-1)
     error = float(square.std(ddof=1) / np.sqrt(len(square)))
@@ -142,7 +142,7 @@ def _root_simulated(net: hg.Network, setting: Setting) -> dict[str, float]:
         weights = [hg.fusion.matrix_weights(level.joint[g][:, :, g]) for g in groups]
         pairs = zip(groups, weights, strict=True)
         errors = np.stack([np.einsum("aib,kib->ka", w, errors[:, g]) for g, w in pairs], axis=1)
-    return beside(np.trace(levels[-1].matrix_weights()[1]), errors[:, 0])
+    return against_peers(np.trace(levels[-1].matrix_weights()[1]), errors[:, 0])
 
 
 def scale(setting: Setting) -> dict[str, float | None]:
@@ -159,16 +159,16 @@ def scale(setting: Setting) -> dict[str, float | None]:
     grown = hg.simulation.relay_tree(plant, leaf, numbers, setting.degree, setting.many_steps)
     tree_took, tree_peak = _since(begin), peak_gb()
     begin = time.perf_counter(), time.process_time()
-    crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.many]), LOCAL, setting.many_steps)
+    crossed = hg.simulation.cross_covariances(network(plant, parts[: setting.crossed_nodes]), LOCAL, setting.many_steps)
     pairs, (_, covariance) = crossed.joint, crossed.matrix_weights()
     took = _since(begin)
     return {
-        "nodes": setting.many,
+        "nodes": setting.crossed_nodes,
         "steps": setting.many_steps,
         "seconds": took[0],
         "processor_seconds": took[1],
         "peak_gb": peak_gb(),
-        "local": float(np.einsum("iaia->", pairs) / setting.many),
+        "local": float(np.einsum("iaia->", pairs) / setting.crossed_nodes),
         "matrix": float(np.trace(covariance)),
         "tree_nodes": setting.tree_nodes,
         "tree_degree": setting.degree,

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.gaussian import GaussianFilter
+from heliograph.filters.gaussian.gaussian import GaussianFilter
 
 B1, B2, B3, B4, B5 = -0.186, -1.778, 6.125, -6.234, 0.081  # stator, rotor, torque
 STEP, FREQUENCY, VOLTAGE = 0.1, 2.0, 2.0

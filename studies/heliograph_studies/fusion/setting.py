@@ -22,7 +22,7 @@ class Setting:
     runs: int = 2000
     steps: int = 200
     measured_steps: int = 30
-    many: int = 1000
+    crossed_nodes: int = 1000
     many_steps: int = 100
     tree_nodes: int = 10_000
     degree: int = 10
@@ -38,7 +38,7 @@ class Setting:
         for name in ("steps", "measured_steps", "many", "many_steps", "machine_runs", "traffic_steps"):
             check_count(name, getattr(self, name), 1)
         check_count("degree", self.degree, 2)
-        check_count("tree_nodes", self.tree_nodes, self.many)
+        check_count("tree_nodes", self.tree_nodes, self.crossed_nodes)
         check_seed("seed", self.seed)
         if not 2 <= self.machine_nodes <= len(OUTPUTS):
             raise fail("machine_nodes", f"a number from 2 to {len(OUTPUTS)}", self.machine_nodes)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from heliograph_studies.h_infinity_fusion.discriminating import discriminate
-from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Runs, simulate, simulate_told
+from heliograph_studies.h_infinity_fusion.example import RECURSIVE, Runs, simulate, simulate_known
 from heliograph_studies.h_infinity_fusion.growth import Growth, growth, violation
 from heliograph_studies.h_infinity_fusion.indices import indices, replay
 from heliograph_studies.h_infinity_fusion.levels import (
@@ -41,12 +41,14 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
         "horizon": [node.horizon for node in nodes],
         "zero_gain": [node.zero_gain for node in nodes],
     }
-    runs, told = stages(f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_told(setting)))
+    runs, known = stages(
+        f"example: {setting.runs:,} runs", lambda: (simulate(setting, by_name), simulate_known(setting))
+    )
     constants, true = stages("growth constants", lambda: _growth(runs))
     second = stages("second example", lambda: discriminate(setting.runs, setting.seed))
     replayed = replay(runs)
     judged = stages("indices", lambda: indices(runs, replayed))
-    parts = Parts(setting, nodes, more, gap, broken, runs, told, replayed, judged, constants, true, second)
+    parts = Parts(setting, nodes, more, gap, broken, runs, known, replayed, judged, constants, true, second)
     return Outcome(numbers(parts), parts)
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.prediction import prediction_of
+from heliograph.filters.wrappers.prediction import prediction_of
 from heliograph_studies.h_infinity_fusion import structured
 from heliograph_studies.h_infinity_fusion.example import mean_and_error
 from heliograph_studies.h_infinity_fusion.levels import without_gain
@@ -62,13 +62,13 @@ def discriminate(runs: int, seed: int) -> Discriminating:
 
 def design() -> dict[str, dict[str, hg.h_infinity.HInfinityDesign]]:
     """The horizon and the recursive design of each node at their smallest levels, and what K = 0 proves."""
-    found: dict[str, dict[str, hg.h_infinity.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
+    results: dict[str, dict[str, hg.h_infinity.HInfinityDesign]] = {"horizon": {}, "recursive": {}, "zero_gain": {}}
     for node in structured.OUTPUTS:
         system = structured.system(node)
-        found["horizon"][node] = hg.h_infinity.horizon_design(system, separate=True)
-        found["recursive"][node] = hg.h_infinity.smallest_recursive_level(system, separate=True)
-        found["zero_gain"][node] = without_gain(system, True)
-    return found
+        results["horizon"][node] = hg.h_infinity.horizon_design(system, separate=True)
+        results["recursive"][node] = hg.h_infinity.smallest_recursive_level(system, separate=True)
+        results["zero_gain"][node] = without_gain(system, True)
+    return results
 
 
 def filters(
@@ -76,13 +76,13 @@ def filters(
 ) -> dict[str, hg.filters.AbstractFilter]:
     """All filters of a node but the one that is told of losses; each predicts."""
     believed, sensor, system = structured.plant(False), structured.sensor(node), structured.system(node)
-    found: dict[str, hg.filters.AbstractFilter] = {
-        name: hg.filters.h_infinity_filter(believed, sensor, system, each[node]) for name, each in designs.items()
+    results: dict[str, hg.filters.AbstractFilter] = {
+        name: hg.filters.h_infinity_filter(believed, sensor, system, element[node]) for name, element in designs.items()
     }
-    found["open_loop"] = hg.filters.open_loop_filter(believed)
+    results["open_loop"] = hg.filters.open_loop_filter(believed)
     for name, hop in (("ekf_ignoring", structured.lossless), ("ekf_statistics", structured.lossy)):
-        found[name] = prediction_of(hg.extended_filter(believed, sensor, structured.channel(hop)))
-    return found
+        results[name] = prediction_of(hg.extended_filter(believed, sensor, structured.channel(hop)))
+    return results
 
 
 def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> list[hg.Network]:
@@ -91,10 +91,10 @@ def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> li
         node: hg.Node(structured.sensor(node), structured.channel(), filters(node, designs))
         for node in structured.OUTPUTS
     }
-    told = {
+    known = {
         node: hg.Node(
             structured.sensor(node),
-            structured.channel(structured.told),
+            structured.channel(structured.known),
             {
                 "ekf_told": prediction_of(
                     hg.extended_filter(
@@ -110,7 +110,7 @@ def networks(designs: dict[str, dict[str, hg.h_infinity.HInfinityDesign]]) -> li
         hg.Network(
             structured.plant(), nodes, {name: hg.Fusion(name, rule) for name in next(iter(nodes.values())).filters}
         )
-        for nodes in (blind, told)
+        for nodes in (blind, known)
     ]
 
 
@@ -128,8 +128,8 @@ def simulate(
                 norms = np.linalg.norm(record.errors("fused", name), axis=-1)
                 errors[scenario][name] = mean_and_error(norms.mean(axis=1))
                 over_time[scenario][name] = norms.mean(axis=0)
-                own = np.linalg.norm(record.errors(NODE, name), axis=-1)
-                local[scenario][name] = mean_and_error(own.mean(axis=1))
+                separate = np.linalg.norm(record.errors(NODE, name), axis=-1)
+                local[scenario][name] = mean_and_error(separate.mean(axis=1))
     return errors, local, over_time
 
 

@@ -19,35 +19,35 @@ def errata(result: Parts) -> list[Statement]:
 
 
 def _growth(result: Parts) -> list[Statement]:
-    found, true = result.growth, result.true_growth
-    false = [s for s, finding in enumerate(found.visited) if finding.refuted]
-    happened = np.flatnonzero(found.secant > result.setting.growth).tolist()
-    own, worst = result.nodes[0].horizon.level, result.broken
+    outcome, true = result.growth, result.true_growth
+    false = [s for s, finding in enumerate(outcome.visited) if finding.refuted]
+    happened = np.flatnonzero(outcome.secant > result.setting.growth).tolist()
+    local, worst = result.nodes[0].horizon.level, result.broken
     return [
         Statement("v_s = 0.4 cos(0.8 s) / sqrt(s) from s = 0", "Section IV", "a disturbance of finite energy",
             "v_0 = inf; sqrt(s + 1) is used here, as in the other noises", {"first_divisor": float(np.sqrt(0.0))},
             lambda first_divisor: holds(first_divisor > 0)),
-        Statement("|f(x)| <= 0.7 |x|", "(2) at xhat = 0", "a = 0.7", found.size.text,
-            {"largest_ratio": found.size.ratio, "constant": result.setting.growth},
+        Statement("|f(x)| <= 0.7 |x|", "(2) at xhat = 0", "a = 0.7", outcome.size.text,
+            {"largest_ratio": outcome.size.ratio, "constant": result.setting.growth},
             lambda largest_ratio, constant: holds(largest_ratio <= constant * ATTAINED)),
         Statement("|f(x) - f(xhat)| <= 0.7 |x - xhat|", "(2), Section IV", "a = 0.7",
-            f"false: {found.whole.text}. Around what the runs visited, slopes reach {found.slopes.max():.4f} and a "
+            f"false: {outcome.whole.text}. Around what the runs visited, slopes reach {outcome.slopes.max():.4f} and a "
             f"pair breaks 0.7 at {len(false)} of {result.setting.steps} steps; estimates of the runs themselves break "
-            f"it at s = {happened}, with {found.secant.max():.3f}",
-            {"largest_slope": max(found.whole.ratio, found.whole.slope), "steps_that_break_it": len(false),
+            f"it at s = {happened}, with {outcome.secant.max():.3f}",
+            {"largest_slope": max(outcome.whole.ratio, outcome.whole.slope), "steps_that_break_it": len(false),
              "constant": result.setting.growth},
             lambda largest_slope, steps_that_break_it, constant: holds(
                 largest_slope <= constant * ATTAINED and steps_that_break_it == 0)),
         Statement("the guarantee of Theorem 1 in the example", "Section IV", "from a = 0.7",
-            f"node 1, best gains: guaranteed {own:.5f}, but a disturbance exists with {worst.level:.5f} ± "
-            f"{worst.standard_error:.1g}", {"guaranteed": own, "found": Sampled(worst.level, worst.standard_error)},
-            lambda guaranteed, found: holds(found.at_most(guaranteed))),
+            f"node 1, best gains: guaranteed {local:.5f}, but a disturbance exists with {worst.level:.5f} ± "
+            f"{worst.standard_error:.1g}", {"guaranteed": local, "found": Sampled(worst.level, worst.standard_error)},
+            lambda guaranteed, outcome: holds(outcome.at_most(guaranteed))),
         Statement("levels can be guaranteed where state and estimates go", "not in the paper", "",
-            f"with slopes that the search did not refute there: one constant {true.one.min():.4f} to "
-            f"{true.one.max():.4f}; a slope for each step {true.each_step[:, 0].min():.4f} to "
+            f"with slopes that the search did not refute there: one constant {true.item.min():.4f} to "
+            f"{true.item.max():.4f}; a slope for each step {true.each_step[:, 0].min():.4f} to "
             f"{true.each_step[:, 0].max():.4f}, with separate multipliers {true.each_step[:, 1].min():.4f} to "
             f"{true.each_step[:, 1].max():.4f}; below the paper's levels by far",
-            {"largest_level": float(true.one.max()), "certified": int(true.certified),
+            {"largest_level": float(true.item.max()), "certified": int(true.certified),
              "least_level": min(result.setting.levels)},
             lambda largest_level, certified, least_level: holds(certified and largest_level < least_level)),
     ]  # fmt: skip
@@ -91,7 +91,7 @@ def _fusion(result: Parts) -> list[Statement]:
         [[np.full((1, 1), -(best**2) / (2 * len(c))), (c * gamma)[None]], [(c * gamma)[:, None], -np.eye(4)]]
     )
     top = float(np.linalg.eigvalsh(edge)[-1])
-    one = published_fused_level([gamma[0]], [1.0]) / gamma[0]
+    item = published_fused_level([gamma[0]], [1.0]) / gamma[0]
     return [
         Statement("the fused level is 2.5419", "Section IV", f"{PAPER_FUSED_LEVEL}",
             f"{paper:.5f} with the printed weights, once they sum to 1 ({result.level_of_paper_weights(False):.5f} "
@@ -108,7 +108,7 @@ def _fusion(result: Parts) -> list[Statement]:
             lambda largest_eigenvalue: holds(largest_eigenvalue < -ROUNDING)),
         Statement("fusing improves the guarantee", "Theorem 3", "2.5419",
             f"{best:.4f} is above every local level (at most {gamma.max():g}), and for a single node the bound is "
-            f"{one:.4f} times its own level; the triangle inequality gives {minkowski:.4f} without quantization, and "
+            f"{item:.4f} times its own level; the triangle inequality gives {minkowski:.4f} without quantization, and "
             f"the best node alone {gamma.min():g}", {"fused": best, "best_node": float(gamma.min())},
             lambda fused, best_node: holds(fused < best_node)),
     ]  # fmt: skip

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 import heliograph as hg
-from heliograph.filters.gaussian import GaussianFilter
-from heliograph.filters.prediction import prediction_of
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.wrappers.prediction import prediction_of
 from heliograph.fusion.quantizer import Quantizer
 from heliograph_studies.h_infinity_fusion.setting import NODES, Hop, Setting
 from heliograph_studies.h_infinity_fusion.zoom_quantizer import ZoomQuantizer
@@ -102,16 +102,17 @@ def h_infinity_filters(setting: Setting, node: int, designs: Designs) -> dict[st
     """The designed filters of one node."""
     parts = setting.plant(False), setting.sensor(node, 0.0), setting.system(node)
     return {
-        name: hg.filters.h_infinity_filter(*parts, each[node], setting.guesses[node]) for name, each in designs.items()
+        name: hg.filters.h_infinity_filter(*parts, design[node], setting.guesses[node])
+        for name, design in designs.items()
     }
 
 
-def simulate_told(setting: Setting) -> Runs:
+def simulate_known(setting: Setting) -> Runs:
     """Extended Kalman filters told of each loss, in a network whose losses are erasures; other draws."""
     nodes = {
         node: hg.Node(
             setting.disturbed_sensor(i),
-            setting.disturbed_channel(setting.told),
+            setting.disturbed_channel(setting.known),
             {"ekf_told": prediction_of(extended(setting, i, setting.lossless))},
         )
         for i, node in enumerate(NODES)

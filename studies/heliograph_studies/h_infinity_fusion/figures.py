@@ -47,9 +47,9 @@ LABELS = {
 }  # fmt: skip
 
 
-def figures(found: Outcome) -> dict[str, Figure]:
+def figures(answer: Outcome) -> dict[str, Figure]:
     """All figures by file name."""
-    result, outcome = found.parts, found.parts.runs
+    result, outcome = answer.parts, answer.parts.runs
     drawn = {f"fig{2 + i:02d}_node{node}": _node(outcome, i) for i, node in enumerate(NODES)}
     drawn["fig06_fusion"] = _fusion(outcome)
     seen = arrivals(outcome)[0]
@@ -115,7 +115,7 @@ def _levels(result: Parts) -> Figure:
     rows: list[tuple[str, Sequence[float], str, str]] = [
         ("the paper's", result.setting.levels, VERMILION, "o"),
         ("smallest with its P₀", (fixed,) * 4, AMBER, "s"),
-        ("one growth constant that is not refuted", true.one[:, 0].tolist(), PURPLE, "D"),
+        ("one growth constant that is not refuted", true.item[:, 0].tolist(), PURPLE, "D"),
         ("recursive, a = 0.7", [n.smallest["trace"] for n in result.nodes], GREEN, "^"),
         ("horizon, a = 0.7", [n.horizon.level for n in result.nodes], BLUE, "v"),
         ("K = 0, a = 0.7", [n.without_measurements for n in result.nodes], INK, "_"),
@@ -128,11 +128,11 @@ def _levels(result: Parts) -> Figure:
 
 
 def _growth(result: Parts) -> Figure:
-    found = result.growth
+    outcome = result.growth
     curves = [
-        Curve("largest slope nearby", VERMILION, found.slopes),
-        Curve("largest ratio that happened", BLUE, found.secant),
-        Curve("a, as printed", INK, np.full(len(found.secant), result.setting.growth)),
+        Curve("largest slope nearby", VERMILION, outcome.slopes),
+        Curve("largest ratio that happened", BLUE, outcome.secant),
+        Curve("a, as printed", INK, np.full(len(outcome.secant), result.setting.growth)),
     ]
     return _over_steps([Panel("growth of f", curves)])
 
@@ -184,7 +184,7 @@ def words(outcome: Outcome) -> dict[str, object]:
     result, second = outcome.parts, outcome.parts.discriminating
     names = ("horizon", "recursive", "zero_gain", "open_loop", "ekf_ignoring", "ekf_statistics", "ekf_told")
     behind = {q: result.runs.mean_error(RECURSIVE, q) for q in (*QUANTIZERS, *MORE_QUANTIZERS)}
-    runs = {name: result.runs for name in result.runs.filters} | {"ekf_told": result.told}
+    runs = {name: result.runs for name in result.runs.filters} | {"ekf_told": result.known}
     return {
         "p": result,
         "second": second,

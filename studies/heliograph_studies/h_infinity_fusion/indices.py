@@ -77,15 +77,15 @@ def replay(outcome: Runs) -> Replayed:
     setting, estimates = outcome.setting, outcome.estimates(RECURSIVE)
     quantizer = zoom(setting)
     d, amplitude, error, astray = np.full_like(estimates[:, :, 0], setting.amplitude), [], [], 0.0
-    own = d
+    local = d
     for s in range(setting.steps):
         x = estimates[:, :, s]
         following, sent = quantizer.step(d, x)  # every component on its own, whatever the shape
         amplitude.append(d)
         error.append(np.asarray(sent.value) - x)
-        astray = max(astray, float(np.max(np.abs(own - d) / d)))
-        received = np.asarray(quantizer.step(own, x)[1].value)
-        d, own = np.asarray(following), np.asarray(quantizer.decay * own + quantizer.growth * received**2)
+        astray = max(astray, float(np.max(np.abs(local - d) / d)))
+        received = np.asarray(quantizer.step(local, x)[1].value)
+        d, local = np.asarray(following), np.asarray(quantizer.decay * local + quantizer.growth * received**2)
     d, mu = np.stack(amplitude, axis=2), np.stack(error, axis=2)
     return Replayed(d, mu, float(np.max(np.abs(mu) * setting.segments / d)), astray, *_broken(outcome, d, mu))
 

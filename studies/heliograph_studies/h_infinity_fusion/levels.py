@@ -107,7 +107,7 @@ class TrueGrowth:
     each step's slope for f~. certified: whether every one of them is.
     """
 
-    one: np.ndarray
+    item: np.ndarray
     differences: np.ndarray
     each_step: np.ndarray
     certified: bool

@@ -37,7 +37,7 @@ def numbers(result: Parts) -> dict[str, Any]:
         },
         "contexts": {
             **{name: context(outcome, name) for name in outcome.filters if name != RECURSIVE},
-            "ekf_told": {**context(result.told, "ekf_told"), "note": "a second network, other draws"},
+            "ekf_told": {**context(result.known, "ekf_told"), "note": "a second network, other draws"},
         },
         "growth": growth_numbers(result),
         "index": {
@@ -144,7 +144,7 @@ def second_numbers(second: Discriminating) -> dict[str, Any]:
     """The second example: by filter, levels of each node and errors; by node, certificates."""
     return {
         "runs": second.runs,
-        "levels": {name: {n: d.level for n, d in each.items()} for name, each in second.designs.items()},
+        "levels": {name: {n: d.level for n, d in design.items()} for name, design in second.designs.items()},
         "certified": {n: c.certified for n, c in second.certificates.items()},
         "without_structure": second.without_structure,
         "without_structure_or_gain": {NODE: second.without_structure_or_gain},
@@ -152,8 +152,8 @@ def second_numbers(second: Discriminating) -> dict[str, Any]:
         "worst": {"node": NODE, **{name: worst_level(worst) for name, worst in second.worst.items()}},
         **{
             key: {
-                scenario: {name: {"mean": mean, "se": error} for name, (mean, error) in each.items()}
-                for scenario, each in errors.items()
+                scenario: {name: {"mean": mean, "se": error} for name, (mean, error) in element.items()}
+                for scenario, element in errors.items()
             }
             for key, errors in (
                 ("mean_fused_error", second.errors),
@@ -180,7 +180,7 @@ def record(result: Parts) -> "xarray.Dataset":
         "mean_amplitude": (("node", "s", "state"), result.replayed.amplitude.mean(axis=0)),
         "second_mean_fused_error": (
             ("scenario", "filter", "step"),
-            np.array([[each[name] for name in filters] for each in second.over_time.values()]),
+            np.array([[item[name] for name in filters] for item in second.over_time.values()]),
         ),
     }
     coordinates = {"s": np.arange(result.setting.steps), "state": list(STATES), "node": list(NODES),

@@ -24,7 +24,7 @@ class Parts:
     enumeration: float
     broken: Worst
     runs: Runs
-    told: Runs
+    known: Runs
     replayed: Replayed
     indices: Indices
     growth: Growth

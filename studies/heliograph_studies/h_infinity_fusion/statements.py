@@ -42,7 +42,7 @@ def _designs(result: Parts) -> list[Statement]:
             f"{listed(horizon)}, {min(ratio):.0f} to {max(ratio):.0f} times below the paper's (recursive: "
             f"{listed(smallest)}; with P_0 = 10 I, {result.readings.fixed_start:.5f} for all, by (19) alone)",
             {"level_of_hearing_nothing": max(zero), "least_level": min(result.setting.levels)},
-            lambda level_of_hearing_nothing, least_level: if_met(level_of_hearing_nothing > least_level)),
+            lambda level_of_receiving_nothing, least_level: if_met(level_of_receiving_nothing > least_level)),
         Statement("the smallest level needs the measurements", OURS, "implied",
             f"largest gain over K = 0 {100 * (1 - min(horizon) / zero[0]):.1f} %, all of it through D: with D = 0, "
             f"{result.readings.without_feedthrough[0]:.6f} with the best gains of node 1 and "
@@ -79,7 +79,7 @@ def _indices(result: Parts) -> list[Statement]:
 def _figures(result: Parts) -> list[Statement]:
     outcome = result.runs
     error = {name: outcome.mean_error(name, "none") for name in outcome.filters}
-    own, none = error[RECURSIVE][0], error["zero_gain"][0]
+    local, none = error[RECURSIVE][0], error["zero_gain"][0]
     dynamic = outcome.mean_error(RECURSIVE, "dynamic")
     largest = [float(np.max(np.abs(node.paper.gains))) for node in result.nodes]
     seen = arrivals(outcome)
@@ -95,16 +95,16 @@ def _figures(result: Parts) -> list[Statement]:
     even, second = outcome.mean_error(RECURSIVE, "static")[0], outcome.mean_error(RECURSIVE, "static_p41")[0]
     return [
         Statement("the estimates track the state", "Figs 2 to 6", "well",
-            f"mean fused error {own:.4f}; but {none:.4f} with K = 0: the plant forgets by itself, and the levels say "
+            f"mean fused error {local:.4f}; but {none:.4f} with K = 0: the plant forgets by itself, and the levels say "
             f"nothing about it (horizon design, guaranteed lower: {error['horizon'][0]:.4f}). Largest entries of the "
             f"gains by node: {listed(largest, 2)}",
             {"own": Sampled(*error[RECURSIVE]), "without_measurements": Sampled(*error["zero_gain"])},
-            lambda own, without_measurements: if_met(own.value < without_measurements.value / 2)),
+            lambda local, without_measurements: if_met(local.value < without_measurements.value / 2)),
         Statement("losses as stated", "Figs 7 to 9", "arrival 0.8, 0.75, 0.7",
             f"{listed(shares)}, at most {off.max():.1f} standard errors off",
             {"standard_errors_off": float(off.max())}, lambda standard_errors_off: holds(standard_errors_off < 4)),
         Statement("the fused error stays small behind the dynamic quantizer", "Fig. 10", "works well",
-            f"mean {dynamic[0]:.4f}, unquantized {own:.4f}",
+            f"mean {dynamic[0]:.4f}, unquantized {local:.4f}",
             {"dynamic": Sampled(*dynamic), "unquantized": Sampled(*error[RECURSIVE])},
             lambda dynamic, unquantized: holds(dynamic.value < 1.2 * unquantized.value)),
         Statement("dynamic quantization beats static", "Figs 10 and 11", "better",
@@ -164,5 +164,5 @@ def _pair(value: tuple[float, float]) -> str:
     return f"{value[0]:.3f} ± {value[1]:.3f}"
 
 
-def _difference(one: tuple[float, float], other: tuple[float, float]) -> Sampled:
-    return Sampled(one[0] - other[0], float(np.hypot(one[1], other[1])))
+def _difference(item: tuple[float, float], other: tuple[float, float]) -> Sampled:
+    return Sampled(item[0] - other[0], float(np.hypot(item[1], other[1])))

@@ -18,7 +18,7 @@ DAMPING, ANGLE = 0.97, 0.5  # of the rotation: its period is 4 pi steps
 ROTATION = DAMPING * np.array([[np.cos(ANGLE), np.sin(ANGLE)], [-np.sin(ANGLE), np.cos(ANGLE)]])
 GROWTH = 0.05
 DISTURBANCE = np.array([[0.0], [1.0]])
-WANTED = np.eye(2)
+TARGET = np.eye(2)
 WEIGHT = 1.0
 OUTPUTS = {"1": [[1.0, 0.0]], "2": [[0.0, 1.0]], "3": [[0.7, 0.7]]}
 ARRIVAL = (0.95, 0.95, 0.9)
@@ -72,7 +72,7 @@ def lossless(link: int) -> hg.random_affine.AbstractRandomAffine:
     return hg.hop(1.0, NOISE_GAIN[link] ** 2)
 
 
-def told(link: int) -> hg.random_affine.AbstractRandomAffine:
+def known(link: int) -> hg.random_affine.AbstractRandomAffine:
     """A link that loses and tells."""
     return hg.erasure(lossless(link), ARRIVAL[link])
 
@@ -88,7 +88,7 @@ def system(node: str, structured: bool = True) -> hg.h_infinity.GrowthSystem:
     """What designs read; not `structured`: all of A x + phi(x) known by its growth |A| + |phi| alone."""
     shape = {"growth": GROWTH, "transition": ROTATION} if structured else {"growth": DAMPING + GROWTH}
     return hg.h_infinity.growth_system(
-        STEPS, DISTURBANCE, [[0.0]], WANTED, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
+        STEPS, DISTURBANCE, [[0.0]], TARGET, channel(), output=OUTPUTS[node], initial_weight=WEIGHT, **shape
     )
 
 
@@ -100,7 +100,7 @@ def world(node: str) -> World:
         lambda x: jnp.asarray(matrix @ x),
         DISTURBANCE,
         np.zeros((1, 1)),
-        WANTED,
+        TARGET,
         WEIGHT * np.eye(4),
         inputs("bias"),
     )
@@ -117,9 +117,9 @@ def relay_draws(
     """G and N of a scalar relay beside a direct link: sqrt(E1 E2) b1 b2 y + sqrt(E2) b2 n1 + n2, sqrt(E3) b3 y + n3."""
     first, second, direct = (np.random.default_rng(seed).random((count, steps, 3)) < arrival).astype(float).T
     first, second, direct = first.T, second.T, direct.T
-    zero, one = np.zeros_like(first), np.ones_like(first)
+    zero, item = np.zeros_like(first), np.ones_like(first)
     c, e = noise_gain, np.sqrt(powers)
     gain = np.stack([e[0] * e[1] * first * second, e[2] * direct], axis=-1)[..., None]
-    relayed = np.stack([e[1] * second * c[0], c[1] * one, zero], axis=-1)
-    straight = np.stack([zero, zero, c[2] * one], axis=-1)
+    relayed = np.stack([e[1] * second * c[0], c[1] * item, zero], axis=-1)
+    straight = np.stack([zero, zero, c[2] * item], axis=-1)
     return Draws(gain, np.stack([relayed, straight], axis=-2))

@@ -16,7 +16,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 import heliograph as hg
-from heliograph.filters.prediction import Ahead
+from heliograph.filters.wrappers.prediction import Ahead
 from heliograph.numerics.module import Module
 
 SHARES = np.array([1.0, 0.5, 0.1, 0.01])  # of the way to the gradient's direction; the best one is taken
@@ -33,7 +33,7 @@ class World(Module):
     measure: Callable[[jax.Array], jax.Array] = eqx.field(static=True)
     disturbance: np.ndarray
     feedthrough: np.ndarray
-    wanted: np.ndarray
+    expected: np.ndarray
     weight: np.ndarray
     inputs: np.ndarray
 
@@ -73,13 +73,13 @@ def worst_disturbance(
     rounds: int = 60,
 ) -> Worst:
     """Climb from `starts` random disturbances of each of the energies, and judge the best one on new draws."""
-    (time, _), n = world.inputs.shape, world.wanted.shape[1]
+    (time, _), n = world.inputs.shape, world.expected.shape[1]
     sizes = (n,), (n,), (time, world.disturbance.shape[1]), (time, draws.noise.shape[-1])
-    random, each = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
-    points = Disturbance(*(s * random.normal(size=(len(each), *size)) for s, size in zip(FIRST, sizes, strict=True)))
+    random, items = np.random.default_rng(seed), np.repeat(np.asarray(energies, dtype=float), starts)
+    points = Disturbance(*(s * random.normal(size=(len(items), *size)) for s, size in zip(FIRST, sizes, strict=True)))
     with jax.enable_x64(True):
-        found, reached = jax.tree.map(np.asarray, _climb(filter, world, draws, points, each, rounds))
-        best = Disturbance(*(part[int(np.argmax(reached))] for part in found))
+        result, reached = jax.tree.map(np.asarray, _climb(filter, world, draws, points, items, rounds))
+        best = Disturbance(*(part[int(np.argmax(reached))] for part in result))
         output = np.asarray(_output_energy(filter, world, new_draws, best))
         energy = float(_energy(world, best))
     ratio = output / energy
@@ -101,7 +101,7 @@ def _climb(
     def gained(w: Disturbance) -> jax.Array:
         return jnp.mean(_output_energy(filter, world, draws, w))
 
-    def one(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
+    def single(point: Disturbance, energy: jax.Array) -> tuple[Disturbance, jax.Array]:
         def improve(w: Disturbance, _: None) -> tuple[Disturbance, jax.Array]:
             uphill = _scaled(world, _raised(world, jax.grad(gained)(w)), energy)
             tries = jax.vmap(lambda t: _scaled(world, _between(w, uphill, t), energy))(jnp.append(0.0, SHARES))
@@ -112,7 +112,7 @@ def _climb(
         w, values = jax.lax.scan(improve, _scaled(world, point, energy), None, length=rounds)
         return w, values[-1] / energy
 
-    result: tuple[Disturbance, jax.Array] = jax.vmap(one)(points, jnp.asarray(energies))
+    result: tuple[Disturbance, jax.Array] = jax.vmap(single)(points, jnp.asarray(energies))
     return result
 
 
@@ -144,20 +144,20 @@ def _raised(world: World, gradient: Disturbance) -> Disturbance:
 def _output_energy(filter: hg.filters.AbstractFilter, world: World, draws: Draws, w: Disturbance) -> jax.Array:
     """sum |M e|^2 for each draw, (draw,)."""
 
-    def one(gains: jax.Array, noises: jax.Array) -> jax.Array:
+    def single(gains: jax.Array, noises: jax.Array) -> jax.Array:
         def step(carry: PyTree, item: PyTree) -> tuple[PyTree, jax.Array]:
             x, state = carry
             k, u, v, rho, gain, noise = item
             z = gain @ (world.measure(x) + world.feedthrough @ v) + noise @ rho
             state, estimate = filter.step(state, z, u, k)
-            missed = world.wanted @ (x - estimate.mean)
+            missed = world.expected @ (x - estimate.mean)
             return (world.dynamics(x, k) + world.disturbance @ v, state), missed @ missed
 
         begin = _from(filter, jnp.asarray(w.state - w.error))
         items = jnp.arange(len(gains)), world.inputs, w.plant, w.channel, gains, noises
         return jnp.sum(jax.lax.scan(step, (w.state, begin), items)[1])
 
-    result: jax.Array = jax.vmap(one)(jnp.asarray(draws.gain), jnp.asarray(draws.noise))
+    result: jax.Array = jax.vmap(single)(jnp.asarray(draws.gain), jnp.asarray(draws.noise))
     return result
 
 

@@ -107,7 +107,7 @@ class Outcome:
     below: Unlisted[np.ndarray]
     turning: Unlisted[np.ndarray]
     between_bound: Unlisted[float]
-    untold: Unlisted[dict[str, Boundedness]]
+    unpublished: Unlisted[dict[str, Boundedness]]
     iterated: Unlisted[Iterated]
     typical: Unlisted[float]
     curves: Unlisted[dict[str, Curves]]
@@ -143,7 +143,10 @@ def links(setting: Setting) -> dict[str, Any]:
         name: link(setting, setting.examples[name], lossy(arrival), lost, arrival)
         for name in ("scalar", "coupled", "one_unstable")
     }
-    return {**independent, "bursts": [link(setting, setting.scalar, bursts(*each), *each) for each in setting.bursts]}
+    return {
+        **independent,
+        "bursts": [link(setting, setting.scalar, bursts(*burst), *burst) for burst in setting.bursts],
+    }
 
 
 def patterns(setting: Setting, critical: dict[str, CriticalArrival]) -> dict[str, Any]:
@@ -167,7 +170,7 @@ def patterns(setting: Setting, critical: dict[str, CriticalArrival]) -> dict[str
 
 def numbers(parts: dict[str, Any]) -> dict[str, Any]:
     """The numbers by test."""
-    critical, each = parts["critical"], [link.numbers() for link in parts["bursts"]]
+    critical, items = parts["critical"], [link.numbers() for link in parts["bursts"]]
 
     def test(name: str) -> dict[str, Any]:
         return {"threshold": critical[name].upper, "necessary": critical[name].lower, **parts[name].numbers()}
@@ -179,7 +182,7 @@ def numbers(parts: dict[str, Any]) -> dict[str, Any]:
         "T3": test("one_unstable"),
         "T4": {"threshold": parts["components"]},
         "T5": {"threshold": max(parts["recovery"].values()), "by_fail": parts["recovery"]},
-        "T6": {name: [numbers[name] for numbers in each] for name in names},
+        "T6": {name: [numbers[name] for numbers in items] for name in names},
     }
 
 
@@ -239,7 +242,7 @@ def _smallest(verdict: Callable[[float], Boundedness], digits: float) -> float:
 def verdicts(setting: Setting) -> dict[str, str]:
     """Verdicts on either side of thresholds, and between the two of the coupled plant."""
     scalar = threshold(setting.scalar.transition[0, 0])
-    one, two = (threshold(factor) for factor in np.diag(setting.components.transition))
+    item, two = (threshold(factor) for factor in np.diag(setting.components.transition))
 
     def apart(first: float, second: float) -> str:
         links = [hg.erasure(hg.perfect(), p) for p in (first, second)]
@@ -249,9 +252,9 @@ def verdicts(setting: Setting) -> dict[str, str]:
         "below": judge(setting.scalar, lossy(scalar - APART)).verdict,
         "above": judge(setting.scalar, lossy(scalar + APART)).verdict,
         "between": judge(setting.coupled, lossy(setting.between)).verdict,
-        "both_above": apart(one + APART, two + APART),
-        "first_below": apart(one - APART, two + APART),
-        "second_below": apart(one + APART, two - APART),
+        "both_above": apart(item + APART, two + APART),
+        "first_below": apart(item - APART, two + APART),
+        "second_below": apart(item + APART, two - APART),
     }
 
 

@@ -22,15 +22,15 @@ def figures(result: Outcome) -> dict[str, Figure]:
 
 
 def _over_arrival(result: Outcome, name: str) -> Figure:
-    found, critical = result.curves[name], result.critical[name]
-    curves = [Curve("upper bound", VERMILION, found.upper), Curve("lower bound", MUTED, found.lower)]
-    if np.isfinite(found.mean).any():
-        curves.insert(1, Curve("mean", BLUE, found.mean))
+    outcome, critical = result.curves[name], result.critical[name]
+    curves = [Curve("upper bound", VERMILION, outcome.upper), Curve("lower bound", MUTED, outcome.lower)]
+    if np.isfinite(outcome.mean).any():
+        curves.insert(1, Curve("mean", BLUE, outcome.mean))
     marks = {f"{critical.lower:.3f}": critical.lower}
     if critical.upper - critical.lower > 0.01:
         marks[f"{critical.upper:.3f}"] = critical.upper
     label = "mean of tr P" if name != "scalar" else "mean of P"
-    return curves_over(found.arrival, Panel(label, curves), "arrival probability", marks)
+    return curves_over(outcome.arrival, Panel(label, curves), "arrival probability", marks)
 
 
 def _bursts(result: Outcome) -> Figure:

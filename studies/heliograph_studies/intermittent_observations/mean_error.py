@@ -54,29 +54,29 @@ def from_runs(example: Example, fail: float, recover: float, filtered: np.ndarra
     square, lost = np.kron(a, a), fail / (fail + recover)
     n = example.states
 
-    def total(heard: np.ndarray) -> np.ndarray:
-        right = fail * heard + (1 - recover) * lost * q
+    def total(received: np.ndarray) -> np.ndarray:
+        right = fail * received + (1 - recover) * lost * q
         before_loss = np.linalg.solve(np.eye(n * n) - (1 - recover) * square, right.reshape(-1, n * n, 1))
         before_loss = before_loss.reshape(-1, n, n)
         following_loss = a @ before_loss @ a.T + lost * q
-        return np.asarray(np.trace(before_loss + (1 - fail) * heard + recover * following_loss, axis1=1, axis2=2))
+        return np.asarray(np.trace(before_loss + (1 - fail) * received + recover * following_loss, axis1=1, axis2=2))
 
-    found = total(following.mean(axis=1))  # linear in what was heard, so that each run gives one value
-    return Simulated(float(found.mean()), float(found.std(ddof=1) / np.sqrt(len(found))))
+    result = total(following.mean(axis=1))  # linear in what was heard, so that each run gives one value
+    return Simulated(float(result.mean()), float(result.std(ddof=1) / np.sqrt(len(result))))
 
 
 def over_patterns(example: Example, arrival: float, steps: int) -> np.ndarray:
     """tr E P after 0 ... steps steps from P = Q, over all 2^steps patterns of independent losses."""
     a, c, q = example.transition, example.output, example.process * np.eye(example.states)
-    r, p, weight, found = example.noise * np.eye(len(c)), q[None], np.ones(1), [float(np.trace(q))]
+    r, p, weight, results = example.noise * np.eye(len(c)), q[None], np.ones(1), [float(np.trace(q))]
     for _ in range(steps):
         gain = a @ p @ c.T @ np.linalg.inv(c @ p @ c.T + r)
         loop = a - gain @ c
-        heard = loop @ p @ loop.swapaxes(1, 2) + gain @ r @ gain.swapaxes(1, 2) + q
-        p = np.concatenate([a @ p @ a.T + q, heard])
+        received = loop @ p @ loop.swapaxes(1, 2) + gain @ r @ gain.swapaxes(1, 2) + q
+        p = np.concatenate([a @ p @ a.T + q, received])
         weight = np.concatenate([(1 - arrival) * weight, arrival * weight])
-        found.append(float(np.einsum("p,pii->", weight, p)))
-    return np.array(found)
+        results.append(float(np.einsum("p,pii->", weight, p)))
+    return np.array(results)
 
 
 class Iterated(NamedTuple):
@@ -99,7 +99,7 @@ def iterate(example: Example, arrival: float, steps: int) -> Iterated:
     a, c, q = example.transition, example.output, example.process * np.eye(example.states)
     r = example.noise * np.eye(len(c))
     printed = joseph = q
-    found = []
+    results = []
     for _ in range(steps):
         innovation, cross = c @ printed @ c.T + r, a @ printed @ c.T
         printed = a @ printed @ a.T + q - arrival * cross @ np.linalg.inv(innovation) @ cross.T
@@ -108,5 +108,5 @@ def iterate(example: Example, arrival: float, steps: int) -> Iterated:
         squares = loop @ joseph @ loop.T + gain @ r @ gain.T
         joseph = (1 - arrival) * a @ joseph @ a.T + arrival * squares + q
         skew = [float(np.abs(v - v.T).max()) for v in (printed, joseph)]
-        found.append((np.trace(printed), np.trace(joseph), *skew))
-    return Iterated(*np.array(found).T)
+        results.append((np.trace(printed), np.trace(joseph), *skew))
+    return Iterated(*np.array(results).T)

@@ -35,8 +35,8 @@ class Example:
 
     def network(self, link: hg.random_affine.AbstractRandomAffine) -> hg.Network:
         """A receiver that is told what is lost, and skips it."""
-        told = hg.kalman_filter(self.plant(), self.sensor())
-        return hg.Network(self.plant(), {NODE: hg.Node(self.sensor(), link, {FILTER: told})})
+        known = hg.kalman_filter(self.plant(), self.sensor())
+        return hg.Network(self.plant(), {NODE: hg.Node(self.sensor(), link, {FILTER: known})})
 
 
 def example(transition: list[list[float]], output: list[list[float]], process: float) -> Example:

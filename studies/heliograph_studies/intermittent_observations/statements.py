@@ -23,15 +23,15 @@ def statements(result: Outcome) -> dict[str, list[Statement]]:
 
 
 def _critical(result: Outcome) -> list[Statement]:
-    found, v = result.critical["scalar"], result.verdicts
+    outcome, v = result.critical["scalar"], result.verdicts
     eigenvalues = np.abs(np.linalg.eigvals(result.setting.coupled.transition))
     product = 1 - float(np.prod(eigenvalues[eigenvalues > 1])) ** -2
     coupled = result.critical["coupled"]
     return [
         Statement("An unstable plant has a critical arrival probability: E P diverges below, is bounded above",
             f"{SINOPOLI}, Theorem 2", "1 − 1/a² = 0.36 for a = −1.25",
-            f"{found.lower:.6f} to {found.upper:.6f}; just below: {v['below']}, just above: {v['above']}",
-            {"lower": found.lower, "upper": found.upper, "predicted": _predicted(result),
+            f"{outcome.lower:.6f} to {outcome.upper:.6f}; just below: {v['below']}, just above: {v['above']}",
+            {"lower": outcome.lower, "upper": outcome.upper, "predicted": _predicted(result),
              "impossible_below": float(v["below"] == "impossible"),
              "certified_above": float(v["above"] == "certified")},
             _critical_arrival),
@@ -52,13 +52,13 @@ def _critical_arrival(
     return holds(near and impossible_below == certified_above == 1)
 
 
-def _as_predicted(found: float, predicted: float) -> Verdict:
-    return holds(abs(found - predicted) < THRESHOLD)
+def _as_predicted(result: float, predicted: float) -> Verdict:
+    return holds(abs(result - predicted) < THRESHOLD)
 
 
 def _bounds(result: Outcome) -> list[Statement]:
     links = {"scalar": result.scalar, "coupled": result.coupled, "one unstable": result.one_unstable}
-    ours = "; ".join(f"{name}: {_between(each)}" for name, each in links.items())
+    ours = "; ".join(f"{name}: {_between(link)}" for name, link in links.items())
     bursts = "; ".join(f"fail {b.fail:g}, recover {b.recover:g}: {_between(b)}" for b in result.bursts)
     last, scalar = result.bursts[-1], result.scalar
     each_link = {f"{key}_of_{name.replace(' ', '_')}": value
@@ -181,15 +181,15 @@ def _of_their_own(
     return holds(near and certified_above == impossible_below == 1)
 
 
-def _all_as_predicted(predicted: float, **found: float) -> Verdict:
-    return holds(all(abs(value - predicted) < THRESHOLD for value in found.values()))
+def _all_as_predicted(predicted: float, **result: float) -> Verdict:
+    return holds(all(abs(value - predicted) < THRESHOLD for value in result.values()))
 
 
 def _errata(result: Outcome) -> list[Statement]:
     it, constant, scalar = result.iterated, result.constant, result.critical["scalar"]
     right = abs(it.joseph[-1] / result.coupled.bound - 1)
     wrong = abs(it.subtracted[-1] / result.coupled.bound - 1)
-    untold = "; ".join(f"{name}: {each.verdict}, {each.reason}" for name, each in result.untold.items())
+    unpublished = "; ".join(f"{name}: {item.verdict}, {item.reason}" for name, item in result.unpublished.items())
     return [
         Statement("A V A' + Q - arrival K S K' can be iterated as it stands", "the equation as printed everywhere",
             "exact arithmetic", f"coupled example, {len(it.joseph)} steps: tr V = {it.subtracted[-1]:.6g}, since V's "
@@ -200,10 +200,10 @@ def _errata(result: Outcome) -> list[Statement]:
             "taken for granted at times", "same threshold",
             f"it needs {constant.upper:.4f}, the filter that is told {scalar.upper:.4f}",
             {"fixed_gain": constant.upper, "told": scalar.upper},
-            lambda fixed_gain, told: holds(fixed_gain - told < THRESHOLD)),
+            lambda fixed_gain, known: holds(fixed_gain - known < THRESHOLD)),
         Statement("Losses that the receiver is not told have a critical probability too", "taken for granted at times",
-            "a threshold", untold,
-            {"impossible": float(sum(each.verdict == "impossible" for each in result.untold.values()))},
+            "a threshold", unpublished,
+            {"impossible": float(sum(item.verdict == "impossible" for item in result.unpublished.values()))},
             lambda impossible: holds(impossible == 0)),
         Statement("Where E P diverges, so does P", "refuted by Shi, Epstein and Murray (2010)", "diverges",
             f"scalar example at arrival {scalar.lower - 0.06:.2f}: the median of P after z is {result.typical:.3f} "

@@ -85,8 +85,8 @@ def through_moving(packets: Packets, setting: Setting, stages: Stages) -> Throug
     """The point, along paths of several seeds; the last is shown."""
     used = moving.packets_of(packets, setting.duration)
     if len(used) < FEWEST:
-        wanted = f"packets sent from {moving.BEGIN:g} to {moving.BEGIN + setting.duration:g} s after the first"
-        raise fail("trace", wanted, f"{len(used)} of {len(packets)} over {float(np.ptp(packets.sent)):.0f} s")
+        expected = f"packets sent from {moving.BEGIN:g} to {moving.BEGIN + setting.duration:g} s after the first"
+        raise fail("trace", expected, f"{len(used)} of {len(packets)} over {float(np.ptp(packets.sent)):.0f} s")
     _shared = Timeline(moving.network, 0.0)  # while it lives, the others have its compiled programs
     runs, paths = setting.runs, []
     for run in range(runs):

@@ -22,8 +22,8 @@ def transition(x: jax.Array, u: jax.Array) -> jax.Array:
 def spread(u: jax.Array) -> jax.Array:
     """Covariance that the pushes of an interval add."""
     dt = u[0]
-    one = PUSH * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-    return jnp.kron(one, jnp.eye(2))
+    item = PUSH * jnp.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+    return jnp.kron(item, jnp.eye(2))
 
 
 plant = hg.Plant(transition, spread, np.zeros(4), np.eye(4), states=("x", "y", "vx", "vy"), inputs=("dt",))
@@ -50,16 +50,16 @@ def world(packets: Packets, duration: float, seed: int) -> tuple[list[Event], np
     times = np.unique(np.concatenate([packets.sent, moments(duration), [0.0]]))
     state, path = generator.normal(size=(2, 2)), np.zeros((len(times), 2))  # (position and velocity, axis)
     for i, dt in enumerate(np.diff(times, prepend=0.0)):
-        one = PUSH * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        push = np.linalg.cholesky(one + 1e-30 * np.eye(2)) @ generator.normal(size=(2, 2)) if dt else 0.0
+        item = PUSH * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+        push = np.linalg.cholesky(item + 1e-30 * np.eye(2)) @ generator.normal(size=(2, 2)) if dt else 0.0
         state = np.array([[1.0, dt], [0.0, 1.0]]) @ state + push
         path[i] = state[0]
-    own = packets.first_heard()
+    local = packets.first_received()
     noise = dict.fromkeys(zip(packets.node, packets.sequence, packets.sent, strict=True))
     for name in noise:  # a copy holds what the first one does
         noise[name] = np.sqrt(VARIANCE) * generator.normal(size=2)
     events = []
-    for i in range(len(own)):
+    for i in range(len(local)):
         name = packets.node[i], packets.sequence[i], packets.sent[i]
         place = np.searchsorted(times, packets.sent[i])
         number = (int(packets.node[i]) << 16) + int(packets.sequence[i])  # one node hears them all

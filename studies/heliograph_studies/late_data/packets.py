@@ -27,7 +27,7 @@ class Packets:
         """Some of them."""
         return Packets(self.node[which], self.sequence[which], self.sent[which], self.received[which])
 
-    def first_heard(self) -> np.ndarray:
+    def first_received(self) -> np.ndarray:
         """Whether each is the first with its node, sequence and time; numbers come again after a reboot."""
         known = set[tuple[int, int, float]]()
         result = np.zeros(len(self), dtype=bool)
@@ -38,13 +38,13 @@ class Packets:
 
     def boots(self) -> "list[Packets]":
         """Without copies, sorted by the time of sending: one part for each boot of each node."""
-        own, parts = self.among(self.first_heard()), list[Packets]()
-        for node in np.unique(own.node):
-            mine = np.flatnonzero(own.node == node)
-            mine = mine[np.argsort(own.sent[mine], kind="stable")]
-            step = np.diff(own.sequence[mine])
-            again = (step < -FALL) | ((step < 0) & (own.sequence[mine][1:] <= RESTART))
-            parts += [own.among(part) for part in np.split(mine, np.flatnonzero(again) + 1)]
+        local, parts = self.among(self.first_received()), list[Packets]()
+        for node in np.unique(local.node):
+            mine = np.flatnonzero(local.node == node)
+            mine = mine[np.argsort(local.sent[mine], kind="stable")]
+            step = np.diff(local.sequence[mine])
+            again = (step < -FALL) | ((step < 0) & (local.sequence[mine][1:] <= RESTART))
+            parts += [local.among(part) for part in np.split(mine, np.flatnonzero(again) + 1)]
         return parts
 
     def fates(self) -> "list[np.ndarray]":
@@ -89,25 +89,25 @@ def statistics(packets: Packets) -> Statistics:
     fates = [np.isnan(fate) for fate in packets.fates()]
     runs = np.concatenate([_runs(lost) for lost in fates])
     before, after = (np.concatenate([lost[part] for lost in fates]) for part in (slice(None, -1), slice(1, None)))
-    own = packets.among(packets.first_heard())
-    by_node = [own.sent[own.node == node] for node in np.unique(own.node)]
-    delay = own.received - own.sent
+    local = packets.among(packets.first_received())
+    by_node = [local.sent[local.node == node] for node in np.unique(local.node)]
+    delay = local.received - local.sent
     sent = sum(map(len, fates))
     return Statistics(
-        packets=len(own),
+        packets=len(local),
         nodes=len(by_node),
         boots=len(fates),
         lost=sum(int(lost.sum()) for lost in fates) / sent,
         run_mean=float(runs.mean()) if len(runs) else 0.0,
         run_max=int(runs.max(initial=0)),
         lost_after_lost=float(after[before].mean()) if before.any() else 0.0,
-        out_of_order=float(_overtaken(own.sent).mean()),
+        out_of_order=float(_overtaken(local.sent).mean()),
         out_of_order_own=float(np.concatenate([_overtaken(sent) for sent in by_node]).mean()),
-        copies=1 - len(own) / len(packets),
+        copies=1 - len(local) / len(packets),
         delay_median=float(np.median(delay)),
         delay_95=float(np.quantile(delay, 0.95)),
         delay_max=float(delay.max()),
-        interval=float(np.ptp(own.sent) * len(by_node) / sent),
+        interval=float(np.ptp(local.sent) * len(by_node) / sent),
     )
 
 

@@ -62,17 +62,17 @@ def _played(
     lags: Mapping[str, float] | None = None,
 ) -> tuple[dict[str, Estimated], dict[str, int]]:
     """Estimates of now, and of `lags` before, at each moment; and the verdicts on what the first node sent."""
-    timeline, wanted = Timeline(network, window), {} if lags is None else lags
+    timeline, expected = Timeline(network, window), {} if lags is None else lags
     coming = sorted(events, key=arrival_of)  # stable: else as they were heard
     node, at = network.names[0], 0
-    result: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *wanted)}
+    result: dict[str, list[tuple[float, Estimate]]] = {name: [] for name in ("now", *expected)}
     for moment in moments:
         while at < len(coming) and arrival_of(coming[at]) <= moment:
             timeline.push(*coming[at])
             at += 1
         timeline.advance(float(moment))
         result["now"].append((moment, _first(timeline.estimates()[node])))
-        for name, lag in wanted.items():
+        for name, lag in expected.items():
             if moment - lag >= 0:
                 result[name].append((moment - lag, _first(timeline.lagged(lag)[node])))
     return {name: _stacked(part) for name, part in result.items()}, {v: timeline.counts[node][v] for v in VERDICTS}

@@ -39,5 +39,5 @@ def _node(node: int, duration: float, generator: np.random.Generator) -> tuple[n
     for k, chance in enumerate(generator.random(count)):
         lost[k] = chance < (LOST if k == 0 else LOST_AFTER_LOST if lost[k - 1] else begin)
     delay = np.exp(np.interp(generator.random(count), SHARES, np.log(DELAYS)))
-    heard = ~lost
-    return np.full(heard.sum(), node), np.flatnonzero(heard), sent[heard], (sent + delay)[heard]
+    received = ~lost
+    return np.full(received.sum(), node), np.flatnonzero(received), sent[received], (sent + delay)[received]

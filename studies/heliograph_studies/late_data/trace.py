@@ -48,11 +48,11 @@ def read_trace(path: str | Path) -> tuple[Packets, int]:
 def _row(line: str) -> tuple[int, int, int, int] | None:
     """Node, sequence, and slots of sending and hearing; None if it is no packet."""
     match = ROW.fullmatch(line.strip())
-    found = [] if match is None else [int(part) for part in match[1].split(",")]
-    if len(found) != BYTES or max(found) > 255:
+    result = [] if match is None else [int(part) for part in match[1].split(",")]
+    if len(result) != BYTES or max(result) > 255:
         return None
-    received, sent, sequence = (_number(found[a:b]) for a, b in ((1, 6), (6, 11), (11, 13)))
-    node = found[14]
+    received, sent, sequence = (_number(result[a:b]) for a, b in ((1, 6), (6, 11), (11, 13)))
+    node = result[14]
     return (node, sequence, sent, received) if node and sent <= received else None
 
 

@@ -9,8 +9,8 @@ from typing import TypedDict
 import numpy as np
 
 import heliograph as hg
-from heliograph.learning.many import fit_each
-from heliograph_studies.learning.parts import kept
+from heliograph.learning.recordings_apart import fit_each
+from heliograph_studies.learning.parts import stored
 from heliograph_studies.learning.setting import METHODS, ROWS, Row, learned, square_wave, true_values, world
 
 BATCH = 64
@@ -37,15 +37,15 @@ class Coverage:
 def compute(parts: Path, seed: int, batches: int, advance: Callable[[str], None]) -> dict[str, Coverage]:
     """Every row, by its name and form; batches that `parts` holds are read from there."""
     parts.mkdir(parents=True, exist_ok=True)
-    found: dict[str, list[Counts]] = {}
+    results: dict[str, list[Counts]] = {}
     for batch in range(batches):
         for row in ROWS:
             key = f"{row.name}.{row.form}"
             advance(f"{key}: recordings {batch * BATCH + 1} to {(batch + 1) * BATCH}")
-            found.setdefault(key, []).append(
-                kept(parts / f"{key}.{seed}.{batch}.json", partial(counts, row, seed, batch))
+            results.setdefault(key, []).append(
+                stored(parts / f"{key}.{seed}.{batch}.json", partial(counts, row, seed, batch))
             )
-    return {key: pooled(each) for key, each in found.items()}
+    return {key: pooled(item) for key, item in results.items()}
 
 
 def counts(row: Row, seed: int, batch: int) -> Counts:
@@ -53,7 +53,7 @@ def counts(row: Row, seed: int, batch: int) -> Counts:
     u = square_wave(row)
     record = hg.monte_carlo(world(row), row.steps, BATCH, seed, inputs=u, first_run=batch * BATCH)
     fits = fit_each(builder(row), record.measurements["node"], u, row.form)
-    names = [one.name for one in fits.parameters.every]
+    names = [item.name for item in fits.parameters.every]
     truth = np.array([true_values(row)[name] for name in names])
     covered: dict[str, dict[str, int]] = {}
     for method in METHODS:
@@ -73,7 +73,7 @@ def pooled(batches: list[Counts]) -> Coverage:
     """Percentages over all batches."""
     recordings, inside = sum(b["recordings"] for b in batches), sum(b["inside"] for b in batches)
     covered = {
-        method: {name: 100 * sum(b["covered"][method][name] for b in batches) / max(inside, 1) for name in each}
-        for method, each in batches[0]["covered"].items()
+        method: {name: 100 * sum(b["covered"][method][name] for b in batches) / max(inside, 1) for name in batch}
+        for method, batch in batches[0]["covered"].items()
     }
     return Coverage(recordings, 1 - inside / recordings, covered)

@@ -40,14 +40,16 @@ def labelled(key: str) -> str:
 def learning_figures(coverage: Mapping[str, Coverage]) -> dict[str, Figure]:
     """What intervals cover by parameter and method; a line at 95 %."""
     keys = list(coverage)
-    names = [name for name in PARAMETERS if any(name in one.covered["cosines"] for one in coverage.values())]
+    names = [name for name in PARAMETERS if any(name in item.covered["cosines"] for item in coverage.values())]
     figure = Figure(figsize=(WIDTH, 1.0 + 0.4 * len(keys)), layout="constrained")
     grid = figure.subplots(1, len(names), sharey=True, squeeze=False)[0]
     for axes, name in zip(grid, names, strict=True):
         axes.axvline(95, color=INK, linewidth=0.8)
         for method in ("hessian", "cosines"):
             places = [
-                (one.covered[method][name], y) for y, one in enumerate(coverage.values()) if name in one.covered[method]
+                (item.covered[method][name], y)
+                for y, item in enumerate(coverage.values())
+                if name in item.covered[method]
             ]
             shape = "o" if method == "cosines" else "D"
             axes.scatter(*zip(*places, strict=True), s=26, color=COLOURS[method], marker=shape, label=method, zorder=3)
@@ -63,8 +65,8 @@ def learning_page(coverage: Mapping[str, Coverage], drawings: Mapping[str, bytes
     """The report; `drawings` holds the figure as SVG."""
     naive = coverage["rare.linear"].covered["hessian"]["gain_variance"]
     honest = coverage["rare.conditional"].covered["cosines"]["gain_variance"]
-    worst = min(v for one in coverage.values() for v in one.covered["cosines"].values())
-    best = max(v for one in coverage.values() for v in one.covered["cosines"].values())
+    worst = min(v for item in coverage.values() for v in item.covered["cosines"].values())
+    best = max(v for item in coverage.values() for v in item.covered["cosines"].values())
     keys = [
         KeyFigure("rare gains, curvature alone", f"{naive:.0f} %", "of 95 % claimed", VERMILION),
         KeyFigure("rare gains, cosines", f"{honest:.0f} %", "of 95 % claimed", BLUE),
@@ -75,7 +77,7 @@ def learning_page(coverage: Mapping[str, Coverage], drawings: Mapping[str, bytes
         "Percentage of intervals that cover the truth, by parameter: cosines near 95, the curvature often below.",
         "How many of the 95 % intervals cover the truth: from the likelihood's curvature, and by cosines.",
     )
-    counted = sorted({one.recordings for one in coverage.values()})
+    counted = sorted({item.recordings for item in coverage.values()})
     caption = (
         f"Percent of {', '.join(map(str, counted))} recordings a row, less those in which a number ran to a limit "
         "(last column). Two standard errors are about 1.8 at 600 recordings. **Intervals**: from the curvature of the "
@@ -114,9 +116,9 @@ def _cells(coverage: Mapping[str, Coverage]) -> list[list[str]]:
         [
             labelled(key),
             method,
-            *(f"{one.covered[method][name]:.1f}" if name in one.covered[method] else "" for name in PARAMETERS),
-            f"{100 * one.left_out:.1f}",
+            *(f"{item.covered[method][name]:.1f}" if name in item.covered[method] else "" for name in PARAMETERS),
+            f"{100 * item.left_out:.1f}",
         ]
-        for key, one in coverage.items()
+        for key, item in coverage.items()
         for method in METHODS
     ]

@@ -10,12 +10,12 @@ from heliograph.disk.whole_file import whole_file
 T = TypeVar("T")
 
 
-def kept(path: Path, work: Callable[[], T]) -> T:
+def stored(path: Path, work: Callable[[], T]) -> T:
     """What was found before, or is now; JSON holds all of it."""
     if path.exists():
         before: T = json.loads(path.read_text(encoding="utf-8"))
         return before
-    found = work()
+    result = work()
     with whole_file(path) as partial_file:
-        partial_file.write_text(json.dumps(found), encoding="utf-8")
-    return found
+        partial_file.write_text(json.dumps(result), encoding="utf-8")
+    return result

@@ -12,7 +12,7 @@ from heliograph_studies.demo import robot
 from heliograph_studies.demo.compute import networks, one_trial, relay
 from heliograph_studies.demo.learned import direct, fitted, judged, learn, learned_summary, parameters, relayed
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
-from heliograph_studies.learning.parts import kept
+from heliograph_studies.learning.parts import stored
 
 if TYPE_CHECKING:
     from heliograph.report.page import Section
@@ -31,12 +31,12 @@ def plaza(parts: Path, advance: Callable[[str], None]) -> Numbers:
     parts.mkdir(parents=True, exist_ok=True)
     recording = read_recording()
     advance("learning from direct ranges")
-    own = kept(parts / "plaza.direct.json", partial(of_direct, recording))
-    each = []
+    local = stored(parts / "plaza.direct.json", partial(of_direct, recording))
+    items = []
     for seed in range(SEEDS):
         advance(f"learning from relay {seed}")
-        each.append(kept(parts / f"plaza.relayed.{seed}.json", partial(of_relayed, recording, seed)))
-    return {"direct": own, "relayed": {name: [one[name] for one in each] for name in each[0]}}
+        items.append(stored(parts / f"plaza.relayed.{seed}.json", partial(of_relayed, recording, seed)))
+    return {"direct": local, "relayed": {name: [item[name] for item in items] for name in items[0]}}
 
 
 def of_direct(recording: PlazaRecording) -> Numbers:
@@ -57,29 +57,29 @@ def of_direct(recording: PlazaRecording) -> Numbers:
 
 def of_relayed(recording: PlazaRecording, seed: int) -> Numbers:
     """Of the ranges behind the relay drawn with one seed."""
-    drive, heard = robot.DRIVES[recording.name], relay(robot.channel, recording.ranges, seed)
-    found = fitted(partial(relayed, drive), recording, heard, len(heard))
-    after = judged(found.network, recording, heard)
+    drive, received = robot.DRIVES[recording.name], relay(robot.channel, recording.ranges, seed)
+    outcome = fitted(partial(relayed, drive), recording, received, len(received))
+    after = judged(outcome.network, recording, received)
     before = one_trial(recording, networks(drive, 1.0), seed).scores["relay_aware"]
     return {
         "seed": seed,
         "rmse": after.position_rmse_m,
         "calibrated": before.position_rmse_m,
         "nees": after.nees_per_dimension,
-        "parameters": parameters(found),
+        "parameters": parameters(outcome),
     }
 
 
-def plaza_section(found: Numbers) -> "Section":
+def plaza_section(result: Numbers) -> "Section":
     """The numbers as a part of the page."""
     from heliograph.report.page import Section, Table
 
-    own, behind = found["direct"], found["relayed"]
-    assert isinstance(own, dict) and isinstance(behind, dict)
+    local, behind = result["direct"], result["relayed"]
+    assert isinstance(local, dict) and isinstance(behind, dict)
     rows = [
-        ["direct, whole drive", f"{own['rmse']:.3f}", f"{own['calibrated']:.3f}"],
-        ["direct, second half (learned from the first)", f"{own['second_half']:.3f}",
-         f"{own['second_half_calibrated']:.3f}"],
+        ["direct, whole drive", f"{local['rmse']:.3f}", f"{local['calibrated']:.3f}"],
+        ["direct, second half (learned from the first)", f"{local['second_half']:.3f}",
+         f"{local['second_half_calibrated']:.3f}"],
         *([f"relayed, seed {seed}", f"{after:.2f}", f"{before:.2f}"]
           for seed, after, before in zip(behind["seed"], behind["rmse"], behind["calibrated"], strict=True)),
         ["relayed, mean", f"{np.mean(behind['rmse']):.2f}", f"{np.mean(behind['calibrated']):.2f}"],

@@ -52,8 +52,8 @@ def results(outcome: Outcome) -> Results:
     coverage, drive = outcome
 
     def page(drawings: Mapping[str, bytes]) -> "Page":
-        own = learning_page(coverage, drawings)
-        return replace(own, sections=[*own.sections[:-1], plaza_section(drive), own.sections[-1]])
+        local = learning_page(coverage, drawings)
+        return replace(local, sections=[*local.sections[:-1], plaza_section(drive), local.sections[-1]])
 
     return Results(learning_figures(coverage), page, {**summary(coverage), "plaza": drive})
 
@@ -62,8 +62,8 @@ def summary(coverage: dict[str, Coverage]) -> dict[str, Json]:
     """coverage.ROW.FORM.METHOD.PARAMETER in percent; recordings and the share left out by row and form."""
     table: dict[str, dict[str, Json]] = {}
     counted: dict[str, dict[str, Json]] = {}
-    for key, one in coverage.items():
+    for key, item in coverage.items():
         row, form = key.split(".")
-        table.setdefault(row, {})[form] = one.covered
-        counted.setdefault(row, {})[form] = {"recordings": one.recordings, "left_out": one.left_out}
+        table.setdefault(row, {})[form] = item.covered
+        counted.setdefault(row, {})[form] = {"recordings": item.recordings, "left_out": item.left_out}
     return {"nominal": 95.0, "batch": BATCH, "coverage": table, "recordings": counted}

@@ -6,7 +6,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.learning.intervals import Method
-from heliograph.learning.objective import Form
+from heliograph.learning.likelihood.objective import Form
 
 MEAN, VARIANCE = 0.8, 0.16
 PLANT_NOISE, SENSOR_NOISE, HOP_NOISE, DIRECT_NOISE = 0.2, 0.3, 0.3, 0.2
@@ -56,7 +56,7 @@ def square_wave(row: Row) -> np.ndarray:
 def world(row: Row) -> hg.Network:
     """The network that is recorded."""
     if row.law == "untold":
-        return untold(PLANT_NOISE, HOP_NOISE, UNTOLD)
+        return unpublished(PLANT_NOISE, HOP_NOISE, UNTOLD)
     return relayed(LAWS[row.law], PLANT_NOISE, SENSOR_NOISE, HOP_NOISE)
 
 
@@ -64,7 +64,7 @@ def learned(row: Row) -> hg.Network:
     """What is learned of it."""
     plant_noise, hop_noise = hg.free(PLANT_NOISE, "plant_noise"), hg.free(HOP_NOISE, "hop_noise")
     if row.law == "untold":
-        return untold(plant_noise, hop_noise, hg.free(UNTOLD, "arrival"))
+        return unpublished(plant_noise, hop_noise, hg.free(UNTOLD, "arrival"))
     mean, variance = hg.free(MEAN, "mean_gain"), hg.free(true_values(row)["gain_variance"], "gain_variance", "positive")
     law = hg.random_affine.GivenMoments([mean, mean**2 + variance])
     return relayed(law, plant_noise, hg.free(SENSOR_NOISE, "sensor_noise"), hop_noise)
@@ -86,7 +86,7 @@ def relayed(law: hg.random_affine.AbstractLaw, plant_noise: float, sensor_noise:
     return _network(plant_noise, sensor_noise, hg.with_direct_link(hop, hg.hop(1.0, DIRECT_NOISE)))
 
 
-def untold(plant_noise: float, hop_noise: float, arrival: float) -> hg.Network:
+def unpublished(plant_noise: float, hop_noise: float, arrival: float) -> hg.Network:
     """Lost without a word, and then noise is added."""
     lossy = hg.dropout(hg.perfect(), arrival)
     return _network(plant_noise, 0.0, hg.amplify_and_forward([lossy, hg.hop(1.0, hop_noise)]))

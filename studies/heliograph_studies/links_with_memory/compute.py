@@ -49,8 +49,8 @@ class Outcome:
     steps: dict[str, dict[str, int]]
     e1: dict[str, Score]
     e2: dict[str, Score]
-    told: dict[str, Score]
-    one_shadow: dict[str, float]
+    known: dict[str, Score]
+    one_fading: dict[str, float]
     curve: dict[str, list[float]]
     memory_test: dict[str, float | np.ndarray]
 
@@ -131,7 +131,7 @@ def simulated(
 def with_side_information(setting: Setting, progress: Progress) -> dict[str, Score]:
     """Fading in bursts: losses that depend on the mode and are told, and classes of the signal's strength."""
     channel, losing = bursts(setting), models.lossy(setting)
-    by_class = hg.filters.told_filter(PLANT, SENSOR, channel, models.CLASSES)
+    by_class = hg.filters.side_information_filter(PLANT, SENSOR, channel, models.CLASSES)
     places: Places = {
         "losses": (losing, {"losses": hg.linear_filter(PLANT, SENSOR, losing)}),
         "classes": (hg.model.with_flag(channel, models.CLASSES), {"classes": by_class}),

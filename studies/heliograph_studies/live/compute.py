@@ -11,15 +11,15 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from heliograph.serving.fleet import Fleet, Options
-from heliograph.serving.kept import plant_from
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.plant import Link
-from heliograph.serving.store import Store
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.plant_codec import plant_from
+from heliograph.serving.storage.store import Store
 from heliograph_studies.live.killed import ALONE, KILLED, WINDOW, killed, left_alone
 from heliograph_studies.live.mower import PLANT, network, read_drive
 from heliograph_studies.live.server import Server
-from heliograph_studies.live.speed import in_memory, many, through
+from heliograph_studies.live.speed import in_memory, many_plants, through
 
 KILLS = 3
 MESSAGES = 20_000  # for the speed
@@ -31,7 +31,7 @@ class Outcome:
     """What was found. `used`: messages that were, by node, of the service left alone and of the one killed."""
 
     messages: int
-    unheard: int
+    unreceived: int
     kills: int
     again: int
     alone: list[bytes]
@@ -76,24 +76,24 @@ def compute(seed: int, advance: Callable[[str], None] = lambda what: None) -> Ou
         server = Server(folder)
         server.start()
         try:
-            found = asyncio.run(killed(folder, server, drive.lines, len(alone), KILLS, seed, advance))
+            record = asyncio.run(killed(folder, server, drive.lines, len(alone), KILLS, seed, advance))
             advance("how fast")
             lanes, options = _lanes(), Options(WINDOW)
-            lines = many(drive.lines, MESSAGES)
+            lines = many_plants(drive.lines, MESSAGES)
             in_memory(lanes, options, lines[:2000])  # compiles
             speed = {"jsonlines": in_memory(lanes, options, lines)}
             for kind in ("mqtt", "nats"):
                 speed[kind] = asyncio.run(through(kind, folder, server, lanes, options, lines))
         finally:
             server.kill()
-        one, two = (_links(lanes, options, folder / name) for name in (ALONE, KILLED))
-    told = [json.loads(line) for line in found.finals]
-    time = np.array([each["time"] for each in told])
-    mean = np.array([each["estimates"]["robot"]["filter"]["mean"] for each in told])
-    used = {node: (link.used, two[node].used) for node, link in one.items()}
-    late = sum(link.late for link in one.values())
-    return Outcome(len(drive.lines), drive.unheard, found.kills, found.again, alone, found.finals, used, late,
-                   time, mean, drive.truth(time), drive.recording.beacons, speed, found.pictures)  # fmt: skip
+        item, two = (_links(lanes, options, folder / name) for name in (ALONE, KILLED))
+    outputs = [json.loads(line) for line in record.finals]
+    time = np.array([item["time"] for item in outputs])
+    mean = np.array([item["estimates"]["robot"]["filter"]["mean"] for item in outputs])
+    used = {node: (link.used, two[node].used) for node, link in item.items()}
+    late = sum(link.late for link in item.values())
+    return Outcome(len(drive.lines), drive.unreceived, record.kills, record.again, alone, record.finals, used, late,
+                   time, mean, drive.truth(time), drive.recording.beacons, speed, record.pictures)  # fmt: skip
 
 
 def _lanes() -> Lanes:

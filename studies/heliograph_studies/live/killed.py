@@ -53,11 +53,11 @@ def left_alone(folder: Path, lines: Sequence[bytes]) -> list[bytes]:
 
 def finals(bodies: Iterable[bytes]) -> list[bytes]:
     """Final estimates without the number that tells copies apart; what was told again counts once."""
-    found: dict[int, bytes] = {}
+    results: dict[int, bytes] = {}
     for body in bodies:
         if b'"kind":"final"' in body:
-            found.setdefault(json.loads(body)["id"], re.sub(rb'^\{"id":\d+,', b"{", body))
-    return list(found.values())
+            results.setdefault(json.loads(body)["id"], re.sub(rb'^\{"id":\d+,', b"{", body))
+    return list(results.values())
 
 
 async def killed(
@@ -83,19 +83,19 @@ async def killed(
             part = slice(len(lines) * kill // (kills + 1), len(lines) * (kill + 1) // (kills + 1))
             async with asyncio.TaskGroup() as group:  # if sending fails nothing more is waited for
                 group.create_task(_send(client, lines[part]))
-                await run.until(partial(_told, client, count * (2 * kill + 1) // (2 * kills + 2)))
+                await run.until(partial(_finals_read, client, count * (2 * kill + 1) // (2 * kills + 2)))
                 await asyncio.sleep(generator.uniform(0, SOON))
                 run.kill()
             run.start()
         advance("what is left")
         await _send(client, lines[len(lines) * kills // (kills + 1) :])
-        await run.until(partial(_told, client, count))
+        await run.until(partial(_finals_read, client, count))
         await run.until(partial(_idle, client))
         pictures = await asyncio.to_thread(look, f"http://127.0.0.1:{port}/")
         run.stop()
         bodies = await _everything(client)
-        found = finals(bodies)
-        return Killed(found, kills, len(bodies) - len(found), pictures)
+        result = finals(bodies)
+        return Killed(result, kills, len(bodies) - len(result), pictures)
     finally:
         run.kill()
         await client.close()
@@ -151,7 +151,7 @@ async def _reads(client: Client) -> bool:
         return False
 
 
-async def _told(client: Client, count: int) -> bool:
+async def _finals_read(client: Client, count: int) -> bool:
     """Whether so many final estimates were told."""
     try:
         info = await client.jetstream(timeout=60).stream_info(f"{TOPIC}-out", subjects_filter=f"{TOPIC}.out.final.*")
@@ -170,9 +170,9 @@ async def _everything(client: Client) -> list[bytes]:
     """All final estimates that the server keeps."""
     stream = client.jetstream(timeout=60)
     reader = await stream.subscribe(f"{TOPIC}.out.final.*", stream=f"{TOPIC}-out", ordered_consumer=True)
-    found = []
+    results = []
     while True:
         try:
-            found.append((await reader.next_msg(1)).data)
+            results.append((await reader.next_msg(1)).data)
         except nats.errors.TimeoutError:
-            return found
+            return results

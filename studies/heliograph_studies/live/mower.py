@@ -23,7 +23,7 @@ class Drive:
 
     recording: PlazaRecording
     lines: list[bytes]
-    unheard: int
+    unreceived: int
 
     def truth(self, time: np.ndarray) -> np.ndarray:
         """Where the mower was, (time, 2) in metres."""
@@ -41,13 +41,13 @@ def network() -> hg.Network:
 def read_drive(seed: int) -> Drive:
     """The recorded odometry at once, and each range with the delay or the loss of a packet of a radio network."""
     recording = read_recording()
-    heard, unheard = plaza.ranges(recording, synthetic_packets(RADIO, seed))
-    coming = sorted([*plaza.odometry(recording), *heard], key=arrival_of)  # stable: else as they were heard
-    return Drive(recording, [line(event) for event in coming], unheard)
+    received, unreceived = plaza.ranges(recording, synthetic_packets(RADIO, seed))
+    coming = sorted([*plaza.odometry(recording), *received], key=arrival_of)  # stable: else as they were heard
+    return Drive(recording, [line(event) for event in coming], unreceived)
 
 
 def line(event: Event, plant: str = PLANT) -> bytes:
     """An event as a message."""
     values = [None if np.isnan(value) else float(value) for value in np.atleast_1d(np.asarray(event.values))]
-    found = {"plant": plant, "node": event.node, "sequence": event.sequence, "time": event.time, "values": values}
-    return json.dumps(found | {"arrival": arrival_of(event)}).encode()
+    results = {"plant": plant, "node": event.node, "sequence": event.sequence, "time": event.time, "values": values}
+    return json.dumps(results | {"arrival": arrival_of(event)}).encode()

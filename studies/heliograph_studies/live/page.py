@@ -15,8 +15,8 @@ COMMAND = """heliograph serve heliograph_studies.live.mower:network --window 10 
 
 def live_figures(outcome: Outcome) -> dict[str, Figure]:
     """The path that was told, on its map."""
-    told = Curve(f"final estimates: {outcome.rmse:.2f} m off", BLUE, outcome.mean[:, :2])
-    return {"map": paths(outcome.truth, [told], outcome.beacons)}
+    known = Curve(f"final estimates: {outcome.rmse:.2f} m off", BLUE, outcome.mean[:, :2])
+    return {"map": paths(outcome.truth, [known], outcome.beacons)}
 
 
 def live_page(outcome: Outcome, drawings: Mapping[str, bytes]) -> Page:
@@ -45,7 +45,7 @@ def _service(outcome: Outcome, drawings: Mapping[str, bytes]) -> Section:
         KeyFigure("position", f"{outcome.rmse:.2f} m", "root mean square error of final estimates", BLUE),
     ]
     points = [
-        f"The ranges travel as packets of a radio network: {outcome.unheard} never arrive, others late; those within "
+        f"The ranges travel as packets of a radio network: {outcome.unreceived} never arrive, others late; those within "
         f"{WINDOW:g} s are put where they belong, {outcome.late} were later than that.",
         "State, sequence numbers, the late-data window and what is to be told are committed together; the broker is "
         "told after the commit, so that it sends again what a killed service had not kept.",

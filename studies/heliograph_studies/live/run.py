@@ -50,7 +50,7 @@ def summary(outcome: "Outcome") -> dict[str, Json]:
     """Numbers of messages, whether killing changed anything, and how fast messages are used."""
     return {
         "messages": outcome.messages,
-        "ranges_lost_on_the_way": outcome.unheard,
+        "ranges_lost_on_the_way": outcome.unreceived,
         "too_late": outcome.late,
         "kills": outcome.kills,
         "final_estimates": len(outcome.killed),

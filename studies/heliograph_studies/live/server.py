@@ -16,19 +16,19 @@ def find_server() -> str:
     Raises:
         ModuleNotFoundError: it is not installed.
     """
-    found = which("nats-server", path=sysconfig.get_path("scripts")) or which("nats-server")
-    if found is None:
+    result = which("nats-server", path=sysconfig.get_path("scripts")) or which("nats-server")
+    if result is None:
         raise ModuleNotFoundError(
             f"nats-server: expected to be installed, got no such command: {how_to_install('live')}", name="nats-server"
         )
-    return found
+    return result
 
 
 def free_port() -> int:
     """A port of this machine that nobody uses."""
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])
+    with socket.socket() as item:
+        item.bind(("127.0.0.1", 0))
+        return int(item.getsockname()[1])
 
 
 class Server:

@@ -10,26 +10,26 @@ import nats
 from paho.mqtt.client import Client
 from paho.mqtt.enums import CallbackAPIVersion
 
-from heliograph.serving.broker import connected
+from heliograph.serving.brokers.broker import connected
+from heliograph.serving.brokers.url import Address, address
 from heliograph.serving.fleet import Fleet, Options
 from heliograph.serving.lanes import Lanes
 from heliograph.serving.loop import serve_until
-from heliograph.serving.nowhere import Nowhere
 from heliograph.serving.output import Output
 from heliograph.serving.service import Service
-from heliograph.serving.store import Store
-from heliograph.serving.url import Address, address
-from heliograph.serving.whose import identity
+from heliograph.serving.storage.identity import identity
+from heliograph.serving.storage.in_memory_store import InMemoryStore
+from heliograph.serving.storage.store import Store
 from heliograph_studies.live.server import Server
 
 PLANTS = 100  # mowers on the same drive, each a little after the one before
 BATCH = 1000  # lines that are taken together from memory
 
 
-def many(lines: Sequence[bytes], count: int) -> list[bytes]:
+def many_plants(lines: Sequence[bytes], count: int) -> list[bytes]:
     """The first messages of one mower as those of many, `count` in all."""
-    found = [json.loads(line) for line in lines[: count // PLANTS]]
-    return [json.dumps(one | {"plant": f"mower {i}"}).encode() for one in found for i in range(PLANTS)]
+    results = [json.loads(line) for line in lines[: count // PLANTS]]
+    return [json.dumps(item | {"plant": f"mower {i}"}).encode() for item in results for i in range(PLANTS)]
 
 
 class Counted:
@@ -65,7 +65,7 @@ class Counted:
 
 def in_memory(lanes: Lanes, options: Options, lines: Sequence[bytes]) -> float:
     """Steps a second of a service that keeps nothing."""
-    service = Service(Fleet(lanes, options), Nowhere())
+    service = Service(Fleet(lanes, options), InMemoryStore())
     begun = perf_counter()
     for i in range(0, len(lines), BATCH):
         service.take(lines[i : i + BATCH])
@@ -112,7 +112,7 @@ def _published(where: Address, lines: Sequence[bytes]) -> None:
     client.max_inflight_messages_set(BATCH)
     client.connect(where.host, where.port)
     client.loop_start()
-    for one in [client.publish(f"{where.topic}/in/mower", line, 1) for line in lines]:
-        one.wait_for_publish(60)
+    for item in [client.publish(f"{where.topic}/in/mower", line, 1) for line in lines]:
+        item.wait_for_publish(60)
     client.disconnect()
     client.loop_stop()

@@ -86,8 +86,8 @@ def cases(trust: float, seeds: range) -> list[Case]:
     """One departure at a time, then all that can occur together, then a cure for the greatest."""
     free, loaded, dead = simulate_drive(loaded=False), simulate_drive(), simulate_drive(dead_time=DEAD_TIME)
     right, wrong = plant(Machine(), trust=trust), plant(Machine(WRONG_RESISTANCE), trust=trust)
-    own = [np.asarray(_draw_truth(right, loaded.voltages, seed)) for seed in seeds]
-    found = [Case("own_model", loaded.voltages, own, right)]
+    local = [np.asarray(_draw_truth(right, loaded.voltages, seed)) for seed in seeds]
+    results = [Case("own_model", loaded.voltages, local, right)]
     for name, drive, model in (
         ("no_load", free, right),
         ("load", loaded, right),
@@ -98,8 +98,8 @@ def cases(trust: float, seeds: range) -> list[Case]:
         ("load_as_state", loaded, plant(Machine(), load_is_state=True, trust=trust)),
     ):
         truth = drive.truth[:, : len(model.states)]
-        found.append(Case(name, drive.voltages, [truth] * len(seeds), model))
-    return found
+        results.append(Case(name, drive.voltages, [truth] * len(seeds), model))
+    return results
 
 
 @compiled

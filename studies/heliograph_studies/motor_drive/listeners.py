@@ -66,9 +66,9 @@ def _send(
 ) -> jax.Array:
     key = jax.random.key(seed)
 
-    def one(k: jax.Array, x: jax.Array) -> jax.Array:
+    def single(k: jax.Array, x: jax.Array) -> jax.Array:
         y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, place, SENSOR))
         z: jax.Array = apply(channel.sample(draw_key(key, k, place, CHANNEL)), y)
         return z
 
-    return jax.vmap(one)(jnp.arange(len(truth)), jnp.asarray(truth))
+    return jax.vmap(single)(jnp.arange(len(truth)), jnp.asarray(truth))

@@ -9,7 +9,7 @@ import numpy as np
 
 import heliograph as hg
 from heliograph.filters import AbstractFilter, PolynomialFilter, ScheduledFilter
-from heliograph.filters.polynomial import MemoryFilter
+from heliograph.filters.linear.polynomial import MemoryFilter
 from heliograph.linear import lifted_system
 from heliograph.linear.comparison import skewness
 from heliograph.linear.memory import memory_system

@@ -41,4 +41,4 @@ def believed(square: LinearSystem, linear: LinearSystem) -> LinearSystem:
     offset = square.steps.offset + np.einsum("tij,tj->ti", gap, before.mean[1:])
     noise = square.steps.noise + gap @ before.covariance[1:] @ np.swapaxes(gap, 1, 2)
     steps = square.steps._replace(output=output, offset=offset, noise=noise)
-    return LinearSystem(steps, square.mean, square.covariance, square.want, square.rounding)
+    return LinearSystem(steps, square.mean, square.covariance, square.projection, square.rounding)

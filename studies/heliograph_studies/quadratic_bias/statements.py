@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from heliograph.random_affine.moment_noise import NoiseMoments
+from heliograph.random_affine.moments.moment_noise import NoiseMoments
 from heliograph_studies.quadratic_bias.bounds import Bound
 from heliograph_studies.quadratic_bias.compute import CLAIMED, TRUE, Outcome
 from heliograph_studies.quadratic_bias.setting import TABLE_1, Noises

@@ -51,7 +51,7 @@ def compute(setting: Setting, stages: Stages) -> Outcome:
 
 def moving_point() -> tuple[np.ndarray, np.ndarray, dict[int, np.ndarray]]:
     """Covariances of the filter, of the smoother given all data, and of those of fixed lags; no data change them."""
-    _, steps = hg.smoothing.retained_steps(hg.linear_filter(*models.moving_point()), np.zeros((models.STEPS, 2)))
+    _, steps = hg.smoothing.smoother_steps(hg.linear_filter(*models.moving_point()), np.zeros((models.STEPS, 2)))
     lagged = {lag: np.asarray(hg.smoothing.FixedLag(lag).estimates(steps).covariance) for lag in LAGS}
     return np.asarray(steps.covariance), np.asarray(INTERVAL.estimates(steps).covariance), lagged
 
@@ -72,7 +72,7 @@ def relay_traces() -> dict[int, dict[str, float]]:
     network = models.relays_in_turn()
     gains = hg.relays.own_error_design(network, models.STEADY).gains
     receiver = hg.filters.LinearSystemFilter(hg.relays.receiver_system(network, gains))
-    _, steps = hg.smoothing.retained_steps(receiver, np.zeros((models.STEADY, 1)))
+    _, steps = hg.smoothing.smoother_steps(receiver, np.zeros((models.STEADY, 1)))
     even = (models.STEADY - max(RELAY_LAGS) - 2) // 2 * 2
     result = {}
     for lag in RELAY_LAGS:

@@ -19,7 +19,7 @@ class Assumption(NamedTuple):
     """What a bound asks for, the number found, and whether it is met."""
 
     text: str
-    found: str
+    result: str
     met: bool
 
 
@@ -43,7 +43,7 @@ class Bound(NamedTuple):
     @property
     def failing(self) -> tuple[str, ...]:
         """The assumptions that are not met, each with what was found."""
-        return tuple(f"{a.text}: {a.found}" for a in self.assumptions if not a.met)
+        return tuple(f"{a.text}: {a.result}" for a in self.assumptions if not a.met)
 
 
 class RelayCertificate(NamedTuple):
@@ -67,41 +67,41 @@ def certify_relays(network: RelayNetwork, gains: GainsByFilter) -> RelayCertific
         ValueError: a filter without gains.
     Source: filter-and-forward successive relays (IEEE/CAA JAS 11(5), 2024), Theorems 3 and 4, Lemmas 8 and 9.
     """
-    found = recompute(network, gains)
-    horizon = len(found.state) - 1
+    result = recompute(network, gains)
+    horizon = len(result.state) - 1
     steps = network.steps(horizon)
     c = _constants(network, steps)
-    relays = np.array([np.linalg.eigvalsh(found.covariance[name]) for name in network.relays])
-    receiver = np.linalg.eigvalsh(found.covariance[RECEIVER])
-    greedy = _greedy(found)
+    relays = np.array([np.linalg.eigvalsh(result.covariance[name]) for name in network.relays])
+    receiver = np.linalg.eigvalsh(result.covariance[RECEIVER])
+    greedy = _greedy(result)
     upper = _recursion(c["p0_upper"], np.full(horizon, c["tau_upper"]), c["w_upper"])
     bounds = [
-        _state_bound(steps, found, greedy),
+        _state_bound(steps, result, greedy),
         _above("Theorem 3, upper", "(33)", (greedy,), upper, relays),
         _relay_lower(c, upper, relays, greedy),
         _above("Theorem 4, upper", "(54)", (greedy,), upper, receiver),
         _receiver_lower(c, upper, receiver, greedy),
         *_uniform(c, relays, receiver, greedy, horizon),
     ]
-    return RelayCertificate({bound.name: bound for bound in bounds}, c, found)
+    return RelayCertificate({bound.name: bound for bound in bounds}, c, result)
 
 
-def _greedy(found: Recomputed) -> Assumption:
-    largest = max(float(np.max(value)) for value in found.correlation.values())
+def _greedy(result: Recomputed) -> Assumption:
+    largest = max(float(np.max(value)) for value in result.correlation.values())
     text = "every gain minimises its filter's own next error (error and innovation uncorrelated)"
     return Assumption(text, f"correlation {largest:.2g}", largest <= GREEDY)
 
 
-def _state_bound(steps: Steps, found: Recomputed, greedy: Assumption) -> Bound:
+def _state_bound(steps: Steps, result: Recomputed, greedy: Assumption) -> Bound:
     """E e_f e_f' <= cov x_k; the values are the largest eigenvalues of cov x_k."""
     radius = max(float(np.max(np.abs(np.linalg.eigvals(a)))) for a in steps.transition)
     still = bool(np.all(steps.transition == steps.transition[0]))
     stable = Assumption("a constant plant with spectral radius below 1", f"{radius:.6g}", still and radius < 1)
-    size = np.trace(found.state, axis1=1, axis2=2)
+    size = np.trace(result.state, axis1=1, axis2=2)
     gap = min(
-        float(np.min(np.linalg.eigvalsh(found.state - error)[:, 0] / size)) for error in found.covariance.values()
+        float(np.min(np.linalg.eigvalsh(result.state - error)[:, 0] / size)) for error in result.covariance.values()
     )
-    values = np.linalg.eigvalsh(found.state)[:, -1]
+    values = np.linalg.eigvalsh(result.state)[:, -1]
     return Bound("state covariance", "E e e' <= cov x", (greedy, stable), values, gap >= -ROUNDING)
 
 
@@ -167,9 +167,9 @@ def _structure(c: dict[str, float]) -> Assumption:
 
 def _positive(c: dict[str, float]) -> tuple[Assumption, ...]:
     """Assumption 1's lower bounds that a circuit can miss."""
-    wanted = {"w_lower": "process noise in every direction", "tau_lower": "an invertible plant matrix",
+    expected = {"w_lower": "process noise in every direction", "tau_lower": "an invertible plant matrix",
               "p0_lower": "an initial covariance in every direction"}  # fmt: skip
-    return tuple(Assumption(text, f"smallest eigenvalue {c[name]:.3g}", c[name] > 0) for name, text in wanted.items())
+    return tuple(Assumption(text, f"smallest eigenvalue {c[name]:.3g}", c[name] > 0) for name, text in expected.items())
 
 
 def _recursion(start: float, factors: Float[np.ndarray, "steps"], constant: float) -> Float[np.ndarray, "steps+1"]:
@@ -221,8 +221,8 @@ def _relay_lower(c: dict[str, float], upper: np.ndarray, relays: np.ndarray, gre
     if not structure.met:
         return Bound("Theorem 3, lower", "(34)", (structure, greedy), None, None)
     above, below, printed, left = _lower_condition(c, upper[:-1])
-    found = f"{above[0]:.4g} at k = 1 (printed form {printed[0]:.4g}), least {above.min():.4g}"
-    condition = Assumption("n - c mbar / s > 0 at every k", found, bool(np.all(above > 0)))
+    result = f"{above[0]:.4g} at k = 1 (printed form {printed[0]:.4g}), least {above.min():.4g}"
+    condition = Assumption("n - c mbar / s > 0 at every k", result, bool(np.all(above > 0)))
     assumptions = structure, greedy, *_positive(c), condition
     if not condition.met:
         return Bound("Theorem 3, lower", "(34)", assumptions, None, None)

@@ -60,8 +60,8 @@ def _alternating(
 ) -> hg.model.RelayNetwork:
     """Two relays in turn over one law of gains, with these noises at relay and remote filter."""
     slots = [
-        {own: {"sensor": hg.hop(law, relay), other: hg.hop(law, 0.0)}, "receiver": {other: hg.hop(law, remote)}}
-        for own, other in (("relay_2", "relay_1"), ("relay_1", "relay_2"))
+        {item: {"sensor": hg.hop(law, relay), other: hg.hop(law, 0.0)}, "receiver": {other: hg.hop(law, remote)}}
+        for item, other in (("relay_2", "relay_1"), ("relay_1", "relay_2"))
     ]
     return hg.model.RelayNetwork(plant, sensor, ("relay_1", "relay_2"), slots)
 
@@ -112,16 +112,16 @@ def misprints(result: Outcome) -> list[Statement]:
     ]  # fmt: skip
 
 
-def _judged(found: Misprinted) -> tuple[Evidence, Callable[..., Verdict]]:
+def _judged(result: Misprinted) -> tuple[Evidence, Callable[..., Verdict]]:
     """Steady trace claimed and true trace, relative to the right recursion: 1 if the misprint does nothing."""
     return (
-        {"claimed": float(found.claimed[-1]), "true": float(found.true[-1])},
+        {"claimed": float(result.claimed[-1]), "true": float(result.true[-1])},
         lambda claimed, true: holds(max(abs(claimed - 1), abs(true - 1)) <= ROUNDING),
     )
 
 
-def _effect(found: Misprinted, k: int) -> str:
-    return f"claimed tr P is {found.claimed[k]:.2f} of the truth, and the truth {_percent(found.true[k])}"
+def _effect(result: Misprinted, k: int) -> str:
+    return f"claimed tr P is {result.claimed[k]:.2f} of the truth, and the truth {_percent(result.true[k])}"
 
 
 def _percent(ratio: float) -> str:

@@ -46,12 +46,12 @@ def _totals(result: Outcome) -> dict[str, float]:
 
 def _designs(result: Outcome) -> list[Statement]:
     paper, total = result.designs.paper, _totals(result)
-    trace, found = paper.trace("receiver"), result.certificates["paper"].recomputed
-    bias = max(float(np.max(np.linalg.norm(found.mean[f], axis=1) / np.sqrt(paper.trace(f)))) for f in FILTERS)
-    correlation = max(float(np.max(c)) for c in found.correlation.values())
-    gaps = [np.abs(found.covariance[f] - paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
+    trace, outcome = paper.trace("receiver"), result.certificates["paper"].recomputed
+    bias = max(float(np.max(np.linalg.norm(outcome.mean[f], axis=1) / np.sqrt(paper.trace(f)))) for f in FILTERS)
+    correlation = max(float(np.max(c)) for c in outcome.correlation.values())
+    gaps = [np.abs(outcome.covariance[f] - paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
     sizes = [np.abs(paper.covariance[f]).max(axis=(1, 2)) for f in FILTERS]
-    own = float(np.max(np.array(gaps) / np.array(sizes)))
+    local = float(np.max(np.array(gaps) / np.array(sizes)))
     ratio, quiet = result.tuned_mean_ratio, result.designs.mean_ratio(result.designs.bounded)
     limit = z_limit(len(trace))
     z, where = worst_z(result)
@@ -62,8 +62,8 @@ def _designs(result: Outcome) -> list[Statement]:
         Statement("the lemmas, with the corrections below, give the exact error covariances", "Lemmas 1 to 7",
             "recursions for each covariance",
             f"traces within {np.max(np.abs(right.claimed - 1)):.1g} of the second moments of the whole network over "
-            f"{len(right.claimed) - 1} steps; a recursion in absolute coordinates within {own:.1g}",
-            {"gap_of_traces": float(np.max(np.abs(right.claimed - 1))), "gap_of_recursions": own},
+            f"{len(right.claimed) - 1} steps; a recursion in absolute coordinates within {local:.1g}",
+            {"gap_of_traces": float(np.max(np.abs(right.claimed - 1))), "gap_of_recursions": local},
             lambda gap_of_traces, gap_of_recursions: holds(gap_of_traces < 1e-8 and gap_of_recursions < 1e-10)),
         Statement("the gains minimise the next trace of each error covariance", "Theorems 1 and 2, (12)", "optimal",
             f"error and innovation are uncorrelated to {correlation:.1g} at each of the {mean - 1} steps",
@@ -101,9 +101,9 @@ def _estimates(result: Outcome) -> list[Statement]:
             f"{_relative(result, 100):.3f} at 100; tr P / tr(nothing heard) {trace[2] / state[2]:.2f} at k = 2, "
             f"{trace[10] / state[10]:.3f} at 10, {total['paper'] / 2 / result.limits['nothing_heard']:.3f} steady",
             {**track, "steady_over_nothing_heard": total["paper"] / 2 / result.limits["nothing_heard"]},
-            lambda relative_error_at_10, relative_error_at_50, relative_error_at_100, steady_over_nothing_heard: holds(
+            lambda relative_error_at_10, relative_error_at_50, relative_error_at_100, steady_over_nothing_received: holds(
                 max(relative_error_at_10, relative_error_at_50, relative_error_at_100) < 1 / 2
-                and steady_over_nothing_heard < HALF)),
+                and steady_over_nothing_received < HALF)),
         Statement("the state is estimated accurately", "Section IV, Fig. 5", "a desired performance",
             f"steady tr P is {total['paper'] / 2:.4g}, {total['paper'] / total['no_relay']:.2f} times what one hop "
             f"without relays gives as late ({total['no_relay'] / 2:.4g}; {result.limits['no_relay_filtered']:.4g} "
@@ -169,7 +169,7 @@ def _bounds(result: Outcome) -> list[Statement]:
             lambda assumptions_missed: holds(assumptions_missed == 0)),
         Statement("errors are bounded for all time", "abstract", "from Lemmas 8 and 9",
             "true for another reason: Ξᵢ, Pₖ ≤ cov xₖ for gains that are optimal for one step, and the spectral "
-            f"radius of Γ is {state.assumptions[1].found}; largest eigenvalue of cov xₖ {np.max(state.values):.3g}",
+            f"radius of Γ is {state.assumptions[1].result}; largest eigenvalue of cov xₖ {np.max(state.values):.3g}",
             {"assumptions_missed": len(state.failing), "least_slack": least["paper"]},
             lambda assumptions_missed, least_slack: holds(assumptions_missed == 0 and least_slack >= -ROUNDING)),
         Statement("Pₖ ≤ cov xₖ also for jointly tuned gains", "not in the paper", "not said",
@@ -191,15 +191,15 @@ def _scalar_bounds(result: Outcome) -> list[Statement]:
             f"10 at k = 0: fails there; max(p₀, w / (1 - τ)) = {tops:.4g} is obeyed",
             {"bound": printed["upper"], "error": 10.0}, lambda bound, error: holds(bound >= error)),
         Statement("p = α p₀ + w / (1 - α) ≤ Pₖ", "Lemma 9, lower, and (51)", f"{printed['receiver']:.4g}",
-            f"P₆₀ = {remote:.4g} on the same system; min(p₀, w / (1 - α)) is {_kept(scalar['Lemma 9, lower'])}",
+            f"P₆₀ = {remote:.4g} on the same system; min(p₀, w / (1 - α)) is {_holds(scalar['Lemma 9, lower'])}",
             {"bound": printed["receiver"], "error": remote}, lambda bound, error: holds(bound <= error)),
         Statement("m = ρ p₀ + w̃ / (1 - ρ) ≤ Ξᵢ", "Lemma 8, lower", f"{printed['relay']:.4g}",
-            f"Ξ₁ = {relay:.4g} at k = 60 on the same system; the corrected bound is {_kept(scalar['Lemma 8, lower'])}",
+            f"Ξ₁ = {relay:.4g} at k = 60 on the same system; the corrected bound is {_holds(scalar['Lemma 8, lower'])}",
             {"bound": printed["relay"], "error": relay}, lambda bound, error: holds(bound <= error)),
     ]  # fmt: skip
 
 
-def _kept(bound: Bound) -> str:
+def _holds(bound: Bound) -> str:
     return "obeyed" if bound.holds else "broken"
 
 
@@ -233,6 +233,6 @@ def _printed_scalar() -> dict[str, float]:
 
 def _below_state(certificate: RelayCertificate, name: str) -> float:
     """Smallest eigenvalue of cov x_k - E e e' over its trace, over all k."""
-    found = certificate.recomputed
-    gap = np.linalg.eigvalsh(found.state - found.covariance[name])[:, 0]
-    return float(np.min(gap / np.trace(found.state, axis1=1, axis2=2)))
+    result = certificate.recomputed
+    gap = np.linalg.eigvalsh(result.state - result.covariance[name])[:, 0]
+    return float(np.min(gap / np.trace(result.state, axis1=1, axis2=2)))

@@ -65,8 +65,8 @@ def test_constants_are_those_of_the_oracle(ours, theirs):
 @pytest.mark.parametrize(("sign", "terms"), [(1, oracle.printed_terms), (-1, oracle.tight_terms)])
 def test_terms_of_the_bounds_are_those_of_the_oracle(s, theirs, sign, terms):
     ours, reference = one_step.box_terms(one_step.channel_of(s), sign), terms(theirs)
-    found = ours.mu, ours.V + ours.d**2, ours.d, ours.X2
-    np.testing.assert_allclose(found, [reference.mu, reference.V, reference.d, reference.X2], rtol=1e-13)  # rounding
+    outcome = ours.mu, ours.V + ours.d**2, ours.d, ours.X2
+    np.testing.assert_allclose(outcome, [reference.mu, reference.V, reference.d, reference.X2], rtol=1e-13)  # rounding
 
 
 def test_the_minus_alone_is_no_bound_and_the_positive_part_repairs_it():
@@ -126,9 +126,9 @@ def test_a_small_run_agrees_with_another_implementation():
             "polytope": cubature(STRONG, i, hg.filters.Polytope(hg.filters.Scalars(*STRONG.beta))),
         }) for i, name in enumerate(NODES)
     }  # fmt: skip
-    found = hg.monte_carlo(hg.Network(plant(STRONG), nodes), STRONG.horizon, 128, 0, hg.Statistics())
+    statistics = hg.monte_carlo(hg.Network(plant(STRONG), nodes), STRONG.horizon, 128, 0, hg.Statistics())
     for name, expected in (("mean_gain", 0.1963), ("polytope", 0.0789)):  # of an independent implementation
-        rmse, error = hg.simulation.pool([found[node][name] for node in NODES]).rmse()
+        rmse, error = hg.simulation.pool([statistics[node][name] for node in NODES]).rmse()
         assert abs(rmse - expected) < 4 * error, (name, rmse, error)
 
 
@@ -167,18 +167,18 @@ def result():
 def test_every_promised_number_is_in_the_summary(result, tmp_path, fits):
     replace(cubature_fusion.publication, compute=lambda *_: result).run(cubature_fusion.Setting(runs=64), tmp_path)
     folder = tmp_path / "cubature-fusion"
-    found = json.loads((folder / "summary.json").read_text())
+    summary = json.loads((folder / "summary.json").read_text())
     for name in ("printed", "strong"):
-        scenario = found["scenarios"][name]
+        scenario = summary["scenarios"][name]
         assert FILTERS | {f"{n}_fixed" for n in BOUNDED} <= set(scenario["filters"])
         assert set(scenario["fused"]) >= FUSED
         for numbers in [*scenario["filters"].values(), *scenario["fused"].values()]:
             assert set(numbers) == NUMBERS
             assert set(numbers["worst_direction"]) == {"ratio", "standard_error", "z", "step", "node"}
-    for claim in found["claims"]:
+    for claim in summary["claims"]:
         assert set(claim) == {"claim", "source", "paper", "ours", "verdict", "evidence"} and claim["ours"]
         assert claim["verdict"] in {"holds", "holds_vacuously", "fails"}
-    assert len({claim["claim"] for claim in found["claims"]}) == len(found["claims"])
+    assert len({claim["claim"] for claim in summary["claims"]}) == len(summary["claims"])
     for number in range(1, 13):
         assert len(list(folder.glob(f"fig{number:02d}_*.png"))) == 1
     assert "<svg" not in (folder / "report.html").read_text().lower().replace("data:image/svg", "")
@@ -191,10 +191,10 @@ def test_the_record_is_labelled_and_agrees_with_the_statistics(result, tmp_path)
     compute.write_record(result, tmp_path)
     with xarray.open_dataset(tmp_path / "record.nc", engine="h5netcdf") as record:
         assert record.rmse.dims == ("scenario", "filter", "node", "time")
-        one = record.sel(scenario="printed", filter="cubature_tight", node="3")
+        item = record.sel(scenario="printed", filter="cubature_tight", node="3")
         expected = result.printed.statistics["3"]["cubature_tight"]
-        np.testing.assert_array_equal(one.rmse.values[:40], expected.rmse_over_time())
-        assert np.all(np.isnan(one.rmse.values[40:]))
+        np.testing.assert_array_equal(item.rmse.values[:40], expected.rmse_over_time())
+        assert np.all(np.isnan(item.rmse.values[40:]))
         np.testing.assert_array_equal(
             record.fused_claimed_trace.sel(scenario="strong", fused="ci_equal").values,
             np.trace(result.strong.statistics["fused"]["ci_equal"].claimed(), axis1=-2, axis2=-1),

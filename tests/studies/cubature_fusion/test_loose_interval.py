@@ -5,6 +5,7 @@ import pytest
 
 import heliograph as hg
 from heliograph_studies.cubature_fusion.loose_interval import LooseInterval
+from tests.filters.gaussian.test_gaussian import SETTINGS
 from tests.filters.test_bounds import (
     FIXED,
     check_by_enumeration,
@@ -13,7 +14,6 @@ from tests.filters.test_bounds import (
     check_recursion,
     one_step,
 )
-from tests.filters.test_gaussian import SETTINGS
 from tests.oracles import cubature_fusion as oracle
 
 

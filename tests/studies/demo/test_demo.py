@@ -14,7 +14,7 @@ from heliograph.model.estimate import Estimate
 from heliograph_studies.demo import compute as compute_module
 from heliograph_studies.demo import robot, run
 from heliograph_studies.demo.compute import NAMES, SEEDS, Outcome, average_noise, compute, relay
-from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, heard_by_one, learn, relayed, said
+from heliograph_studies.demo.learned import FIRST_GUESS, HELD, Learned, direct, learn, received_by_one, relayed, said
 from heliograph_studies.demo.recording import PlazaRecording, read_recording
 from heliograph_studies.demo.scores import score
 from heliograph_studies.demo.twin import Design, channel_less
@@ -123,28 +123,28 @@ def test_knowing_the_relay_pays_on_every_seed(outcome: Outcome) -> None:
 
 def test_constants_of_one_drive_serve_another(outcome: Outcome) -> None:
     """Only the gyro's rate at rest, beacons and start are the other drive's own."""
-    found = compute(read_recording("plaza1"), 0)
-    for trial in found.trials:
+    result = compute(read_recording("plaza1"), 0)
+    for trial in result.trials:
         aware, mean = (trial.scores[name] for name in ("relay_aware", "mean_gain"))
         assert aware.position_rmse_m <= 1.5  # the project's own requirement, as the three below
         assert 0.6 <= aware.nees_per_dimension <= 1.6
         assert mean.position_rmse_m >= 2.5 * aware.position_rmse_m
         assert mean.nees_per_dimension > 100
-    first = [found.trials[0].scores[name].position_rmse_m for name in ("relay_aware", "mean_gain")]
+    first = [result.trials[0].scores[name].position_rmse_m for name in ("relay_aware", "mean_gain")]
     said = "{:.2f} m where the mean gain gives {:.2f} m".format(*first)
     assert said in " ".join((ROOT / "README.md").read_text().split())
-    told, known = run.summary(found), run.summary(outcome)
-    assert (told["recording"], told["rows"], known["recording"]) == ("Plaza1", 9660, "Plaza2")
-    assert list(told) == list(known)
+    published, known = run.summary(result), run.summary(outcome)
+    assert (published["recording"], published["rows"], known["recording"]) == ("Plaza1", 9660, "Plaza2")
+    assert list(published) == list(known)
 
 
 def test_relay_draws_follow_the_channel(recording: PlazaRecording) -> None:
     received = relay(robot.channel, recording.ranges, 3)
-    heard = ~np.isnan(recording.ranges)
-    np.testing.assert_array_equal(np.isnan(received), ~heard)
+    observed = ~np.isnan(recording.ranges)
+    np.testing.assert_array_equal(np.isnan(received), ~observed)
     np.testing.assert_array_equal(received, relay(robot.channel, recording.ranges, 3))
-    assert not np.any(received[heard] == relay(robot.channel, recording.ranges, 4)[heard])
-    y, z = recording.ranges[heard], received[heard]
+    assert not np.any(received[observed] == relay(robot.channel, recording.ranges, 4)[observed])
+    y, z = recording.ranges[observed], received[observed]
     deviation = np.sqrt((SECOND**2 - 1) * y**2 + RELAY_NOISE)
     scaled = (z - y) / deviation  # mean 0, variance 1
     assert abs(scaled.mean()) < 4 / np.sqrt(len(y))  # four standard errors
@@ -178,15 +178,15 @@ def test_score_of_known_errors() -> None:
 
 
 def test_summary_holds_the_scores(folder: Path, outcome: Outcome, designs: dict[str, Design]) -> None:
-    found = json.loads((folder / "summary.json").read_text())
-    assert found["seed"] == 0
-    assert found["seeds"]["seed"] == list(range(SEEDS))
-    assert found["designs"] == {name: run.numbers(one) for name, one in designs.items()}
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["seed"] == 0
+    assert summary["seeds"]["seed"] == list(range(SEEDS))
+    assert summary["designs"] == {name: run.numbers(design) for name, design in designs.items()}
     for name in NAMES:
         shown = outcome.trials[0].scores[name]
-        assert found["position_rmse_m"][name] == shown.position_rmse_m == found["seeds"]["position_rmse_m"][name][0]
-        assert found["nees_per_dimension"][name] == shown.nees_per_dimension
-        assert len(found["seeds"]["nees_per_dimension"][name]) == SEEDS
+        assert summary["position_rmse_m"][name] == shown.position_rmse_m == summary["seeds"]["position_rmse_m"][name][0]
+        assert summary["nees_per_dimension"][name] == shown.nees_per_dimension
+        assert len(summary["seeds"]["nees_per_dimension"][name]) == SEEDS
 
 
 def test_written_measurements_give_the_written_estimates(folder: Path) -> None:
@@ -254,11 +254,11 @@ def test_learning_without_the_truth_beats_the_calibration_on_the_second_half(lea
     assert learned.rows == 908
     assert learned.second_half.position_rmse_m <= 0.30  # the project's own requirement, as the next
     assert learned.second_half_calibrated.position_rmse_m >= 0.33
-    assert learned.found.converged and len(learned.found.best.rows()) == 5
+    assert learned.result.converged and len(learned.result.best.rows()) == 5
 
 
 def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned) -> None:
-    rows = {row.name: row for row in learned.found.rows()}
+    rows = {row.name: row for row in learned.result.rows()}
     gyro = rows["gyro_rate"]
     assert gyro.low < learned.drift < gyro.high  # the truth, which it has not seen
     assert learned.rest < gyro.low
@@ -269,31 +269,33 @@ def test_it_finds_what_the_gyro_reads_while_driving(learned: Learned) -> None:
 
 def test_its_maximum_is_one_of_the_filters_own_likelihood(learned: Learned, recording: PlazaRecording) -> None:
     """That of the filter with the learned constants, and less with each of them moved by a standard error."""
-    network = heard_by_one(PLAZA2, robot.Constants(**learned.found.values), hg.perfect(4))
-    own = hg.log_likelihood(network.nodes["robot"].filters["learned"], recording.ranges[:908], recording.odometry[:908])
-    best = learned.found.best
-    assert own == pytest.approx(best.total, rel=1e-10)
+    network = received_by_one(PLAZA2, robot.Constants(**learned.result.values), hg.perfect(4))
+    likelihood = hg.log_likelihood(
+        network.nodes["robot"].filters["learned"], recording.ranges[:908], recording.odometry[:908]
+    )
+    best = learned.result.best
+    assert likelihood == pytest.approx(best.total, rel=1e-10)
     error = np.sqrt(np.diag(best.covariance()[0]))
     moved = best.x + np.concatenate([np.diag(error), -np.diag(error)])
-    assert np.all(best.surface.found(moved).total < best.total - 0.05)
+    assert np.all(best.surface.result(moved).total < best.total - 0.05)
 
 
 def test_what_is_learned_behind_the_relay_is_its_gains_variance(recording: PlazaRecording) -> None:
     """One gain with the variance of both hops' product gives the likelihood of the relay itself, row by row."""
-    names = [one.name for one in describe(partial(relayed, PLAZA2)).parameters.every]
+    names = [item.name for item in describe(partial(relayed, PLAZA2)).parameters.every]
     assert sorted(names) == ["gain_variance", "gyro_rate", "position_walk", "range_scale"]
-    assert {one.name for one in describe(partial(direct, PLAZA2)).parameters.every} == set(FIRST_GUESS._fields)
+    assert {item.name for item in describe(partial(direct, PLAZA2)).parameters.every} == set(FIRST_GUESS._fields)
     constants = robot.Constants(FIRST_GUESS.gyro_rate, FIRST_GUESS.range_scale, robot.RANGE_VARIANCE, 0.02, HELD)
     values = {"gain_variance": SECOND**2 - 1, "gyro_rate": 0.0, "range_scale": 1.0, "position_walk": 0.02}
     z = relay(robot.channel, recording.ranges, 0)[:50]
-    one = describe(partial(relayed, PLAZA2)).at(values)
-    other = heard_by_one(PLAZA2, constants, robot.channel)
-    sums = [hg.log_likelihood(n.nodes["robot"].filters["learned"], z, recording.odometry[:50]) for n in (one, other)]
+    item = describe(partial(relayed, PLAZA2)).at(values)
+    other = received_by_one(PLAZA2, constants, robot.channel)
+    sums = [hg.log_likelihood(n.nodes["robot"].filters["learned"], z, recording.odometry[:50]) for n in (item, other)]
     assert sums[0] == pytest.approx(sums[1], rel=1e-10)
 
 
 def test_what_was_learned_is_written_beside_the_scores(folder: Path, learned: Learned) -> None:
-    found = json.loads((folder / "summary.json").read_text())["learned"]
-    assert found["second_half"] == learned.second_half.position_rmse_m
-    assert found["parameters"]["gyro_rate"]["estimate"] == learned.found.values["gyro_rate"]
+    result = json.loads((folder / "summary.json").read_text())["learned"]
+    assert result["second_half"] == learned.second_half.position_rmse_m
+    assert result["parameters"]["gyro_rate"]["estimate"] == learned.result.values["gyro_rate"]
     assert "What the ranges alone say" in (folder / "report.html").read_text(encoding="utf-8")

@@ -53,22 +53,22 @@ def other() -> PlazaRecording:
 
 
 def test_another_drive_is_read_in_the_order_of_its_time_stamps(other: PlazaRecording) -> None:
-    heard = ~np.isnan(other.ranges)
-    assert heard.sum() == 3529 and np.all(heard.sum(axis=1) <= 1)  # every range, none twice in a row
+    received = ~np.isnan(other.ranges)
+    assert received.sum() == 3529 and np.all(received.sum(axis=1) <= 1)  # every range, none twice in a row
     step = other.odometry[:, 2]
     assert np.all(np.diff(other.time) >= 0)
     assert step.max() <= 1.0 and np.all(step >= 0)  # gaps of up to 97 s are bridged by the odometry
     np.testing.assert_allclose(step.sum(), other.time[-1] - other.start)
     # Ranges are where their stamps say, before and after the file goes back: a scale is all that is off.
-    off = other.ranges[heard] - robot.RANGE_SCALE * other.distances()[heard]
+    off = other.ranges[received] - robot.RANGE_SCALE * other.distances()[received]
     assert all(abs(part.mean()) < 0.25 and part.std() < 0.8 for part in np.array_split(off, 30))
 
 
 def test_the_other_drive_has_three_things_of_its_own(other: PlazaRecording) -> None:
-    own = robot.DRIVES["plaza1"]
-    assert other.gyro_rate == pytest.approx(own.gyro_rate, abs=0.5e-9)
-    np.testing.assert_allclose(own.beacons, other.beacons, atol=0.5e-3)
-    np.testing.assert_allclose(own.start, other.start_pose, atol=0.5e-3)
+    local = robot.DRIVES["plaza1"]
+    assert other.gyro_rate == pytest.approx(local.gyro_rate, abs=0.5e-9)
+    np.testing.assert_allclose(local.beacons, other.beacons, atol=0.5e-3)
+    np.testing.assert_allclose(local.start, other.start_pose, atol=0.5e-3)
 
 
 def test_headings_are_those_of_travel_on_either_drive(recording: PlazaRecording, other: PlazaRecording) -> None:

@@ -40,12 +40,12 @@ def test_theorem_1_survives_enumeration_and_the_enumeration_finds_a_wrong_term(m
 def test_the_growth_constant_is_false_for_differences_and_true_for_sizes(monkeypatch):
     monkeypatch.setattr(slope_bound, "LIMIT", 256)  # boxes: of a slope above 15 no number proves 0.7
     f, side = dynamics(15), np.full(2, 2.0)
-    found = hg.h_infinity.check_growth(f, 0.7, -side, side)
-    assert found.refuted and 15 < found.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
-    x, y = found.pair
+    result = hg.h_infinity.check_growth(f, 0.7, -side, side)
+    assert result.refuted and 15 < result.ratio < 0.7 * np.sqrt(1 + (2 * 15) ** 2 + 1)  # below |J| for |x2| <= 2
+    x, y = result.pair
     with jax.enable_x64(True):
         moved = np.linalg.norm(np.asarray(f(jnp.asarray(x))) - np.asarray(f(jnp.asarray(y))))
-    assert moved / np.linalg.norm(x - y) == pytest.approx(found.ratio, rel=1e-9)
+    assert moved / np.linalg.norm(x - y) == pytest.approx(result.ratio, rel=1e-9)
     assert not hg.h_infinity.check_size(f, 0.7, -side, side).refuted
 
 
@@ -73,14 +73,14 @@ def test_the_search_finds_the_norm_of_a_linear_system():
         structured.inputs("bias"),
     )  # fmt: skip
     draws = structured.draws(2, 0)
-    found = worst_disturbance.worst_disturbance(item, world, draws, draws, [1.0], rounds=200)
+    result = worst_disturbance.worst_disturbance(item, world, draws, draws, [1.0], rounds=200)
     powers = [np.linalg.matrix_power(rotation, k) for k in range(steps)]
     toeplitz = np.block([
         [powers[k], *(powers[k - 1 - j] @ structured.DISTURBANCE if j < k else np.zeros((2, 1)) for j in range(steps))]
         for k in range(steps)
     ])  # fmt: skip
     top = np.linalg.svd(toeplitz, compute_uv=False)[0]
-    assert found.level <= top * (1 + 1e-12) and found.level == pytest.approx(
+    assert result.level <= top * (1 + 1e-12) and result.level == pytest.approx(
         top, rel=1e-3
     )  # 200 rounds of power method
 

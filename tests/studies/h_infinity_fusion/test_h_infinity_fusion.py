@@ -48,8 +48,8 @@ def theorem_1(entry, node):
     theta_star, cross, b2_star, b3_star = theta * (1 - theta), theta * (1 - b2), b2 * (1 - b2), b3 * (1 - b3)
     E1, E2 = np.diag([1.0, np.sqrt(2)]), np.array([[1.0, 1, 0], [0, 0, 1]])
     mean1, mean2 = np.array([[theta], [b3]]), np.diag([b2, 1, 1])
-    one, two, three = np.array([[1.0], [0]]), np.array([[0.0], [1]]), np.diag([1.0, 0, 0])
-    first, second = np.block([one, 0 * one]), np.block([two, 0 * two])  # of h alone, since R_2 has no other column
+    item, two, three = np.array([[1.0], [0]]), np.array([[0.0], [1]]), np.diag([1.0, 0, 0])
+    first, second = np.block([item, 0 * item]), np.block([two, 0 * two])  # of h alone, since R_2 has no other column
     R1 = np.zeros((4, 2))
     R1[2:, 1:] = -K @ E1 @ mean1
     R2 = np.vstack([np.zeros((2, 2)), -K @ E1])
@@ -64,12 +64,12 @@ def theorem_1(entry, node):
         (1, 4): PR @ R4 @ C,
         (2, 2): R1.T @ PR @ R1 + theta_star * first.T @ R2.T @ PR @ R2 @ first
         + b3_star * second.T @ R2.T @ PR @ R2 @ second - lam2 * np.eye(2),
-        (2, 3): R1.T @ PR @ bar + theta_star * first.T @ R2.T @ PR @ R3 @ one * D
+        (2, 3): R1.T @ PR @ bar + theta_star * first.T @ R2.T @ PR @ R3 @ item * D
         + b3_star * second.T @ R2.T @ PR @ R3 @ two * D,
         (2, 4): (R1.T @ PR @ R4 + cross * first.T @ R2.T @ PR @ R5 @ three) @ C,
         (3, 3): bar.T @ PR @ bar - gamma**2 * np.eye(1)
-        + D**2 * (theta_star * one.T @ R3.T @ PR @ R3 @ one + b3_star * two.T @ R3.T @ PR @ R3 @ two),
-        (3, 4): bar.T @ PR @ R4 @ C + cross * D * one.T @ R3.T @ PR @ R5 @ three @ C,
+        + D**2 * (theta_star * item.T @ R3.T @ PR @ R3 @ item + b3_star * two.T @ R3.T @ PR @ R3 @ two),
+        (3, 4): bar.T @ PR @ R4 @ C + cross * D * item.T @ R3.T @ PR @ R5 @ three @ C,
         (4, 4): C @ (R4.T @ PR @ R4 + b2_star * three @ R5.T @ PR @ R5 @ three) @ C - gamma**2 * np.eye(3),
     }  # fmt: skip
     edges = np.cumsum([0, 4, 4, 2, 1, 3])
@@ -112,8 +112,8 @@ def test_smallest_levels(nodes):
     np.testing.assert_allclose([n.horizon.level for n in nodes], [0.025931, 0.028873, 0.029031, 0.028674], rtol=3e-5)
     np.testing.assert_allclose([n.separate.level for n in nodes], 0.025565, rtol=3e-5)
     # bisection to 1e-4
-    found = [n.smallest["trace"] for n in nodes]
-    np.testing.assert_allclose(found, [0.02696, 0.02901, 0.02903, 0.02895], rtol=4e-4)
+    results = [n.smallest["trace"] for n in nodes]
+    np.testing.assert_allclose(results, [0.02696, 0.02901, 0.02903, 0.02895], rtol=4e-4)
     for node in nodes:
         assert node.without_measurements == pytest.approx(0.0290307, rel=2e-6)  # closed form, to its printed digits
         assert node.zero_gain.level == pytest.approx(node.without_measurements, rel=3e-6)
@@ -153,8 +153,8 @@ def test_the_estimates_are_the_papers_predictions(outcome, nodes):
     for i, node in enumerate(NODES):
         xhat = np.array(SETTING.guesses[i])
         for k in range(15):
-            found = np.asarray(record.estimates[node][RECURSIVE].mean)[0, k]
-            worst = max(worst, np.abs(found - xhat).max())
+            answer = np.asarray(record.estimates[node][RECURSIVE].mean)[0, k]
+            worst = max(worst, np.abs(answer - xhat).max())
             innovation = record.measurements[node][0, k] - expected @ [SETTING.sensing[i] * xhat.sum()]
             moved = 0.7 * np.array([xhat[0] * np.cos(0.1 * xhat[1]), xhat[1] * np.sin(k * xhat[0])])
             xhat = moved + nodes[i].paper.gains[k] @ innovation
@@ -173,10 +173,10 @@ def test_errors_saturation_and_indices(outcome):
     replayed = indices.replay(outcome)
     np.testing.assert_array_equal(np.abs(outcome.estimates(RECURSIVE)) > replayed.amplitude,
                                   np.swapaxes(uplink.saturated, 1, 2))  # fmt: skip
-    found = indices.indices(outcome, replayed)
-    np.testing.assert_allclose(found.local[RECURSIVE], [-310.5, -273.5, -309.5, -351.3], atol=0.051)
-    assert found.fused[RECURSIVE] == pytest.approx(-2470.2, abs=0.051)
-    assert np.all(found.local["zero_gain"] < 0) and np.all(found.local[indices.ZERO] < 0)
+    answer = indices.indices(outcome, replayed)
+    np.testing.assert_allclose(answer.local[RECURSIVE], [-310.5, -273.5, -309.5, -351.3], atol=0.051)
+    assert answer.fused[RECURSIVE] == pytest.approx(-2470.2, abs=0.051)
+    assert np.all(answer.local["zero_gain"] < 0) and np.all(answer.local[indices.ZERO] < 0)
 
 
 def test_losses_are_read_off_what_was_received(outcome):
@@ -192,8 +192,8 @@ def test_losses_are_read_off_what_was_received(outcome):
 
 
 def test_the_guarantee_from_a_false_constant_is_broken(nodes):
-    found = growth.violation(SETTING, 0, nodes[0].horizon)
-    assert found.level - 4 * found.standard_error > nodes[0].horizon.level
+    answer = growth.violation(SETTING, 0, nodes[0].horizon)
+    assert answer.level - 4 * answer.standard_error > nodes[0].horizon.level
 
 
 @pytest.fixture(scope="module")
@@ -213,9 +213,9 @@ def result(nodes, outcome):
         errors, errors, over, worst, 100,
     )  # fmt: skip
     shown = outcome.record.estimates["fused"]
-    told = {f"ekf_told.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
+    known = {f"ekf_told.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
     also = {f"horizon.{q}": shown[f"zero_gain.{q}"] for q in example.QUANTIZERS}
-    estimates = outcome.record.estimates | {"fused": shown | told | also}
+    estimates = outcome.record.estimates | {"fused": shown | known | also}
     whole = replace(outcome, record=replace(outcome.record, estimates=estimates), filters=(*outcome.filters, "horizon"))
     replayed = indices.replay(outcome)
     parts = Parts(
@@ -243,25 +243,25 @@ def folder(result, tmp_path_factory):
 
 
 def test_the_summary_has_every_key(folder):
-    found = json.loads((folder / "summary.json").read_text())
-    assert len(found["nodes"]) == 4
-    for node in found["nodes"]:
+    summary = json.loads((folder / "summary.json").read_text())
+    assert len(summary["nodes"]) == 4
+    for node in summary["nodes"]:
         assert {"gamma_paper", "steps_certified", "max_eig", "gamma_min", "certificate"} <= node.keys()
         assert {"recursive_trace", "horizon", "horizon_split"} <= node["gamma_min"].keys()
         shapes = {key: np.shape(value) for key, value in node["certificate"][0].items()}
         assert shapes == {"P": (4, 4), "K": (2, 2), "L_next": (4, 4), "lambda1": (), "lambda2": (), "gamma": ()}
         assert node["max_eig"] < 0
-    assert {"weights", "gamma", "gamma_of_paper_weights", "minkowski"} <= found["fusion"].keys()
-    assert found["fusion"]["gamma_of_paper_weights"] == pytest.approx(2.54188, abs=5.1e-6)
-    assert found["fusion"]["minkowski"]["gamma"] == pytest.approx(1.794, abs=5.1e-4)
-    wanted = {"none", "dynamic", "static", "dynamic_decodable"}
-    assert wanted | {f"{name}_se" for name in wanted} <= found["mean_fused_error"].keys()
-    assert found["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
-    assert found["saturation"]["dynamic_decodable"] == 0
-    assert found["saturated_fraction"] == found["saturation"]["dynamic"]
-    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= found["contexts"]["ekf_told"].keys()
-    assert len(found["index"]["J1"][RECURSIVE]) == 4
-    assert {"growth", "discriminating", "claims", "saturated_fraction"} <= found.keys()
+    assert {"weights", "gamma", "gamma_of_paper_weights", "minkowski"} <= summary["fusion"].keys()
+    assert summary["fusion"]["gamma_of_paper_weights"] == pytest.approx(2.54188, abs=5.1e-6)
+    assert summary["fusion"]["minkowski"]["gamma"] == pytest.approx(1.794, abs=5.1e-4)
+    expected = {"none", "dynamic", "static", "dynamic_decodable"}
+    assert expected | {f"{name}_se" for name in expected} <= summary["mean_fused_error"].keys()
+    assert summary["mean_fused_error"]["dynamic_minus_static"]["share_of_runs_better"] > 0.9
+    assert summary["saturation"]["dynamic_decodable"] == 0
+    assert summary["saturated_fraction"] == summary["saturation"]["dynamic"]
+    assert {"mean_fused_error", "mean_fused_error_se", "dynamic", "static"} <= summary["contexts"]["ekf_told"].keys()
+    assert len(summary["index"]["J1"][RECURSIVE]) == 4
+    assert {"growth", "discriminating", "claims", "saturated_fraction"} <= summary.keys()
 
 
 def test_every_file_is_there_and_the_record_can_be_read(folder, fits):

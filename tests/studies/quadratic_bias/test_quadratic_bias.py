@@ -21,14 +21,14 @@ EXPECTED = {"memory": (0.0419766, 0.0393043), "cubic": (0.0328326, 0.0333223), "
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def result(tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
     return quadratic_bias.run(quadratic_bias.Setting(runs=128, seed=1), out), out / "quadratic-bias"
 
 
 @pytest.fixture(scope="module")
-def folder(found):
-    return found[1]
+def folder(result):
+    return result[1]
 
 
 @pytest.fixture(scope="module")
@@ -62,15 +62,15 @@ def test_covariances_are_the_oracles(numbers):
     }  # fmt: skip
     for name, covariance in expected.items():
         for i, state in enumerate(("x1", "x2", "eps1", "eps2")):
-            found = numbers["covariance"][name][state]
-            np.testing.assert_allclose(found, covariance[:, i, i], rtol=0, atol=1e-12)
+            result = numbers["covariance"][name][state]
+            np.testing.assert_allclose(result, covariance[:, i, i], rtol=0, atol=1e-12)
 
 
 def test_covariances_of_the_variants(numbers):
     for name, expected in EXPECTED.items():
-        found = numbers["covariance"][name]
-        assert len(found["x1"]) == 101 and found["x1"][0] == 0.01
-        means = [np.mean(found[state][31:]) for state in ("x1", "x2")]
+        result = numbers["covariance"][name]
+        assert len(result["x1"]) == 101 and result["x1"][0] == 0.01
+        means = [np.mean(result[state][31:]) for state in ("x1", "x2")]
         np.testing.assert_allclose(means, expected, rtol=0, atol=5.1e-8)  # seven decimals
 
 
@@ -88,17 +88,17 @@ def test_readme_says_what_is_found(numbers):
     assert published == gain["quadratic"] and here.startswith(f"{gain['cubic']} by cubes, ")
     mixture = float(re.search(r"([\d.]+) % by a mixture", here)[1])
     assert f"| {published}, as published; no package has it | {mixture} % | `heliograph reproduce quadratic-" in README
-    found, linear = numbers["monte_carlo"]["mixture"], numbers["mean_covariance"]["linear"]["x1"]
-    assert abs(found["x1"] - (1 - mixture / 100) * linear) < 4 * found["x1_se"]
+    result, linear = numbers["monte_carlo"]["mixture"], numbers["mean_covariance"]["linear"]["x1"]
+    assert abs(result["x1"] - (1 - mixture / 100) * linear) < 4 * result["x1_se"]
 
 
 def test_simulation_agrees_with_the_design(numbers):
     """128 runs: each mean within 4 standard errors of the designed covariance, state and bias."""
-    for name, found in numbers["monte_carlo"].items():
+    for name, number in numbers["monte_carlo"].items():
         for state in ("x1", "x2", "eps1", "eps2"):
             if name in numbers["mean_covariance"]:
-                error = found[state] - numbers["mean_covariance"][name][state]
-                assert abs(error) < 4 * found[f"{state}_se"], (name, state)
+                error = number[state] - numbers["mean_covariance"][name][state]
+                assert abs(error) < 4 * number[f"{state}_se"], (name, state)
 
 
 def test_in_the_outage_scenario_the_printed_filter_loses_while_claiming_to_win(numbers):
@@ -120,10 +120,10 @@ def test_outage_covariances_are_the_oracles():
         eps0=oracle.two_point(-0.3, 0.3, 0.5), w=oracle.two_point((1 - p) * p**-0.5, -(p**0.5), p),
         xi=oracle.two_point(-0.1, 0.1, 0.5), v=shock, varpi=shock, sigma=shock,
     )  # fmt: skip
-    found = printed.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
+    result = printed.printed_quadratic(outage.plant, outage.sensor, outage.channel, 40)
     expected = oracle.quadratic(system, 40, repaired=False)
-    np.testing.assert_allclose(found.true_covariance, expected.true[1:, :2, :2], rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(found.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(result.true_covariance, expected.true[1:, :2, :2], rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(result.schedule.gains.covariance, expected.claimed[1:, :2, :2], rtol=1e-10, atol=1e-12)
 
 
 def test_every_file_is_there_and_the_record_can_be_read(folder, fits):
@@ -159,8 +159,8 @@ VERDICTS = [
 ]  # fmt: skip
 
 
-def test_verdicts_follow_from_evidence(found):
-    check_verdicts(statements(found[0])["paper"], VERDICTS)
+def test_verdicts_follow_from_evidence(result):
+    check_verdicts(statements(result[0])["paper"], VERDICTS)
 
 
 def test_a_folder_with_other_files_and_too_few_runs_are_refused(tmp_path):

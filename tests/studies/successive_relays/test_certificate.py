@@ -52,13 +52,13 @@ def test_tuned_gains_leave_the_bounds_proofs():
 
 def test_corrected_uniform_bounds_hold_where_the_printed_fail():
     net = scalar(0.5, 10.0)
-    found = certify_relays(net, own_error_design(net, 60).gains)
-    assert all(bound.applies and bound.holds for bound in found.bounds.values())
-    last = found.recomputed.covariance["receiver"][-1, 0, 0]
+    result = certify_relays(net, own_error_design(net, 60).gains)
+    assert all(bound.applies and bound.holds for bound in result.bounds.values())
+    last = result.recomputed.covariance["receiver"][-1, 0, 0]
     assert last == pytest.approx(1.333, abs=1e-3)
     # printed: tau p0 + w / (1 - tau), alpha p0 + w / (1 - alpha), with alpha = tau up to 1e-6
     assert pytest.approx(3.833, abs=1e-3) == 0.25 * 10 + 1 / 0.75
-    assert last < 3.833 and found.recomputed.covariance["receiver"][0, 0, 0] > 3.833
+    assert last < 3.833 and result.recomputed.covariance["receiver"][0, 0, 0] > 3.833
 
 
 def test_every_bound_can_fail():

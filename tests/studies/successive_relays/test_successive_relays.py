@@ -21,7 +21,7 @@ RUNS = 600
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory):
+def result(tmp_path_factory):
     out = tmp_path_factory.mktemp("reproduction")
     # Sweeps: of a design that is drawn, and in no number tested here. Steady: 0.98^1200 = 3e-11 of a covariance.
     chosen = successive_relays.Setting(runs=RUNS, seed=2, sweeps=1, steady=600)
@@ -29,8 +29,8 @@ def found(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def folder(found):
-    return found[1]
+def folder(result):
+    return result[1]
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +119,8 @@ VERDICTS = [
 ]  # fmt: skip
 
 
-def test_verdicts_follow_from_evidence(found):
-    check_verdicts([each for part in statements(found[0]).values() for each in part], VERDICTS)
+def test_verdicts_follow_from_evidence(result):
+    check_verdicts([item for part in statements(result[0]).values() for item in part], VERDICTS)
 
 
 def test_an_order_in_which_everything_is_known_when_used():
@@ -150,8 +150,8 @@ def test_bad_calls_are_refused(tmp_path):
 
 
 def test_the_printed_recursion_corrected_is_the_oracles():
-    found, solution = recursion("none", 30, setting.Setting()), oracle.solve(oracle.section_iv(30))
-    np.testing.assert_allclose(found.remote_trace, np.trace(solution.P, axis1=1, axis2=2), rtol=1e-12)
+    result, solution = recursion("none", 30, setting.Setting()), oracle.solve(oracle.section_iv(30))
+    np.testing.assert_allclose(result.remote_trace, np.trace(solution.P, axis1=1, axis2=2), rtol=1e-12)
     with pytest.raises(ValueError, match="misprint: expected one of"):
         recursion("lemma_99", 3, setting.Setting())
 

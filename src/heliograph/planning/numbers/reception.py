@@ -29,9 +29,9 @@ from heliograph.planning.transmitters import powers_of_law, transmitter_names
 from heliograph.random_affine.base import AbstractRandomAffine, memories
 from heliograph.random_affine.chain import MarkovChain, stationary
 from heliograph.random_affine.combine import Stack
-from heliograph.random_affine.modes import JointModes, Revealed, joint_modes
-from heliograph.random_affine.second_moments import has_known_mean, second_order
-from heliograph.random_affine.told import outcomes
+from heliograph.random_affine.modes import JointModes, ModeOutput, joint_modes
+from heliograph.random_affine.moments.second_moments import has_known_mean, second_order
+from heliograph.random_affine.side_information import outcomes
 from heliograph.simulation.network import Network
 from heliograph.simulation.node import Common, Node
 
@@ -81,7 +81,7 @@ def sources_of(network: Network) -> dict[str, Source]:
             if not isinstance(sensor, LinearSensor) or channel.past:
                 got = "a channel with delays" if isinstance(sensor, LinearSensor) else type(sensor).__name__
                 raise fail(f"node {name!r}", "a LinearSensor and a channel without delays", got)
-            if isinstance(node, Node) and node.told_by is not None:
+            if isinstance(node, Node) and node.informed_by is not None:
                 raise fail(f"node {name!r}", "a sensor without feedback", "one that receives a filter's estimate")
             refuse_angles("design", sensor)
             result[name] = Source(node.sensor, node.channel)
@@ -201,7 +201,7 @@ def _observed_modes(name: str, channel: AbstractRandomAffine) -> _Modes:
 def _flagged(name: str, channel: AbstractRandomAffine) -> JointModes:
     """What arrives in each mode of a channel all of whose modes are observed."""
     parts = channel.maps if isinstance(channel, Stack) else ()
-    rest = [part for part in parts if not isinstance(part, Revealed)]
+    rest = [part for part in parts if not isinstance(part, ModeOutput)]
     chains = memories(channel)
     markov = all(isinstance(memory, MarkovChain) for memory in chains.values())
     if not markov or len(parts) - len(rest) != len(chains):

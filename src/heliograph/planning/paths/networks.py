@@ -173,7 +173,7 @@ class _Step(NamedTuple):
 def _at_step(nodes: Mapping[str, Node], k: int, state: Float[np.ndarray, "n1 n1"]) -> _Step:
     step = _Step([], [], [], [], [], [], [], [])
     for name, node in nodes.items():
-        if node.told_by is not None:
+        if node.informed_by is not None:
             raise _unfit("a sensor with feedback, whose power depends on the error")
         sensor, channel = at(node.sensor, k), at(node.channel, k)
         if not isinstance(sensor, LinearSensor):

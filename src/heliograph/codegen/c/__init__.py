@@ -1,0 +1,1 @@
+"""C99: a program as source text."""

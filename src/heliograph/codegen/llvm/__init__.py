@@ -1,0 +1,1 @@
+"""LLVM IR: a program as text, and as code of this machine."""

@@ -1,0 +1,273 @@
+"""The functions of a compiled program as text, and where its numbers lie in memory."""
+
+import math
+from collections.abc import Collection, Iterable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from heliograph.codegen.folding import DTYPES
+from heliograph.codegen.graph import Buffer, Guard, Loop, Node, Store, Unsupported
+from heliograph.codegen.llvm.operations import BITS
+from heliograph.codegen.llvm.slots import Slots, loops_of
+from heliograph.codegen.llvm.text import Writer
+from heliograph.codegen.llvm.transposed import mover
+from heliograph.codegen.lowering import Lowering
+from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.products import products_of
+from heliograph.codegen.program import Program, needed
+from heliograph.codegen.rules.loops import copied
+from heliograph.codegen.rules.random_bits import hash_function
+from heliograph.codegen.spread import varying
+from heliograph.codegen.summed import Summed, row_length
+from heliograph.codegen.vectors.elementary import functions
+
+LONGEST = 60_000  # operations: beyond, LLVM takes longer than XLA
+LINE = 64  # bytes: where vectors of any width may start
+
+
+class Code(NamedTuple):
+    """Text of the two functions, and what they are called with.
+
+    `pointers` are to memory of the inputs, the tables, the outputs and last to `shared` bytes that all runs share;
+    `scratch` bytes belong to a thread. `common` says which outputs all runs share. `operations` stand in the program,
+    and a block takes `work` of them, each turn of its loops counted.
+    """
+
+    blocks: str
+    once: str | None
+    tables: list[np.ndarray]
+    outputs: list[Buffer]
+    common: list[bool]
+    places: list[int]  # of common outputs in the shared memory
+    shared: int
+    scratch: int
+    operations: int
+    work: int
+
+
+def output_buffers(program: Program, last: Collection[int] = ()) -> list[Buffer]:
+    """Have a program store its results: each in a buffer of its own.
+
+    Those of these numbers `last`, after everything else is computed, so that they may lie where arguments did.
+    """
+    lowering = Lowering()
+    lowering.graph = program.graph
+    results: list[Buffer] = []
+    for number, value in enumerate(program.outputs):
+        nodes_only = number in last or not isinstance(value, InMemory)
+        stored = _filled(lowering, lowering.nodes(value)) if nodes_only else _stored(lowering, value, results)
+        results.append(stored.buffer)
+    return results
+
+
+def _stored(lowering: Lowering, value: InMemory, taken: list[Buffer]) -> InMemory:
+    """An array in memory as it is, where it is all of what the program filled; else copied."""
+    buffer = value.buffer
+    whole = not value.moves and value.offset == 0 and value.strides == contiguous(value.shape)
+    alone = buffer.kind == "scratch" and buffer.inside is None and buffer not in taken
+    if whole and alone and value.size == buffer.size:
+        buffer.shape = value.shape
+        return value
+    return _filled(lowering, lowering.nodes(value)) if value.size <= LONG else copied(lowering, value)
+
+
+def _filled(lowering: Lowering, nodes: np.ndarray) -> InMemory:
+    """Nodes in new memory, known ones too."""
+    flat: list[Node] = nodes.ravel().tolist()
+    buffer = Buffer("scratch", flat[0].type if flat else "f64", nodes.shape, lowering.graph.current)
+    for place, node in enumerate(flat):
+        lowering.graph.store(buffer, node, place, (), ())
+    return InMemory.whole(buffer)
+
+
+def written(
+    program: Program,
+    differing: Iterable[bool],
+    width: int,
+    fuse: bool,
+    alone: bool = False,
+    last: Collection[int] = (),
+    summed: Summed | None = None,
+) -> Code:
+    """The text of a program whose inputs differ between runs, or do not.
+
+    `alone`: one run, whose arrays are used in place; results of the numbers `last` may lie where arguments did.
+    `summed`: outputs that are summed over runs.
+
+    Raises:
+        Unsupported: an operation that has no text.
+    """
+    outputs = output_buffers(program, last)
+    lanes = [b for b, d in zip(program.inputs, differing, strict=True) if d or alone]
+    items = needed(outputs)
+    operations = sum(isinstance(x, Node) and x.op != "constant" for x in items)
+    if operations > LONGEST:
+        raise Unsupported(f"a program of {operations} operations, above {LONGEST}")
+    spread = varying(outputs, lanes)
+    if alone:
+        spread = items | set(program.inputs)
+    products = products_of(sorted_items(items)) if fuse else set()
+    tables = [x for x in items if isinstance(x, Buffer) and x.kind == "table"]
+    common = [b not in spread for b in outputs]
+    spread -= set(tables)
+    owners = {x.owner[0] for x in items if isinstance(x, Buffer)}
+    added = set() if summed is None else {b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in spread}
+    _check_sums(items, added)
+    scratch, in_scratch = _places(
+        [
+            b
+            for b in owners - added
+            if b in spread and b.kind != "table" and not (alone and (b in outputs or b in lanes))
+        ],
+        width,
+        0,
+    )
+    shared, in_shared = _places([b for b in owners if b not in spread and b.kind == "scratch"], 1, 0)
+    slots = Slots(shared)
+    pointers = [*program.inputs, *tables, *outputs]
+    differing_outputs = [b for b, c in zip(outputs, common, strict=True) if not c]
+    mine = needed(differing_outputs, lambda x: x in spread or isinstance(x, Loop | Guard | Store))
+    blocks = Writer(width, mine, products, spread, slots)
+    text = _blocks(blocks, program, pointers, lanes, outputs, in_scratch, in_shared, alone, summed)
+    text = _with_functions(text, blocks)
+    roots: list[Any] = [*slots.places, *(b for b in blocks.read if b.kind == "scratch")]
+    roots += [b for b, c in zip(outputs, common, strict=True) if c]
+    once = None
+    if roots:
+        writer = Writer(1, needed(roots), products, set(), slots)
+        once = _with_functions(_once(writer, program, pointers, in_shared), writer)
+    arrays = [np.ascontiguousarray(b.table, dtype=DTYPES[b.type]) for b in tables if b.table is not None]
+    places = [in_shared.get(b, 0) for b in outputs]
+    return Code(text, once, arrays, outputs, common, places, slots.size, scratch + LINE, operations, _work(mine))
+
+
+def _check_sums(items: Iterable[Any], outputs: Collection[Buffer]) -> None:
+    """Sums are written to alone: a number that is used again lies elsewhere too."""
+    read = {x.value[0].owner[0] for x in items if isinstance(x, Node) and x.op == "load"}
+    if any(b.inside is not None or b in read or b.type != "f64" for b in outputs):
+        raise Unsupported("a sum over runs of numbers that are used again")
+
+
+def sorted_items(items: Iterable[Any]) -> list[Any]:
+    """In one order, whatever that of the set."""
+    return sorted(items, key=lambda x: x.serial if isinstance(x, Node) else -1)
+
+
+def _work(items: Iterable[Any]) -> int:
+    """Operations of a block of runs; a loop that data end counts as one turn."""
+    return sum(math.prod(loop.length or 1 for loop in loops_of(x)) for x in items if isinstance(x, Node))
+
+
+def _places(buffers: Iterable[Buffer], width: int, start: int) -> tuple[int, dict[Buffer, int]]:
+    """Where buffers lie one after another, in bytes, and the end."""
+    places: dict[Buffer, int] = {}
+    for buffer in buffers:
+        places[buffer] = start
+        start += -(-buffer.size * width * BITS[buffer.type] // 8 // LINE) * LINE
+    return start, places
+
+
+HEAD = "(ptr %pointers, ptr %scratch, i64 %begin, i64 %end, i64 %runs)"
+
+
+def _blocks(
+    writer: Writer,
+    program: Program,
+    pointers: list[Buffer],
+    lanes: list[Buffer],
+    outputs: list[Buffer],
+    in_scratch: dict[Buffer, int],
+    in_shared: dict[Buffer, int],
+    alone: bool,
+    summed: Summed | None,
+) -> str:
+    """Blocks `begin` to `end` of W runs: inputs transposed, computed, outputs transposed back."""
+    names = _pointers(writer, pointers, in_shared)
+    for buffer, place in in_scratch.items():
+        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr %scratch, i64 {place}")
+    writer.line("%last = sub i64 %runs, 1")
+    writer.line("br label %block")
+    writer.start("block")
+    writer.line("%number = phi i64 [%begin, %entry], [%next, %done]")
+    writer.line(f"%first = mul i64 %number, {writer.width}")
+    movers = set()
+
+    def move(kind: str, buffer: Buffer) -> None:
+        bits = BITS[buffer.type]
+        movers.add((bits, kind == "take"))
+        pair = f"ptr {names[buffer]}, ptr {writer.bases[buffer]}"
+        writer.line(f"call void @{kind}{bits}({pair}, i64 {buffer.size}, i64 %first, i64 %last)")
+
+    taken = [] if alone else [b for b in lanes if b in in_scratch and b.size]
+    given = [] if alone else [b for b in outputs if b in in_scratch and b.size]
+    for buffer in taken:
+        move("take", buffer)
+    if summed is not None:
+        added = [b for b, s in zip(outputs, summed.outputs, strict=True) if s and b in writer.spread]
+        _add(writer, summed, names, program.inputs[summed.number], added)
+    writer.block(program.graph.top)
+    for buffer in given:
+        if buffer not in writer.sums:
+            move("give", buffer)
+    writer.line("br label %done")
+    writer.start("done")
+    writer.line("%next = add i64 %number, 1")
+    writer.line("%more = icmp slt i64 %next, %end")
+    writer.line("br i1 %more, label %block, label %exit")
+    writer.start("exit")
+    body = "\n".join(writer.lines)
+    texts = [mover(bits, writer.width, inwards) for bits, inwards in sorted(movers)]
+    return "\n".join([*texts, f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"])
+
+
+def _add(writer: Writer, summed: Summed, names: dict[Buffer, str], number: Buffer, outputs: list[Buffer]) -> None:
+    """Have the stores to some outputs add to sums over runs, from the batch of a block's first run on."""
+    width = writer.width
+    place = writer.add(f"getelementptr i32, ptr {names[number]}, i64 %first")
+    run = writer.add(f"load i32, ptr {place}, align 4")
+    batch = writer.add(f"zext i32 {writer.add(f'urem i32 {run}, {summed.batches}')} to i64")
+    count = writer.add("sub i64 %runs, %first")
+    first = writer.add(f"insertelement <{width} x i64> poison, i64 {count}, i64 0")
+    every = writer.add(
+        f"shufflevector <{width} x i64> {first}, <{width} x i64> poison, <{width} x i32> zeroinitializer"
+    )
+    numbers = ", ".join(f"i64 {lane}" for lane in range(width))
+    writer.counted = writer.add(f"icmp ult <{width} x i64> <{numbers}>, {every}")
+    for buffer in outputs:
+        writer.bases[buffer] = writer.add(f"getelementptr double, ptr {names[buffer]}, i64 {batch}")
+        writer.sums[buffer] = row_length(width, summed.batches)
+
+
+def _once(writer: Writer, program: Program, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> str:
+    """What all runs share."""
+    _pointers(writer, pointers, in_shared)
+    writer.block(program.graph.top)
+    body = "\n".join(writer.lines)
+    return f"define void @run{HEAD} {{\nentry:\n{body}\n  ret void\n}}\n"
+
+
+def _pointers(writer: Writer, pointers: list[Buffer], in_shared: dict[Buffer, int]) -> dict[Buffer, str]:
+    """Load the addresses of inputs, tables and outputs; the names of all, whose buffers start there unless moved."""
+    names: dict[Buffer, str] = {}
+    for number, buffer in enumerate([*pointers, None]):
+        place = writer.add(f"getelementptr ptr, ptr %pointers, i64 {number}")
+        name = writer.add(f"load ptr, ptr {place}, align 8")
+        if buffer is None:
+            writer.slots.base = name
+        else:
+            names[buffer] = writer.bases[buffer] = name
+    for buffer, start in in_shared.items():
+        writer.bases[buffer] = writer.add(f"getelementptr i8, ptr {writer.slots.base}, i64 {start}")
+    return names
+
+
+def _with_functions(text: str, writer: Writer) -> str:
+    """With the functions that it calls."""
+    called = writer.called - {"threefry"}
+    parts = [text]
+    if called:
+        parts.insert(0, functions(writer.width, called))
+    if "threefry" in writer.called:
+        parts.insert(0, hash_function(writer.width))
+    return "\n".join(parts)

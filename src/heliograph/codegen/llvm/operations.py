@@ -1,0 +1,140 @@
+"""The text of LLVM IR for each scalar operation, on vectors <W x T> of as many runs.
+
+Nothing is left to the compiler's judgement: a product and a sum are one fused operation only where the text says so,
+so that the bits of a result depend neither on the width nor on the level of optimisation.
+"""
+
+import struct
+from collections.abc import Callable
+
+from heliograph.codegen.graph import Node, Type, Unsupported
+from heliograph.codegen.vectors.elementary import FUNCTIONS, SCALAR
+
+LLVM = {"f64": "double", "bool": "i1", "i32": "i32", "i64": "i64", "u32": "i32", "u64": "i64"}
+BITS = {"f64": 64, "bool": 8, "i32": 32, "i64": 64, "u32": 32, "u64": 64}  # in memory
+FLOAT = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
+INTEGER = {"add": "add", "sub": "sub", "mul": "mul", "and": "and", "or": "or", "xor": "xor"}
+ORDER = {"eq": "eq", "ne": "ne", "lt": "lt", "le": "le", "gt": "gt", "ge": "ge"}
+UNARY = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "ceil": "ceil", "round_even": "roundeven"}
+CALLED = {*FUNCTIONS, *SCALAR, "threefry"}  # functions of their own, `hg_` before the name
+
+Emit = Callable[[str], str]  # the text of an operation -> the name of its result
+
+
+def vector(type: Type, width: int) -> str:
+    """<W x T>."""
+    return f"<{width} x {LLVM[type]}>"
+
+
+def literal(value: float | int | bool, type: Type) -> str:
+    """A known number, doubles by their bits."""
+    if type == "f64":
+        return "0x" + struct.pack(">d", float(value)).hex().upper()
+    if type == "bool":
+        return "true" if value else "false"
+    return str(int(value))
+
+
+def splat(value: float | int | bool, type: Type) -> str:
+    """A known number in all runs."""
+    return f"splat ({LLVM[type]} {literal(value, type)})"
+
+
+def operation(node: Node, names: list[str], width: int, emit: Emit) -> str:
+    """Emit what computes a node of its arguments' names; the name of the result."""
+    source: Type = node.args[0].type if node.args else node.type
+    local, kind = vector(source, width), f"v{width}{'f64' if source == 'f64' else LLVM[source]}"
+    op, result = node.op, vector(node.type, width)
+    if op == "select":
+        return emit(f"select {local} {names[0]}, {result} {names[1]}, {result} {names[2]}")
+    if op in ORDER:
+        return emit(f"{_comparison(op, source)} {local} {names[0]}, {names[1]}")
+    if op == "convert":
+        return _converted(source, node.type, names[0], width, emit)
+    if op == "bitcast":
+        return emit(f"bitcast {local} {names[0]} to {result}")
+    if op == "not":
+        return emit(f"xor {local} {names[0]}, {splat(True, 'bool') if source == 'bool' else splat(-1, source)}")
+    if op in CALLED:
+        typed = ", ".join(f"{vector(a.type, width)} {n}" for a, n in zip(node.args, names, strict=True))
+        return emit(f"call {result} @hg_{op}({typed})")
+    if source == "f64":
+        return _of_doubles(op, names, local, kind, width, emit)
+    return _of_integers(node, names, local, kind, emit)
+
+
+def _comparison(op: str, type: Type) -> str:
+    if type == "f64":
+        return "fcmp une" if op == "ne" else f"fcmp o{op}"
+    if op in ("eq", "ne"):
+        return f"icmp {op}"
+    return f"icmp {'u' if type in ('u32', 'u64', 'bool') else 's'}{op}"
+
+
+def _of_doubles(op: str, names: list[str], text: str, kind: str, width: int, emit: Emit) -> str:
+    first = f"{text} {names[0]}"
+    if op in FLOAT:
+        return emit(f"{FLOAT[op]} {first}, {names[1]}")
+    if op == "neg":
+        return emit(f"fneg {first}")
+    if op in UNARY:
+        return emit(f"call {text} @llvm.{UNARY[op]}.{kind}({first})")
+    if op in ("max", "min"):
+        return emit(f"call {text} @llvm.{op}imum.{kind}({first}, {text} {names[1]})")
+    if op == "is_finite":
+        size = emit(f"call {text} @llvm.fabs.{kind}({first})")
+        return emit(f"fcmp olt {text} {size}, {splat(float('inf'), 'f64')}")
+    if op == "sign":
+        item = emit(f"call {text} @llvm.copysign.{kind}({text} {splat(1.0, 'f64')}, {first})")
+        other = emit(f"fcmp one {first}, {splat(0.0, 'f64')}")
+        return emit(f"select <{width} x i1> {other}, {text} {item}, {first}")
+    if op == "rem":
+        return emit(f"frem {first}, {names[1]}")
+    raise Unsupported(op)
+
+
+def _of_integers(node: Node, names: list[str], text: str, kind: str, emit: Emit) -> str:
+    op, type, first = node.op, node.args[0].type, f"{text} {names[0]}"
+    if op in INTEGER:
+        return emit(f"{INTEGER[op]} {first}, {names[1]}")
+    if op == "neg":
+        return emit(f"sub {text} zeroinitializer, {names[0]}")
+    signed = type[0] == "i"
+    if op in ("max", "min"):
+        return emit(f"call {text} @llvm.{'s' if signed else 'u'}{op}.{kind}({first}, {text} {names[1]})")
+    if op == "abs" and signed:
+        return emit(f"call {text} @llvm.abs.{kind}({first}, i1 false)")
+    if op in ("div", "rem") and node.args[1].op == "constant" and node.args[1].value > 0:
+        return emit(f"{'s' if signed else 'u'}{op} {first}, {names[1]}")
+    if op in ("shift_left", "shift_right", "shift_right_signed") and node.args[1].op == "constant":
+        if not 0 <= node.args[1].value < BITS[type]:
+            raise Unsupported("a shift by more than all bits")
+        return emit(f"{ {'shift_left': 'shl', 'shift_right': 'lshr'}.get(op, 'ashr') } {first}, {names[1]}")
+    raise Unsupported(f"{op} of {type}")
+
+
+def _converted(source: Type, target: Type, name: str, width: int, emit: Emit) -> str:
+    local, result = vector(source, width), vector(target, width)
+    if source == target or LLVM[source] == LLVM[target]:
+        return name
+    if target == "f64":
+        return emit(f"{'sitofp' if source[0] == 'i' else 'uitofp'} {local} {name} to {result}")
+    if source == "f64":
+        how = "fptosi" if target[0] == "i" else "fptoui"
+        suffix = f"v{width}{LLVM[target]}.v{width}f64"
+        return emit(f"call {result} @llvm.{how}.sat.{suffix}({local} {name})")
+    if BITS[target] < BITS[source]:
+        return emit(f"trunc {local} {name} to {result}")
+    return emit(f"{'sext' if source[0] == 'i' else 'zext'} {local} {name} to {result}")
+
+
+def fused(node: Node, product: Node, names: list[str], width: int, emit: Emit) -> str:
+    """a b + c, c - a b or a b - c, rounded once; names of a, b, c."""
+    local = vector("f64", width)
+    a, b, c = names
+    if node.op == "sub":
+        if node.args[1] is product:
+            a = emit(f"fneg {local} {a}")
+        else:
+            c = emit(f"fneg {local} {c}")
+    return emit(f"call {local} @llvm.fma.v{width}f64({local} {a}, {local} {b}, {local} {c})")

@@ -1,0 +1,66 @@
+"""Memory of numbers that all runs share, between the function that computes them and the one that uses them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from heliograph.codegen.graph import Loop, Node
+from heliograph.codegen.llvm.operations import BITS, vector
+
+if TYPE_CHECKING:
+    from heliograph.codegen.llvm.text import Writer
+
+
+class Slots:
+    """Where numbers that all runs share, which one function computes and the other uses, lie in memory.
+
+    One in a loop has a place for each turn.
+    """
+
+    def __init__(self, size: int):
+        self.size = size  # bytes
+        self.places: dict[Node, int] = {}
+        self.base = ""
+
+    def place(self, node: Node) -> int:
+        """Where a number lies; it is given a place when it is first used."""
+        if node not in self.places:
+            self.places[node] = self.size
+            turns = 1
+            for loop in loops_of(node):
+                turns *= loop.length or 1
+            self.size += 8 * turns
+        return self.places[node]
+
+    def load(self, writer: Writer, node: Node) -> str:
+        """A shared number, a scalar."""
+        address = self._address(writer, node)
+        loaded = writer.add(f"load i{BITS[node.type]}, ptr {address}, align 8")
+        if node.type == "bool":
+            return writer.add(f"trunc i8 {loaded} to i1")
+        return writer.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
+
+    def store(self, writer: Writer, node: Node, name: str) -> None:
+        """Write it where it is computed, if the other function uses it."""
+        if node not in self.places or writer.width != 1:
+            return
+        local = vector(node.type, 1)
+        address = self._address(writer, node)
+        if node.type == "bool":
+            name, local = writer.add(f"zext {local} {name} to <1 x i8>"), "<1 x i8>"
+        writer.line(f"store {local} {name}, ptr {address}, align 1")
+
+    def _address(self, writer: Writer, node: Node) -> str:
+        place, stride, index = self.place(node), 8, ""
+        for loop in loops_of(node):
+            assert loop.counter is not None
+            part = writer.add(f"mul i64 {writer.scalar(loop.counter)}, {stride}")
+            index = writer.add(f"add i64 {index}, {part}") if index else part
+            stride *= loop.length or 1
+        start = writer.add(f"getelementptr i8, ptr {self.base}, i64 {place}")
+        return writer.add(f"getelementptr i8, ptr {start}, i64 {index}") if index else start
+
+
+def loops_of(node: Node) -> list[Loop]:
+    """The loops around a node, innermost first."""
+    return [b.owner for b in node.block.inwards() if isinstance(b.owner, Loop)]

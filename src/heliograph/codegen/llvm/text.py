@@ -1,0 +1,271 @@
+"""A program as text of LLVM IR: one function that computes blocks of W runs, and one for what all runs share."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from heliograph.codegen.graph import Block, Buffer, Check, Guard, Loop, Node, Store, Type
+from heliograph.codegen.llvm.operations import BITS, CALLED, LLVM, fused, operation, splat, vector
+from heliograph.codegen.llvm.slots import Slots
+from heliograph.codegen.products import fusable
+
+Scope = dict[Any, str]
+
+
+class Writer:
+    """Writes the operations of a program that are `mine`: of those that differ between runs, or of those that do not.
+
+    `bases` holds each buffer's address, `spread` which buffers have a number for each lane. Of a number that all runs
+    share, and another function computed, `shared` says where it lies.
+    """
+
+    def __init__(self, width: int, mine: set[Any], products: set[Node], spread: set[Any], slots: Slots):
+        self.width, self.mine, self.products, self.spread, self.slots = width, mine, products, spread, slots
+        self.lines: list[str] = []
+        self.scopes: list[Scope] = [{}]
+        self.label = "entry"
+        self.count = 0
+        self.called: set[str] = set()
+        self.read: set[Buffer] = set()  # buffers that all runs share
+        self.bases: dict[Buffer, str] = {}
+        self.sums: dict[Buffer, int] = {}  # outputs that are added to sums over runs, and the length of their rows
+        self.counted = ""  # the lanes that count
+
+    def add(self, text: str) -> str:
+        """A fresh name for what the text computes."""
+        self.count += 1
+        self.lines.append(f"  %t{self.count} = {text}")
+        return f"%t{self.count}"
+
+    def line(self, text: str) -> None:
+        """A line that has no result."""
+        self.lines.append(f"  {text}")
+
+    def start(self, label: str) -> None:
+        """Begin a basic block."""
+        self.lines.append(f"{label}:")
+        self.label = label
+
+    def block(self, block: Block) -> None:
+        """Operations and statements in their order."""
+        for item in block.items:
+            if item not in self.mine:
+                continue
+            if isinstance(item, Node):
+                if item not in self.products:
+                    self._keep(item, self._compute(item))
+            elif isinstance(item, Store):
+                self._store(item)
+            elif isinstance(item, Loop):
+                self._loop(item)
+            elif isinstance(item, Guard):
+                self._guard(item)
+
+    def _keep(self, node: Node, name: str) -> None:
+        self.scopes[-1][node] = name
+        self.slots.store(self, node, name)
+
+    def _compute(self, node: Node) -> str:
+        if node.op == "load":
+            return self._load(node)
+        product = fusable(node, self.products)
+        if product is not None:
+            rest = node.args[0] if node.args[1] is product else node.args[1]
+            names = [self.operand(n) for n in (*product.args, rest)]
+            return fused(node, product, names, self.width, self.add)
+        if node.op in CALLED:
+            self.called.add(node.op)
+        return operation(node, [self.operand(a) for a in node.args], self.width, self.add)
+
+    def operand(self, node: Node) -> str:
+        """The name of a number in all lanes."""
+        if node.op == "constant":
+            return splat(node.value, node.type)
+        for scope in reversed(self.scopes):
+            if node in scope:
+                return scope[node]
+        if node in self.mine and node.op != "counter":
+            raise RuntimeError(f"{node} is used before it is computed")
+        name = self.scopes[-1][node] = self._everywhere(self.scalar(node), node.type)
+        return name
+
+    def scalar(self, node: Node) -> str:
+        """The name of a number that all lanes share."""
+        if node.op == "constant":
+            return str(int(node.value))
+        key = ("scalar", node)
+        for scope in reversed(self.scopes):
+            if key in scope:
+                return scope[key]
+        if node in self.mine or any(node in scope for scope in self.scopes):
+            name = self.add(f"extractelement {vector(node.type, self.width)} {self.operand(node)}, i64 0")
+        elif node.op == "load" and all(self._is_scalar(i) for i in node.args):
+            name = self._scalar_load(node)
+        else:
+            name = self.slots.load(self, node)
+        self.scopes[-1][key] = name
+        return name
+
+    def _is_scalar(self, node: Node) -> bool:
+        return node.op in ("constant", "counter") or node not in self.mine or self.width == 1
+
+    def _everywhere(self, name: str, type: Type) -> str:
+        local = vector(type, self.width)
+        first = self.add(f"insertelement {local} poison, {LLVM[type]} {name}, i64 0")
+        return self.add(f"shufflevector {local} {first}, {local} poison, <{self.width} x i32> zeroinitializer")
+
+    def _address(self, buffer: Buffer, offset: int, strides: Sequence[int], indices: Sequence[Node], lanes: int) -> str:
+        """Of the entry offset + sum strides * indices, each of so many lanes."""
+        owner, start = buffer.owner
+        element = f"[{lanes} x i{BITS[owner.type]}]"
+        base = self.bases[owner]
+        if indices:
+            key = ("row", owner, tuple(strides), tuple(indices))
+            result = next((scope[key] for scope in reversed(self.scopes) if key in scope), None)
+            if result is None:
+                place = ""
+                for stride, index in zip(strides, indices, strict=True):
+                    part = self.add(f"mul i64 {self.scalar(index)}, {stride}")
+                    place = self.add(f"add i64 {place}, {part}") if place else part
+                result = self.scopes[-1][key] = self.add(f"getelementptr {element}, ptr {base}, i64 {place}")
+            base = result
+        return self.add(f"getelementptr {element}, ptr {base}, i64 {offset + start}")
+
+    def _load(self, node: Node) -> str:
+        buffer, offset, strides = node.value
+        if not all(self._is_scalar(i) for i in node.args):
+            return self._gather(node)
+        if buffer.owner[0] not in self.spread:
+            return self._everywhere(self._scalar_load(node), node.type)
+        address = self._address(buffer, offset, strides, node.args, self.width)
+        if node.type == "bool":
+            bytes_ = self.add(f"load <{self.width} x i8>, ptr {address}, align 1")
+            return self.add(f"icmp ne <{self.width} x i8> {bytes_}, zeroinitializer")
+        return self.add(f"load {vector(node.type, self.width)}, ptr {address}, align {BITS[node.type] // 8}")
+
+    def _scalar_load(self, node: Node) -> str:
+        buffer, offset, strides = node.value
+        self.read.add(buffer.owner[0])
+        address = self._address(buffer, offset, strides, node.args, 1)
+        loaded = self.add(f"load i{BITS[node.type]}, ptr {address}, align {BITS[node.type] // 8}")
+        if node.type == "bool":
+            return self.add(f"icmp ne i8 {loaded}, 0")
+        return self.add(f"bitcast i64 {loaded} to double") if node.type == "f64" else loaded
+
+    def _gather(self, node: Node) -> str:
+        """Each lane from a place of its own."""
+        buffer, offset, strides = node.value
+        owner, start = buffer.owner
+        lanes = self.width if owner in self.spread else 1
+        if lanes == 1:
+            self.read.add(owner)
+        wide, local = f"<{self.width} x i64>", vector(node.type, self.width)
+        place = f"splat (i64 {(offset + start) * lanes})"
+        for stride, index in zip(strides, node.args, strict=True):
+            part = self.add(f"mul {wide} {self.operand(index)}, splat (i64 {stride * lanes})")
+            place = self.add(f"add {wide} {part}, {place}")
+        if lanes > 1:
+            numbers = ", ".join(f"i64 {lane}" for lane in range(self.width))
+            place = self.add(f"add {wide} {place}, <{numbers}>")
+        bits, values = BITS[node.type], f"<{self.width} x i{BITS[node.type]}>"
+        loaded = "poison"
+        for lane in range(self.width):
+            at = self.add(f"extractelement {wide} {place}, i64 {lane}")
+            address = self.add(f"getelementptr i{bits}, ptr {self.bases[owner]}, i64 {at}")
+            item = self.add(f"load i{bits}, ptr {address}, align {bits // 8}")
+            loaded = self.add(f"insertelement {values} {loaded}, i{bits} {item}, i64 {lane}")
+        if node.type == "bool":
+            return self.add(f"icmp ne {values} {loaded}, zeroinitializer")
+        return self.add(f"bitcast {values} {loaded} to {local}") if node.type == "f64" else loaded
+
+    def _store(self, store: Store) -> None:
+        name, local = self.operand(store.node), vector(store.node.type, self.width)
+        lanes = self.sums.get(store.buffer, self.width)
+        address = self._address(store.buffer, store.offset, store.strides, store.indices, lanes)
+        if store.buffer in self.sums:
+            before = self.add(f"load {local}, ptr {address}, align 8")
+            counted = self.add(f"select <{self.width} x i1> {self.counted}, {local} {name}, {local} zeroinitializer")
+            name = self.add(f"fadd {local} {before}, {counted}")
+        if store.node.type == "bool":
+            name, local = self.add(f"zext {local} {name} to <{self.width} x i8>"), f"<{self.width} x i8>"
+        self.line(f"store {local} {name}, ptr {address}, align {BITS[store.node.type] // 8}")
+
+    def _loop(self, loop: Loop) -> None:
+        """Parameters are what the turn before made of them; a counted loop takes one turn at least."""
+        self.count += 1
+        name, before = f"loop{self.count}", self.label
+        pairs = zip(loop.parameters, loop.results, strict=True)
+        moving = [k for k, pair in enumerate(pairs) if any(n in self.mine for n in pair)]
+        starts = [self.operand(loop.initial[k]) for k in moving]
+        self.line(f"br label %{name}")
+        self.start(name)
+        place = len(self.lines)
+        self.scopes.append({})
+        counter = f"%{name}.counter"
+        if loop.counter is not None:
+            self.scopes[-1]["scalar", loop.counter] = counter
+        for k in moving:
+            self._keep(loop.parameters[k], f"%{name}.p{k}")
+        if loop.counter is not None and loop.counter in self.mine:
+            self._keep(loop.counter, self.operand(loop.counter))
+        if loop.condition is None:
+            self.block(loop.body)
+            following = [self.operand(loop.following[k]) for k in moving]
+            self.line(f"br label %{name}.latch")
+            self.start(f"{name}.latch")
+            self.line(f"{counter}.next = add i64 {counter}, 1")
+            self.line(f"%{name}.more = icmp slt i64 {counter}.next, {loop.length}")
+            self.line(f"br i1 %{name}.more, label %{name}, label %{name}.end")
+            results = following
+        else:
+            following, results = self._turns(loop, name, moving)
+        phis = [f"  {counter} = phi i64 [0, %{before}], [{counter}.next, %{self.label}]"] if loop.length else []
+        for k, start, after in zip(moving, starts, following, strict=True):
+            local = vector(loop.parameters[k].type, self.width)
+            phis.append(f"  %{name}.p{k} = phi {local} [{start}, %{before}], [{after}, %{self.label}]")
+        self.lines[place:place] = phis
+        self.start(f"{name}.end")
+        self.scopes.pop()
+        for k, result in zip(moving, results, strict=True):
+            self._keep(loop.results[k], result)
+
+    def _turns(self, loop: Loop, name: str, moving: list[int]) -> tuple[list[str], list[str]]:
+        """A loop that ends when no lane's condition holds."""
+        check = next(i for i, item in enumerate(loop.body.items) if isinstance(item, Check) and item.loop is loop)
+        head, tail = Block(loop.body.parent), Block(loop.body.parent)
+        head.items, tail.items = loop.body.items[:check], loop.body.items[check + 1 :]
+        self.block(head)
+        assert loop.condition is not None
+        some = self._any(loop.condition)
+        self.line(f"br i1 {some}, label %{name}.turn, label %{name}.end")
+        self.start(f"{name}.turn")
+        self.block(tail)
+        following = [self.operand(loop.following[k]) for k in moving]
+        self.line(f"br label %{name}.latch")
+        self.start(f"{name}.latch")
+        self.line(f"br label %{name}")
+        return following, [f"%{name}.p{k}" for k in moving]
+
+    def _any(self, condition: Node) -> str:
+        """Whether a condition holds in some lane."""
+        local = f"<{self.width} x i1>"
+        bits = self.add(f"bitcast {local} {self.operand(condition)} to i{self.width}")
+        return self.add(f"icmp ne i{self.width} {bits}, 0")
+
+    def _guard(self, guard: Guard) -> None:
+        self.count += 1
+        name = f"guard{self.count}"
+        some = self._any(guard.condition)
+        before = self.label
+        self.line(f"br i1 {some}, label %{name}, label %{name}.end")
+        self.start(name)
+        self.scopes.append({})
+        self.block(guard.body)
+        used = [k for k, r in enumerate(guard.results) if r in self.mine]
+        values = [self.operand(guard.values[k]) for k in used]
+        after = self.label
+        self.line(f"br label %{name}.end")
+        self.start(f"{name}.end")
+        self.scopes.pop()
+        for k, value in zip(used, values, strict=True):
+            local = vector(guard.results[k].type, self.width)
+            self._keep(guard.results[k], self.add(f"phi {local} [{value}, %{after}], [zeroinitializer, %{before}]"))

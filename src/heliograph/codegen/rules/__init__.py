@@ -1,0 +1,1 @@
+"""Rules: how each operation of JAX becomes scalar operations."""

@@ -1,0 +1,133 @@
+"""Rules of operations that act on each entry alone."""
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from heliograph.codegen.graph import Graph, Key, Node, Type, Unsupported
+from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+
+# Operation of JAX -> the graph's.
+ELEMENTWISE = {name: name for name in (
+    "add", "sub", "mul", "div", "rem", "neg", "abs", "sqrt", "exp", "log", "log1p", "expm1", "sin", "cos", "tan",
+    "tanh", "atan2", "pow", "floor", "ceil", "sign", "is_finite", "max", "min", "eq", "ne", "lt", "le", "gt", "ge",
+    "and", "or", "xor", "not", "shift_left", "erf", "erf_inv", "erfc", "lgamma", "digamma", "asin", "acos", "atan",
+    "sinh", "cosh", "asinh", "acosh", "atanh", "cbrt", "exp2", "nextafter",
+)} | {"add_any": "add", "shift_right_logical": "shift_right"}  # fmt: skip
+
+
+def broadcast(arrays: Sequence[np.ndarray], shape: tuple[int, ...]) -> list[list[Any]]:
+    """The entries of several arrays in row-major order, axes of length 1 repeated."""
+    return [(a if a.shape == shape else np.broadcast_to(a, shape)).ravel().tolist() for a in arrays]
+
+
+def _elementwise(op: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        shape, type, node = result_shape(equation), result_type(equation), lowering.graph.node
+        return [array_of([node(op, type, *item) for item in zip(*broadcast(inputs, shape), strict=True)], shape)]
+
+    return rule
+
+
+def _composed(function: Any) -> Rule:
+    """A rule of one entry: function(graph, type, parameters, *entries)."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        shape, type, graph = result_shape(equation), result_type(equation), lowering.graph
+        entries = zip(*broadcast(inputs, shape), strict=True)
+        return [array_of([function(graph, type, equation.params, *entry) for entry in entries], shape)]
+
+    return rule
+
+
+def select(graph: Graph, condition: Node, a: Any, b: Any) -> Any:
+    """a where the condition holds, else b: of numbers or of keys."""
+    if isinstance(a, Key):
+        return Key(select(graph, condition, a.first, b.first), select(graph, condition, a.second, b.second))
+    return graph.node("select", a.type, condition, a, b)
+
+
+def _select_n(graph: Graph, type: Type, params: Any, which: Node, *cases: Any) -> Any:
+    if len(cases) == 2 and which.type == "bool":
+        return select(graph, which, cases[1], cases[0])
+    chosen = cases[-1]
+    for number, case in reversed(list(enumerate(cases[:-1]))):
+        chosen = select(graph, graph.node("eq", "bool", which, graph.constant(number, which.type)), case, chosen)
+    return chosen
+
+
+def _key_select(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    shape = result_shape(equation)
+    entries = zip(*broadcast(inputs, shape), strict=True)
+    return [array_of([_select_n(lowering.graph, "u32", None, *entry) for entry in entries], shape)]
+
+
+def _power(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    """x^n by squarings."""
+    exponent = abs(params["y"])
+    factors, square = [], x
+    while exponent:
+        if exponent % 2:
+            factors.append(square)
+        exponent //= 2
+        if exponent:
+            square = graph.node("mul", type, square, square)
+    item = graph.constant(1.0 if type == "f64" else 1, type)
+    product = reduce(lambda a, b: graph.node("mul", type, a, b), factors, item)
+    return product if params["y"] >= 0 else graph.node("div", type, item, product)
+
+
+def _clamp(graph: Graph, type: Type, params: Any, low: Node, x: Node, high: Node) -> Node:
+    return graph.node("min", type, graph.node("max", type, low, x), high)
+
+
+def _convert(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("convert", type, x)
+
+
+def _bitcast(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    if type[1:] != x.type[1:]:
+        raise Unsupported(f"bitcast from {x.type} to {type}")
+    return x if x.type == type else graph.node("bitcast", type, x)
+
+
+def _logistic(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    item = graph.constant(1.0, type)
+    power = graph.node("exp", type, graph.node("neg", type, x))
+    return graph.node("div", type, item, graph.node("add", type, item, power))
+
+
+def _root_reciprocal(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("div", type, graph.constant(1.0, type), graph.node("sqrt", type, x))
+
+
+def _square(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    return graph.node("mul", type, x, x)
+
+
+def _round(graph: Graph, type: Type, params: Any, x: Node) -> Node:
+    if int(params["rounding_method"]) != 1:
+        raise Unsupported("rounding of halves away from zero")
+    return graph.node("round_even", type, x)
+
+
+def _as_it_is(lowering: Lowering, equation: JaxprEqn, inputs: list[Any]) -> list[Any]:
+    return inputs
+
+
+def _shift_right_arithmetic(graph: Graph, type: Type, params: Any, x: Node, by: Node) -> Node:
+    return graph.node("shift_right" if type[0] == "u" else "shift_right_signed", type, x, by)
+
+
+RULES |= {name: _elementwise(op) for name, op in ELEMENTWISE.items()}
+RULES |= {
+    "select_n": _key_select, "integer_pow": _composed(_power), "square": _composed(_square),
+    "rsqrt": _composed(_root_reciprocal), "logistic": _composed(_logistic), "clamp": _composed(_clamp),
+    "convert_element_type": _composed(_convert), "bitcast_convert_type": _composed(_bitcast),
+    "round": _composed(_round), "shift_right_arithmetic": _composed(_shift_right_arithmetic),
+}  # fmt: skip
+PASSED_ON = ("copy", "copy_p", "stop_gradient", "optimization_barrier")
+RULES |= dict.fromkeys(PASSED_ON, _as_it_is)

@@ -1,0 +1,162 @@
+"""Rules of gathering and scattering: which entry goes where is known, or a choice that data make among few."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+from jax.lax import GatherScatterMode
+
+from heliograph.codegen.graph import Unsupported
+from heliograph.codegen.lowering import RULES, Lowering, Rule, known_integers
+from heliograph.codegen.memory import contiguous
+from heliograph.codegen.rules.loops import in_memory
+from heliograph.codegen.rules.shapes import FEW, chosen
+from heliograph.codegen.rules.views import clamped
+
+
+def _places(
+    shape: tuple[int, ...],
+    sizes: Sequence[int],
+    indices: np.ndarray,
+    index_map: Sequence[int],
+    batching: Sequence[tuple[int, int]],
+    removed: Sequence[int],
+    clips: bool,
+) -> np.ndarray:
+    """For each index (...) and entry of its window (...), the place in an array of this shape; -1 beyond its edges.
+
+    `index_map`: the array's axis for each number of an index; `batching`: pairs of an axis of the array and one of the
+    indices that go together; `removed`: axes that a window does not have.
+    """
+    starts = np.zeros((*indices.shape[:-1], len(shape)), dtype=np.int64)
+    for k, axis in enumerate(index_map):
+        starts[..., axis] = indices[..., k]
+    for axis, along in batching:
+        count = np.arange(indices.shape[along])
+        starts[..., axis] = count.reshape([-1 if a == along else 1 for a in range(indices.ndim - 1)])
+    last = np.array(shape) - np.array(sizes)
+    inside = np.all((starts >= 0) & (starts <= last), axis=-1)
+    strides = np.array(contiguous(shape), dtype=np.int64)
+    base = np.sum(np.clip(starts, 0, last) * strides, axis=-1)
+    if not clips:
+        base = np.where(inside, base, -1 - int(np.prod(shape, dtype=np.int64)))
+    left = [a for a in range(len(shape)) if a not in removed]
+    offsets = np.zeros([sizes[a] for a in left], dtype=np.int64)
+    for place, a in enumerate(left):
+        offsets += strides[a] * np.arange(sizes[a]).reshape([-1 if p == place else 1 for p in range(len(left))])
+    places = np.reshape(base, (*base.shape, *[1] * offsets.ndim)) + offsets
+    return np.maximum(places, -1)
+
+
+def _clips(mode: Any) -> bool:
+    return mode in (GatherScatterMode.CLIP, GatherScatterMode.PROMISE_IN_BOUNDS)
+
+
+def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    x, indices = inputs
+    at = known_integers(indices)
+    if at is None:
+        return [_by_cases(lowering, equation, x, indices)]
+    params, numbers = equation.params, equation.params["dimension_numbers"]
+    batching = list(zip(numbers.operand_batching_dims, numbers.start_indices_batching_dims, strict=True))
+    removed = (*numbers.collapsed_slice_dims, *numbers.operand_batching_dims)
+    places = _places(
+        x.shape, params["slice_sizes"], at, numbers.start_index_map, batching, removed, _clips(params["mode"])
+    )
+    first = at.ndim - 1
+    places = np.moveaxis(places, range(first, places.ndim), numbers.offset_dims)
+    flat = x.ravel()
+    if np.any(places < 0):
+        missing, aval = params["fill_value"], equation.outvars[0].aval
+        dtype = aval.dtype  # type: ignore[attr-defined]
+        missing = (np.nan if dtype.kind == "f" else np.iinfo(dtype).min) if missing is None else missing
+        flat = np.append(flat, lowering.known(np.full((), missing, dtype)))
+    result: np.ndarray = flat[places]
+    return [result]
+
+
+def _by_cases(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """With indices (..., axis) that data decide: what is gathered for each number that those of an axis may be.
+
+    Each entry is chosen by the index of its own row alone, so that rows of many nodes are no more cases than one.
+    """
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    place = next(j for j in range(indices.shape[-1]) if known_integers(indices[..., j]) is None)
+    axis = numbers.start_index_map[place]
+    last = x.shape[axis] - sizes[axis]
+    if last >= FEW:
+        return _from_memory(lowering, equation, x, indices, place)
+    cases = [_gather(lowering, equation, [x, _with(lowering, indices, place, n)])[0] for n in range(last + 1)]
+    result = cases[-1].copy()
+    for entry in np.ndindex(*result.shape):
+        which = indices[(*_row(entry, numbers), place)]
+        if which.op != "constant":
+            here = [np.array(case[entry], dtype=object) for case in cases]
+            result[entry] = chosen(lowering.graph, which, here)[()]
+    return result
+
+
+def _from_memory(lowering: Lowering, equation: JaxprEqn, x: np.ndarray, indices: np.ndarray, place: int) -> np.ndarray:
+    """The same of many places: each entry is loaded from as far on as its row's index says."""
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axis = numbers.start_index_map[place]
+    begin = _with(lowering, indices, place, 0)
+    if known_integers(begin) is None:
+        raise Unsupported("gather at two places that data decide")
+    starts = _gather(lowering, equation, [np.arange(x.size, dtype=object).reshape(x.shape), begin])[0]
+    buffer, stride = in_memory(lowering, x).buffer, contiguous(x.shape)[axis]
+    result = np.empty(starts.shape, dtype=object)
+    for entry in np.ndindex(*result.shape):
+        first = clamped(lowering, indices[(*_row(entry, numbers), place)], x.shape[axis] - sizes[axis])
+        if isinstance(first, int):
+            result[entry] = x.ravel()[starts[entry]]
+        else:
+            result[entry] = lowering.graph.load(buffer, int(starts[entry]), (stride,), (first,))
+    return result
+
+
+def _with(lowering: Lowering, indices: np.ndarray, place: int, number: int) -> np.ndarray:
+    """Indices with a number in place of each that data decide."""
+    result = indices.copy()
+    for row in np.ndindex(*indices.shape[:-1]):
+        node = indices[(*row, place)]
+        if node.op != "constant":
+            result[(*row, place)] = lowering.graph.constant(number, node.type)
+    return result
+
+
+def _row(entry: tuple[int, ...], numbers: Any) -> tuple[int, ...]:
+    """Of which row of indices an entry of the result is gathered."""
+    return tuple(i for axis, i in enumerate(entry) if axis not in numbers.offset_dims)
+
+
+def _scatter(op: str | None) -> Rule:
+    """Updates one after another; what lies beyond the edges is dropped."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        x, indices, updates = inputs
+        at = known_integers(indices)
+        if at is None:
+            raise Unsupported(f"{equation.primitive.name} at places that data decide")
+        params, numbers = equation.params, equation.params["dimension_numbers"]
+        removed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
+        windows = iter(updates.shape[a] for a in numbers.update_window_dims)
+        sizes = [1 if a in removed else next(windows) for a in range(x.ndim)]
+        batching = list(zip(numbers.operand_batching_dims, numbers.scatter_indices_batching_dims, strict=True))
+        index_map = numbers.scatter_dims_to_operand_dims
+        places = _places(x.shape, sizes, at, index_map, batching, removed, _clips(params["mode"]))
+        places = np.moveaxis(places, range(at.ndim - 1, places.ndim), numbers.update_window_dims)
+        result = x.ravel().copy()
+        for place, new in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if place >= 0:
+                result[place] = new if op is None else lowering.graph.node(op, new.type, result[place], new)
+        return [result.reshape(x.shape)]
+
+    return rule
+
+
+RULES |= {
+    "gather": _gather, "scatter": _scatter(None), "scatter-add": _scatter("add"), "scatter_add": _scatter("add"),
+    "scatter-mul": _scatter("mul"), "scatter_mul": _scatter("mul"),
+}  # fmt: skip

@@ -1,0 +1,190 @@
+"""Loops: short ones are written out; long ones stay loops, with what they stack in memory, and so do `while` loops."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from heliograph.codegen.graph import Block, Buffer, Check, Key, Loop, Node, Type, Unsupported
+from heliograph.codegen.lowering import IN_MEMORY, Lowering, Value, array_of
+from heliograph.codegen.memory import InMemory
+from heliograph.codegen.rules.elementwise import select
+
+WRITTEN_OUT = 2000  # numbers computed by all turns of a loop that is written out
+KERNEL = 300  # numbers that a kernel over runs is taken to compute
+Turn = Callable[[Node, list[np.ndarray]], tuple[Sequence[np.ndarray], Sequence[np.ndarray]]]
+
+
+def repeated(
+    lowering: Lowering, length: int, carry: Sequence[np.ndarray], turn: Turn, backwards: bool = False
+) -> tuple[list[np.ndarray], list[InMemory]]:
+    """What is carried after `length` turns, and what each of them stacks, in memory.
+
+    turn(place, carry) -> what is carried on, what is stacked at that place; places run from 0, or down to 0.
+    """
+    graph, outer = lowering.graph, lowering.graph.current
+    body = Block(outer)
+    loop = Loop(body, length, [n for x in carry for n in words(x)])
+    loop.counter = counter = graph.fresh("counter", "i64", (), body, loop)
+    loop.parameters = [
+        graph.fresh("parameter", n.type, (), body, (loop, place)) for place, n in enumerate(loop.initial)
+    ]
+    graph.current = body
+    place = graph.node("sub", "i64", graph.constant(length - 1, "i64"), counter) if backwards else counter
+    following, stacked = turn(place, _like(carry, loop.parameters))
+    loop.following = [n for x in following for n in words(x)]
+    memory = [_stack(lowering, length, x, counter, backwards, outer) for x in stacked]
+    graph.current = outer
+    outer.items.append(loop)
+    loop.results = [graph.fresh("result", n.type, (), outer, (loop, place)) for place, n in enumerate(loop.initial)]
+    return _like(carry, loop.results), memory
+
+
+def _stack(
+    lowering: Lowering, length: int, value: np.ndarray, counter: Node, backwards: bool, outer: Block
+) -> InMemory:
+    """Store this turn's numbers of an array as one row of memory."""
+    flat = _numbers(value)
+    type: Type = flat[0].type if flat else "f64"
+    buffer = Buffer("scratch", type, (length, *value.shape), outer)
+    size = len(flat)
+    start, stride = ((length - 1) * size, -size) if backwards else (0, size)
+    for entry, node in enumerate(flat):
+        lowering.graph.store(buffer, node, start + entry, (stride,), (counter,))
+    return InMemory.whole(buffer)
+
+
+def words(value: np.ndarray) -> list[Node]:
+    """The nodes of an array in row-major order, a key as its two words."""
+    flat: list[Any] = value.ravel().tolist()
+    return [n for x in flat for n in ((x.first, x.second) if isinstance(x, Key) else (x,))]
+
+
+def _numbers(value: np.ndarray) -> list[Node]:
+    flat: list[Node] = value.ravel().tolist()
+    if any(isinstance(x, Key) for x in flat):
+        raise Unsupported("keys of random numbers in memory")
+    return flat
+
+
+def _like(arrays: Sequence[np.ndarray], nodes: Sequence[Node]) -> list[np.ndarray]:
+    """Nodes in arrays of the same shapes, keys again."""
+    rest = iter(nodes)
+    return [
+        array_of(
+            [Key(next(rest), next(rest)) if isinstance(x, Key) else next(rest) for x in a.ravel().tolist()], a.shape
+        )
+        for a in arrays
+    ]
+
+
+def _scan(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    params = equation.params
+    consts, carried, length = params["num_consts"], params["num_carry"], params["length"]
+    fixed, rows = inputs[:consts], inputs[consts + carried :]
+    carry = [lowering.nodes(x) for x in inputs[consts : consts + carried]]
+    if length * size_of(params["jaxpr"].jaxpr) <= WRITTEN_OUT or length <= 1:
+        return _written_out(lowering, equation, fixed, carry, rows)
+    jaxpr = params["jaxpr"].jaxpr
+    same = [jaxpr.outvars[k] is jaxpr.invars[consts + k] for k in range(carried)]
+    rows = [in_memory(lowering, x) for x in rows]
+
+    def turn(place: Node, moving: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        items = iter(moving)
+        now = [x if s else next(items) for x, s in zip(carry, same, strict=True)]
+        results = lowering.inline(params["jaxpr"], [*fixed, *now, *(x.row(place) for x in rows)])
+        nodes = [lowering.nodes(x) for x in results]
+        return [x for x, s in zip(nodes[:carried], same, strict=True) if not s], nodes[carried:]
+
+    moving, stacked = repeated(
+        lowering, length, [x for x, s in zip(carry, same, strict=True) if not s], turn, params["reverse"]
+    )
+    after = iter(moving)
+    return [*(x if s else next(after) for x, s in zip(carry, same, strict=True)), *stacked]
+
+
+def _written_out(
+    lowering: Lowering, equation: JaxprEqn, fixed: list[Value], carry: list[Value], rows: list[Value]
+) -> list[Value]:
+    params = equation.params
+    stacked: list[list[Value]] = []
+    turns = range(params["length"])
+    for turn in reversed(turns) if params["reverse"] else turns:
+        items = [x.row(turn) if isinstance(x, InMemory) else _entry(x, turn) for x in rows]
+        results = lowering.inline(params["jaxpr"], [*fixed, *carry, *items])
+        carry = results[: len(carry)]
+        stacked.append([lowering.nodes(x) for x in results[len(carry) :]])
+    if not stacked:
+        avals: list[Any] = [v.aval for v in equation.outvars[len(carry) :]]
+        return [*carry, *(np.empty(a.shape, dtype=object) for a in avals)]
+    if params["reverse"]:
+        stacked.reverse()
+    return [*carry, *(np.stack(item) for item in zip(*stacked, strict=True))]
+
+
+def _entry(x: np.ndarray, turn: int) -> np.ndarray:
+    """x[turn] as an array, of one axis too."""
+    return x[turn : turn + 1].reshape(x.shape[1:])
+
+
+def in_memory(lowering: Lowering, value: Value) -> InMemory:
+    """An array of nodes, stored."""
+    if isinstance(value, InMemory):
+        return value
+    flat = _numbers(value)
+    graph = lowering.graph
+    type: Type = flat[0].type if flat else "f64"
+    if all(n.op == "constant" for n in flat):
+        table = np.array([n.value for n in flat]).reshape(value.shape)
+        return InMemory.whole(Buffer("table", type, value.shape, graph.top, table))
+    buffer = Buffer("scratch", type, value.shape, graph.current)
+    for place, node in enumerate(flat):
+        graph.store(buffer, node, place, (), ())
+    return InMemory.whole(buffer)
+
+
+def copied(lowering: Lowering, x: InMemory) -> InMemory:
+    """The same long array in new memory of its own."""
+    return repeated(lowering, x.shape[0], [], lambda place, _: ([], [lowering.nodes(x.row(place))]))[1][0]
+
+
+def _while(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Turns as long as some run's condition holds; a run whose condition does not keeps its numbers."""
+    params, graph, outer = equation.params, lowering.graph, lowering.graph.current
+    conditional, fixed = params["cond_nconsts"], params["body_nconsts"]
+    of_condition, of_body = inputs[:conditional], inputs[conditional : conditional + fixed]
+    carry = [lowering.nodes(x) for x in inputs[conditional + fixed :]]
+    body = Block(outer)
+    loop = Loop(body, None, [n for x in carry for n in words(x)])
+    loop.parameters = [graph.fresh("parameter", n.type, (), body, (loop, k)) for k, n in enumerate(loop.initial)]
+    graph.current = body
+    now = _like(carry, loop.parameters)
+    loop.condition = active = lowering.scalar(lowering.inline(params["cond_jaxpr"], [*of_condition, *now])[0])
+    body.items.append(Check(loop))
+    results = [lowering.nodes(x) for x in lowering.inline(params["body_jaxpr"], [*of_body, *now])]
+    moved = [n for x in results for n in words(x)]
+    loop.following = [select(graph, active, new, old) for new, old in zip(moved, loop.parameters, strict=True)]
+    graph.current = outer
+    outer.items.append(loop)
+    loop.results = [graph.fresh("result", n.type, (), outer, (loop, k)) for k, n in enumerate(loop.initial)]
+    return _like(carry, loop.results)
+
+
+def size_of(jaxpr: Any) -> int:
+    """Numbers that a traced program computes, about."""
+    total = 0
+    for equation in jaxpr.eqns:
+        inner = [size_of(getattr(p, "jaxpr", p)) for p in _programs(equation.params)]
+        turns = equation.params["length"] if equation.primitive.name == "scan" else 1
+        inner += [KERNEL] if equation.primitive.name == "runs_last" else []
+        total += turns * sum(inner) + sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
+    return total
+
+
+def _programs(params: dict[str, Any]) -> list[Any]:
+    values = [x for p in params.values() for x in (p if isinstance(p, tuple) else (p,))]
+    return [x for x in values if hasattr(x, "eqns") or hasattr(x, "jaxpr")]
+
+
+IN_MEMORY |= {"scan": _scan, "while": _while}

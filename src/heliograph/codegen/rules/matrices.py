@@ -1,0 +1,151 @@
+"""Rules of sums, products and factors: written out, entry by entry."""
+
+from collections.abc import Sequence
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from heliograph.codegen.graph import Graph, Node, Type, Unsupported
+from heliograph.codegen.lowering import RULES, Lowering, Rule, array_of, result_shape, result_type
+
+
+def total(graph: Graph, op: str, type: Type, nodes: Sequence[Node], empty: float) -> Node:
+    """Nodes joined one by one; `empty` where there are none."""
+    if not nodes:
+        return graph.constant(empty, type)
+    return reduce(lambda a, b: graph.node(op, type, a, b), nodes)
+
+
+def _reduction(op: str, empty: float) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        axes, shape, type = equation.params["axes"], result_shape(equation), result_type(equation)
+        x = np.moveaxis(inputs[0], axes, range(-len(axes), 0)).reshape(int(np.prod(shape, dtype=int)), -1)
+        return [array_of([total(lowering.graph, op, type, row, empty) for row in x.tolist()], shape)]
+
+    return rule
+
+
+def _cumulative(op: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        axis, type = equation.params["axis"], result_type(equation)
+        x = np.moveaxis(inputs[0], axis, 0)
+        x = (x[::-1] if equation.params["reverse"] else x).reshape(len(x), -1)
+        rows = [x[0].tolist()]
+        for row in x[1:].tolist():
+            rows.append([lowering.graph.node(op, type, a, b) for a, b in zip(rows[-1], row, strict=True)])
+        result = array_of([n for row in rows for n in row], np.moveaxis(inputs[0], axis, 0).shape)
+        return [np.moveaxis(result[::-1] if equation.params["reverse"] else result, 0, axis)]
+
+    return rule
+
+
+def _arg(op: str) -> Rule:
+    """The first place of the greatest or least entry; of NaN, as in JAX, the first NaN."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        graph, type = lowering.graph, result_type(equation)
+        x = np.moveaxis(inputs[0], equation.params["axes"][0], -1).reshape(
+            -1, inputs[0].shape[equation.params["axes"][0]]
+        )
+        results = []
+        for row in x.tolist():
+            best, place = row[0], graph.constant(0, type)
+            for number, entry in enumerate(row[1:], 1):
+                known = graph.node("eq", "bool", best, best)
+                beyond = graph.node(op, "bool", entry, best)
+                is_nan = graph.node("ne", "bool", entry, entry)
+                better = graph.node("and", "bool", known, graph.node("or", "bool", beyond, is_nan))
+                best = graph.node("select", entry.type, better, entry, best)
+                place = graph.node("select", type, better, graph.constant(number, type), place)
+            results.append(place)
+        return [array_of(results, result_shape(equation))]
+
+    return rule
+
+
+def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+    """Sums of products over the contracted axes, batch axes first."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    a, b = (_batched(x, c, d) for x, c, d in ((inputs[0], left, left_batch), (inputs[1], right, right_batch)))
+    graph, type, inner = lowering.graph, result_type(equation), a.shape[2]
+    nodes = []
+    for rows, columns in zip(a.tolist(), b.tolist(), strict=True):
+        for row in rows:
+            for column in columns:
+                products = [graph.node("mul", type, row[k], column[k]) for k in range(inner)]
+                nodes.append(total(graph, "add", type, products, 0.0 if type == "f64" else 0))
+    return [array_of(nodes, result_shape(equation))]
+
+
+def _batched(x: np.ndarray, contracted: Sequence[int], batch: Sequence[int]) -> np.ndarray:
+    """As (batch, free, contracted)."""
+    free = [d for d in range(x.ndim) if d not in contracted and d not in batch]
+    sizes = [int(np.prod([x.shape[d] for d in axes], dtype=int)) for axes in (batch, free, contracted)]
+    return np.transpose(x, [*batch, *free, *contracted]).reshape(sizes)
+
+
+def _each_matrix(function: Any) -> Rule:
+    """A rule of the last two axes: function(graph, parameters, *matrices) for each of the axes before them."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[np.ndarray]) -> list[np.ndarray]:
+        flat = [x.reshape(-1, *x.shape[-2:]) for x in inputs]
+        items = [function(lowering.graph, equation.params, *matrices) for matrices in zip(*flat, strict=True)]
+        return [np.stack(items).reshape(result_shape(equation))]
+
+    return rule
+
+
+def _cholesky(graph: Graph, params: Any, a: np.ndarray) -> np.ndarray:
+    """Column by column, one reciprocal each; NaN for a matrix that is not positive definite."""
+    n = len(a)
+    zero = graph.constant(0.0, "f64")
+    lower = np.full((n, n), zero, dtype=object)
+    for j in range(n):
+        rests = []
+        for i in range(j, n):
+            rest = a[i, j]
+            for k in range(j):
+                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", lower[i, k], lower[j, k]))
+            rests.append(rest)
+        root = graph.node("sqrt", "f64", rests[0])
+        positive = graph.node("gt", "bool", rests[0], zero)
+        root = graph.node("select", "f64", positive, root, graph.constant(float("nan"), "f64"))
+        scale = graph.node("div", "f64", graph.constant(1.0, "f64"), root)
+        lower[j, j] = root
+        for i in range(j + 1, n):
+            lower[i, j] = graph.node("mul", "f64", rests[i - j], scale)
+    return lower
+
+
+def _triangular_solve(graph: Graph, params: Any, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """X with A X = B (or X A = B, or with A'), one reciprocal for each diagonal entry."""
+    if params["conjugate_a"]:
+        raise Unsupported("complex numbers")
+    lower, transposed = params["lower"], params["transpose_a"]
+    if not params["left_side"]:  # A' X' = B'
+        transposed, b = not transposed, b.T
+    if transposed:
+        a, lower = a.T, not lower
+    n, item = len(a), graph.constant(1.0, "f64")
+    scales = [item if params["unit_diagonal"] else graph.node("div", "f64", item, a[i, i]) for i in range(n)]
+    x = np.empty(b.shape, dtype=object)
+    order = list(range(n)) if lower else list(range(n))[::-1]
+    for place, i in enumerate(order):
+        for column in range(b.shape[1]):
+            rest = b[i, column]
+            for j in order[:place]:
+                rest = graph.node("sub", "f64", rest, graph.node("mul", "f64", a[i, j], x[j, column]))
+            x[i, column] = graph.node("mul", "f64", rest, scales[i])
+    return x if params["left_side"] else x.T
+
+
+RULES |= {
+    "reduce_sum": _reduction("add", 0), "reduce_prod": _reduction("mul", 1), "reduce_or": _reduction("or", 0),
+    "reduce_and": _reduction("and", 1), "reduce_xor": _reduction("xor", 0),
+    "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
+    "cumsum": _cumulative("add"), "cumprod": _cumulative("mul"), "cummax": _cumulative("max"),
+    "cummin": _cumulative("min"), "argmax": _arg("gt"), "argmin": _arg("lt"), "dot_general": _dot_general,
+    "cholesky": _each_matrix(_cholesky), "triangular_solve": _each_matrix(_triangular_solve),
+}  # fmt: skip

@@ -1,0 +1,146 @@
+"""Rules of arithmetic on long arrays in memory: a loop over their rows, one row after another.
+
+What `vmap` made of a step, for each row of a record at once, becomes that step in a loop again.
+"""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from heliograph.codegen.graph import Node, Unsupported
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, like, result_shape
+from heliograph.codegen.memory import LARGE, LONG, InMemory
+from heliograph.codegen.rules.elementwise import ELEMENTWISE
+from heliograph.codegen.rules.loops import in_memory, repeated
+
+OF_ENTRIES = (
+    *ELEMENTWISE, "select_n", "integer_pow", "square", "rsqrt", "logistic", "clamp", "convert_element_type",
+    "bitcast_convert_type", "round",
+)  # fmt: skip
+
+
+def is_long(inputs: list[Value]) -> bool:
+    """Whether nodes for all entries of some argument would be too many; of tables alone they are numbers."""
+    longest = max((x.size for x in inputs if isinstance(x, InMemory)), default=0)
+    known = all(x.buffer.kind == "table" and not x.moves for x in inputs if isinstance(x, InMemory))
+    return longest > LARGE or (longest > LONG and not (known and _are_known(inputs)))
+
+
+def _are_known(inputs: list[Value]) -> bool:
+    arrays = (x for x in inputs if not isinstance(x, InMemory))
+    return all(isinstance(n, Node) and n.op == "constant" for x in arrays for n in x.ravel().tolist())
+
+
+def _of_entries(name: str) -> Rule:
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        shape = result_shape(equation)
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(x) for x in inputs]))
+        items = [x if len(x.shape) < len(shape) or x.shape[0] == 1 else in_memory(lowering, x) for x in inputs]
+        item = like_row(equation)
+
+        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            rows = [row_of(lowering, x, place, len(shape)) for x in items]
+            return [], list(lowering.equation(item, rows))
+
+        return list(repeated(lowering, shape[0], [], lambda p, c: as_nodes(lowering, turn(p, c)))[1])
+
+    return rule
+
+
+def as_nodes(lowering: Lowering, results: tuple[list[Value], list[Value]]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Carried and stacked arrays, loaded."""
+    carried, stacked = results
+    return [lowering.nodes(x) for x in carried], [lowering.nodes(x) for x in stacked]
+
+
+def row_of(lowering: Lowering, x: Value, place: Node, ndim: int) -> Value:
+    """The part of an argument that a row of the result needs."""
+    if isinstance(x, InMemory):
+        return x.row(place)
+    return x[:1].reshape(x.shape[1:]) if x.ndim == ndim and ndim else x
+
+
+def like_row(equation: JaxprEqn, **params: Any) -> Any:
+    """The same operation of one row."""
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    rows = [SimpleNamespace(aval=like(a.shape[1:], a.dtype)) for a in avals]
+    return SimpleNamespace(
+        primitive=equation.primitive, params=equation.params | params, outvars=rows, invars=equation.invars,
+        source_info=equation.source_info,
+    )  # fmt: skip
+
+
+def _dot_general(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Of products for each row: the first batch axis; of a product with all rows: the first free axis of the left."""
+    (left, right), (left_batch, right_batch) = equation.params["dimension_numbers"]
+    if not is_long(inputs):
+        return list(RULES["dot_general"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    a, b = (in_memory(lowering, x) for x in inputs)
+    if left_batch:
+        a, b = _first(a, left_batch[0]), _first(b, right_batch[0])
+        numbers = (
+            (_without(left, left_batch[0]), _without(right, right_batch[0])),
+            (_without(left_batch[1:], left_batch[0]), _without(right_batch[1:], right_batch[0])),
+        )
+    else:
+        free = next((d for d in range(a.ndim) if d not in left), None)
+        if free is None:
+            raise Unsupported("a sum of products over a long array")
+        a, numbers = _first(a, free), ((_without(left, free), right), ((), ()))
+    item = like_row(equation, dimension_numbers=numbers)
+
+    def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        rows = [a.row(place), b.row(place) if left_batch else b]
+        return as_nodes(lowering, ([], list(lowering.equation(item, rows))))
+
+    return list(repeated(lowering, a.shape[0], [], turn)[1])
+
+
+def _first(x: InMemory, axis: int) -> InMemory:
+    """With an axis moved to the front."""
+    order = [axis, *(a for a in range(x.ndim) if a != axis)]
+    return x.view([x.shape[a] for a in order], [x.strides[a] for a in order])
+
+
+def _without(axes: tuple[int, ...], removed: int) -> tuple[int, ...]:
+    return tuple(a - (a > removed) for a in axes)
+
+
+def _reduction(name: str) -> Rule:
+    """Along the first axis one row after another; along others within each row."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        x, axes = inputs[0], equation.params["axes"]
+        if not is_long(inputs):
+            return list(RULES[name](lowering, equation, [lowering.nodes(x)]))
+        inner = tuple(a - 1 for a in axes if a)
+        shape = tuple(n for a, n in enumerate(x.shape[1:]) if a not in inner)
+        dtype = equation.outvars[0].aval.dtype  # type: ignore[attr-defined]
+        row = SimpleNamespace(aval=like(shape, dtype))
+        params = equation.params | {"axes": inner}
+        item: Any = SimpleNamespace(params=params, outvars=[row])
+        pair: Any = SimpleNamespace(params=equation.params | {"axes": (0,)}, outvars=[row])
+
+        def reduced(place: Node) -> np.ndarray:
+            return np.asarray(RULES[name](lowering, item, [lowering.nodes(x.row(place))])[0])
+
+        if 0 not in axes:
+            return list(repeated(lowering, x.shape[0], [], lambda place, _: ([], [reduced(place)]))[1])
+        nothing = np.empty((0, *shape), dtype=object)
+        start = RULES[name](lowering, pair, [nothing])[0]
+
+        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [np.asarray(RULES[name](lowering, pair, [np.stack([carry[0], reduced(place)])])[0])], []
+
+        return list(repeated(lowering, x.shape[0], [start], turn)[0])
+
+    return rule
+
+
+REDUCTIONS = ("reduce_sum", "reduce_prod", "reduce_or", "reduce_and", "reduce_max", "reduce_min")
+IN_MEMORY |= {name: _of_entries(name) for name in OF_ENTRIES}
+IN_MEMORY |= {name: _reduction(name) for name in REDUCTIONS}
+IN_MEMORY |= {"dot_general": _dot_general}

@@ -1,0 +1,179 @@
+"""Rules of operations on arrays in memory that give another view of the same memory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from heliograph.codegen.graph import Buffer, Key, Node
+from heliograph.codegen.lowering import IN_MEMORY, RULES, Lowering, Rule, Value, result_shape
+from heliograph.codegen.memory import LONG, InMemory, contiguous
+from heliograph.codegen.rules.elementwise import PASSED_ON
+from heliograph.codegen.rules.loops import copied, in_memory, repeated
+from heliograph.codegen.rules.shapes import FEW
+
+View = Callable[[InMemory, Any, tuple[int, ...]], InMemory | None]
+
+
+def _viewed(name: str, view: View) -> Rule:
+    """A rule of one array: its view, or where there is none the rearranged nodes."""
+
+    def rule(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        result = view(inputs[0], equation.params, result_shape(equation))
+        return [result] if result is not None else list(RULES[name](lowering, equation, [lowering.nodes(inputs[0])]))
+
+    return rule
+
+
+def _slice(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    steps = params["strides"] or (1,) * x.ndim
+    offset = sum(s * first for s, first in zip(x.strides, params["start_indices"], strict=True))
+    return x.view(shape, [s * step for s, step in zip(x.strides, steps, strict=True)], offset)
+
+
+def _reverse(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    axes = params["dimensions"]
+    offset = sum(x.strides[a] * (x.shape[a] - 1) for a in axes)
+    return x.view(shape, [-s if a in axes else s for a, s in enumerate(x.strides)], offset)
+
+
+def _transpose(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    return x.view(shape, [x.strides[a] for a in params["permutation"]])
+
+
+def _reshape(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory | None:
+    return x.reshaped(shape)
+
+
+def _broadcast(x: InMemory, params: Any, shape: tuple[int, ...]) -> InMemory:
+    strides = [0] * len(shape)
+    for size, stride, axis in zip(x.shape, x.strides, params["broadcast_dimensions"], strict=True):
+        strides[axis] = 0 if size == 1 else stride
+    return x.view(shape, strides)
+
+
+def _split(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    x, axis, parts, start = inputs[0], equation.params["axis"], [], 0
+    for size in equation.params["sizes"]:
+        shape = [size if a == axis else n for a, n in enumerate(x.shape)]
+        parts.append(x.view(shape, x.strides, x.strides[axis] * start))
+        start += size
+    return parts
+
+
+def _dynamic_slice(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    sizes = equation.params["slice_sizes"]
+    x = indexable(lowering, inputs[0], inputs[1:])
+    if not isinstance(x, InMemory):
+        return list(RULES["dynamic_slice"](lowering, equation, [lowering.nodes(i) for i in inputs]))
+    offset, moves = 0, []
+    for axis, start in enumerate(inputs[1:]):
+        first = clamped(lowering, lowering.scalar(start), x.shape[axis] - sizes[axis])
+        if isinstance(first, int):
+            offset += x.strides[axis] * first
+        else:
+            moves.append((x.strides[axis], first))
+    return [x.view(sizes, x.strides, offset, *moves)]
+
+
+def indexable(lowering: Lowering, x: Value, places: list[Value]) -> Value:
+    """A table, or an array of many entries, in memory, where data or the number of a turn say which are taken."""
+    nodes = [n for p in places for n in lowering.nodes(p).ravel().tolist()]
+    if isinstance(x, InMemory) or all(n.op == "constant" for n in nodes):
+        return x
+    flat = x.ravel().tolist()
+    if any(isinstance(n, Key) for n in flat) or not (len(flat) > FEW or all(n.op == "constant" for n in flat)):
+        return x
+    return in_memory(lowering, x)
+
+
+def clamped(lowering: Lowering, start: Node, last: int) -> Node | int:
+    """A place between 0 and the last one."""
+    if start.op == "constant" or last == 0:
+        return min(max(int(start.value or 0), 0), last)
+    graph = lowering.graph
+    wide = graph.node("convert", "i64", start)
+    return graph.node(
+        "min", "i64", graph.node("max", "i64", wide, graph.constant(0, "i64")), graph.constant(last, "i64")
+    )
+
+
+def _gather(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """x[i, j, ...] of whole rows: a view. Other gathers take the nodes."""
+    numbers, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    axes, indices = numbers.start_index_map, lowering.nodes(inputs[1])
+    x = indexable(lowering, inputs[0], [indices])
+    if not isinstance(x, InMemory) or indices.size != len(axes) or numbers.operand_batching_dims:
+        return list(RULES["gather"](lowering, equation, [lowering.nodes(i) for i in inputs]))
+    offset, moves = 0, []
+    for axis, start in zip(axes, indices.ravel().tolist(), strict=True):
+        first = clamped(lowering, start, x.shape[axis] - sizes[axis])
+        if isinstance(first, int):
+            offset += x.strides[axis] * first
+        else:
+            moves.append((x.strides[axis], first))
+    left = [a for a in range(x.ndim) if a not in numbers.collapsed_slice_dims]
+    view = x.view([sizes[a] for a in left], [x.strides[a] for a in left], offset, *moves)
+    return [view.view(result_shape(equation), _matched(view, result_shape(equation)))]
+
+
+def _matched(view: InMemory, shape: tuple[int, ...]) -> list[int]:
+    """Strides of the same entries where axes of length 1 were added."""
+    rest = [s for n, s in zip(view.shape, view.strides, strict=True) if n != 1]
+    items = iter(rest)
+    return [next(items) if n != 1 else 0 for n in shape]
+
+
+def _concatenate(lowering: Lowering, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """Along the first axis into new memory, along another one row after another."""
+    shape, axis = result_shape(equation), equation.params["dimension"]
+    if int(np.prod(shape, dtype=int)) <= LONG or not any(isinstance(x, InMemory) for x in inputs):
+        return list(RULES["concatenate"](lowering, equation, [lowering.nodes(x) for x in inputs]))
+    if axis != 0:
+        parts = [in_memory(lowering, x) for x in inputs]
+
+        def turn(place: Node, carry: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+            return [], [np.concatenate([lowering.nodes(x.row(place)) for x in parts], axis=axis - 1)]
+
+        return list(repeated(lowering, shape[0], [], turn)[1])
+    return [joined(lowering, inputs, shape)]
+
+
+def joined(lowering: Lowering, parts: list[Value], shape: tuple[int, ...]) -> InMemory:
+    """Arrays one after another as one array in memory: one that fills its own memory is written there at once."""
+    graph = lowering.graph
+    type = next(x for x in parts if isinstance(x, InMemory)).type
+    buffer, start = Buffer("scratch", type, shape, graph.current), 0
+    for x in parts:
+        if isinstance(x, InMemory) and _is_alone(x, graph.current):
+            buffer.take_in(x.buffer, start)
+        else:
+            _copy(lowering, x, buffer, start)
+        start += x.size
+    return InMemory.whole(buffer)
+
+
+def _is_alone(x: InMemory, block: Any) -> bool:
+    """Whether an array is all of a buffer that the program fills in this block and that lies nowhere else yet."""
+    buffer = x.buffer
+    whole = not x.moves and x.offset == 0 and x.size == buffer.size and x.strides == contiguous(x.shape)
+    return whole and buffer.kind == "scratch" and buffer.inside is None and buffer.block is block
+
+
+def _copy(lowering: Lowering, x: Value, buffer: Buffer, start: int) -> None:
+    graph = lowering.graph
+    if x.size <= LONG or not isinstance(x, InMemory):
+        for place, node in enumerate(lowering.nodes(x).ravel().tolist()):
+            graph.store(buffer, node, start + place, (), ())
+    else:
+        buffer.take_in(copied(lowering, x).buffer, start)
+
+
+VIEWS: dict[str, View] = {
+    "slice": _slice, "rev": _reverse, "transpose": _transpose, "reshape": _reshape, "squeeze": _reshape,
+    "expand_dims": _reshape, "broadcast_in_dim": _broadcast,
+}  # fmt: skip
+IN_MEMORY |= {name: _viewed(name, view) for name, view in VIEWS.items()}
+IN_MEMORY |= {"split": _split, "dynamic_slice": _dynamic_slice, "gather": _gather, "concatenate": _concatenate}
+IN_MEMORY |= {name: RULES[name] for name in PASSED_ON}

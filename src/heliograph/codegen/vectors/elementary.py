@@ -1,0 +1,71 @@
+"""Elementary functions of vectors of doubles as text of LLVM IR, each one straight line of operations.
+
+LLVM's own intrinsics call the scalar library once for each number of a vector; these compute all numbers of a vector
+at once. Each is within 2 units of rounding of the true value over its whole range, with NaN, infinities, zeros of both
+signs and denormal numbers as IEEE 754 and JAX have them. The square root and the absolute value need no function.
+
+Source: the reductions and minimax polynomials of Sun's fdlibm, https://www.netlib.org/fdlibm (exp's is a Taylor series
+of one degree more than needed).
+"""
+
+from collections.abc import Callable, Iterable
+
+from heliograph.codegen.vectors import error_function as error
+from heliograph.codegen.vectors import exponential as exponential
+from heliograph.codegen.vectors import trigonometry as trigonometry
+from heliograph.codegen.vectors.formulas import Vector, function
+
+FUNCTIONS: dict[str, tuple[Callable[..., Vector], int]] = {
+    "exp": (exponential.exp, 1),
+    "exp2": (exponential.exp2, 1),
+    "expm1": (exponential.expm1, 1),
+    "log": (exponential.log, 1),
+    "log1p": (exponential.log1p, 1),
+    "tanh": (exponential.tanh, 1),
+    "logistic": (exponential.logistic, 1),
+    "sin": (trigonometry.sin, 1),
+    "cos": (trigonometry.cos, 1),
+    "tan": (trigonometry.tan, 1),
+    "atan": (trigonometry.atan, 1),
+    "atan2": (trigonometry.atan2, 2),
+    "asin": (trigonometry.asin, 1),
+    "acos": (trigonometry.acos, 1),
+    "erf": (error.erf, 1),
+    "erfc": (error.erfc, 1),
+    "erf_inv": (error.erf_inv, 1),
+}
+ATTRIBUTES = "attributes #9 = { noinline nounwind }\n"
+
+# Called for each number of a vector: seldom used, or hard to get right.
+SCALAR = {"pow": 2, "sinh": 1, "cosh": 1, "asinh": 1, "acosh": 1, "atanh": 1, "cbrt": 1, "lgamma": 1}
+
+
+def functions(width: int, names: Iterable[str]) -> str:
+    """The text of `define internal <W x double> @hg_NAME(<W x double> ...)` for each name, with what it declares.
+
+    `width` is W; names are those of `FUNCTIONS` and `SCALAR`. Two texts in one module may declare the same intrinsics,
+    which LLVM takes as one.
+    """
+    texts, declared = [], set()
+    for name in sorted(set(names)):
+        text, needs = function(name, width, *FUNCTIONS[name]) if name in FUNCTIONS else _by_number(name, width)
+        texts.append(text)
+        declared |= needs
+    return "\n".join([*sorted(declared), *texts, ATTRIBUTES])
+
+
+def _by_number(name: str, width: int) -> tuple[str, set[str]]:
+    """A function that calls the scalar library for each number."""
+    double, count = f"<{width} x double>", SCALAR[name]
+    lines, total = [], "poison"
+    for lane in range(width):
+        for i in range(count):
+            lines.append(f"%a{lane}_{i} = extractelement {double} %x{i}, i64 {lane}")
+        args = ", ".join(f"double %a{lane}_{i}" for i in range(count))
+        lines.append(f"%b{lane} = call double @{name}({args})")
+        lines.append(f"%r{lane} = insertelement {double} {total}, double %b{lane}, i64 {lane}")
+        total = f"%r{lane}"
+    signature = ", ".join(f"{double} %x{i}" for i in range(count))
+    body = "".join(f"  {line}\n" for line in lines)
+    text = f"define internal {double} @hg_{name}({signature}) #9 {{\n{body}  ret {double} {total}\n}}\n"
+    return text, {f"declare double @{name}({', '.join(['double'] * count)})"}

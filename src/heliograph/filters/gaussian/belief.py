@@ -1,0 +1,73 @@
+"""What filters share whose state is a mean and a covariance: where it begins, how it moves, what it says."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, predicts
+from heliograph.filters.gaussian.transform import AbstractTransform, Transformed, linear_transform
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.numerics.angle import wrapped
+from heliograph.numerics.check import array, covariance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+class Belief(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the state given the data so far."""
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+
+
+class AbstractBeliefFilter(AbstractFilter):
+    """A filter whose state is a `Belief`, predicted by a transform, or exactly where the plant is linear."""
+
+    plant: AnyPlant
+    transform: AbstractTransform
+    initial_mean: Array
+    initial_covariance: Array
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Belief:
+        """The prior."""
+        return Belief(jnp.asarray(self.initial_mean), jnp.asarray(self.initial_covariance))
+
+    @predicts
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """Mean and covariance of f(x, u) + w."""
+        return Belief(*predicted(at(self.plant, k), self.transform, state, jnp.asarray(u))[:2])
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
+
+
+def predicted(plant: AbstractPlant, transform: AbstractTransform, state: Belief, u: jax.Array) -> Transformed:
+    """Mean and covariance of f(x, u) + w, and Cov(x, f(x, u))."""
+    if isinstance(plant, LinearPlant):
+        moved = linear_transform(plant.matrix, plant.transition(state.mean, u), state.covariance)
+    else:
+        moved = transform.apply(plant.moves(u, state.mean), *state)
+    return Transformed(moved.mean + plant.noise_mean(), moved.covariance + plant.noise_covariance(u), moved.cross)
+
+
+def prior_of(
+    plant: AbstractPlant, initial_mean: ArrayLike | None, initial_covariance: ArrayLike | None
+) -> tuple[Array, Array, bool]:
+    """The plant's initial mean and covariance where no others are given, and whether any were."""
+    n = len(plant.states)
+    mean = plant.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
+    spread = plant.initial_covariance
+    if initial_covariance is not None:
+        spread = covariance("filter's initial covariance", initial_covariance, n)
+    return mean, spread, initial_mean is not None or initial_covariance is not None

@@ -1,0 +1,246 @@
+"""Linear, extended and cubature filters with a factored covariance: the form for single precision."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.factors import (
+    Columns,
+    Factors,
+    columns_of,
+    decorrelated,
+    factors_of,
+    gram_schmidt,
+    joined,
+    measured,
+    reciprocal,
+    sum_of,
+)
+from heliograph.filters.gaussian.gain_spread import gain_spread
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.gaussian.transform import Cubature, Function, Linearization
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.linear import LinearFilter
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AbstractPlant, AnyPlant, LinearPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor
+from heliograph.numerics.angle import Angles, continued, nearest, wrapped
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.random_affine.noise import AbstractNoise
+
+
+class Moments(NamedTuple):
+    """A mean (n,) and the factors of its covariance."""
+
+    mean: Float[jax.Array, " n"]
+    factors: Factors
+
+
+class FactoredBelief(NamedTuple):
+    """The estimate, and the state's own moments before any data where the gain's spread acts on these (else none)."""
+
+    estimate: Moments
+    before_data: Moments | None
+
+
+class Image(NamedTuple):
+    """f(x) of x = m + L xi, Cov xi = diag(d): its mean, its slopes in xi (rows, n), and what is not linear in xi."""
+
+    mean: jax.Array
+    slopes: jax.Array
+    curvature: list[Columns]
+
+
+class FactoredFilter(AbstractFilter):
+    """The same filter as one of `GaussianFilter` or `LinearFilter`, its covariance carried as L D L'.
+
+    With y = H x + e and z = G y + n, M = E[G], K_r the operators of the gain's spread, the noise of z given x is the
+    sum of squares of M (e, R) and of K_r (y, 1): its factors turn z into components with uncorrelated noises, which are
+    used one after another. No covariance is the difference of others. Of a cubature rule, the odd part of f at
+    m +- sqrt(n) L_j is linear in xi, and the even part is one more noise: so f needs no other update than H x.
+
+    Equal to the base in exact arithmetic, but for what that adds for its rounding. Claim: the base's.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    mean_gain: Array | OverTime
+    offset: Array | OverTime
+    spread: Array | OverTime
+    initial_mean: Array
+    initial_covariance: Array
+    cubature: bool = eqx.field(static=True)
+    from_prior: bool = eqx.field(static=True)  # the spread acts on the state's moments before data
+    random_gain: bool = eqx.field(static=True)
+    angles: Angles = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> FactoredBelief:
+        """The prior."""
+        root = columns_of(np.asarray(self.initial_covariance))
+        start = Moments(jnp.asarray(self.initial_mean), factors_of(joined([root])))
+        return FactoredBelief(start, start if self.from_prior else None)
+
+    @predicts
+    def predict(self, state: FactoredBelief, u: ArrayLike = (), k: Step = 0) -> FactoredBelief:
+        """Mean and factors of f(x, u) + w."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        before_data = None if state.before_data is None else self._moved(plant, state.before_data, u)
+        return FactoredBelief(self._moved(plant, state.estimate, u), before_data)
+
+    @corrects
+    def correct(self, state: FactoredBelief, z: ArrayLike, k: Step = 0) -> tuple[FactoredBelief, Innovation]:
+        """Use the components of z that arrived."""
+        mean_gain, offset, spread = (at(part, k) for part in (self.mean_gain, self.offset, self.spread))
+        sensor, (mean, factors) = at(self.sensor, k), state.estimate
+        signal = self._signal(sensor, state.estimate)
+        # The noise of z given the state: what is not linear, the sensor's, and the spread of the gain.
+        of_signal = [*signal.curvature, columns_of(_known(sensor.noise.covariance))]
+        noise = [Columns(mean_gain @ part.matrix, part.weights) for part in of_signal]
+        noise += self._spread(spread, sensor, state, signal, of_signal)
+        expected = mean_gain @ signal.mean + offset
+        z = nearest(jnp.asarray(z), expected, self.angles)
+        present = ~jnp.isnan(z)
+        rows = jnp.concatenate([mean_gain @ signal.slopes, jnp.where(present, z - expected, 0.0)[:, None]], axis=1)
+        rows = jnp.where(present[:, None], rows, 0.0)
+        masked = joined(noise)
+        lower, variances = gram_schmidt(masked._replace(matrix=jnp.where(present[:, None], masked.matrix, 0.0)))
+        rows = decorrelated(lower, rows)
+        after = _used(mean, factors, rows, jnp.where(present, variances, 1.0))
+        known = Columns(mean_gain @ signal.slopes, factors.variances)
+        total = sum_of(joined([known, masked]))
+        return FactoredBelief(after, state.before_data), gaussian_innovation(z, expected, total)
+
+    @in_float64
+    def estimate(self, state: FactoredBelief) -> Estimate:
+        """The estimate's mean, angles between -pi and pi, and covariance."""
+        mean, factors = state.estimate
+        return Estimate(wrapped(mean, first(self.plant).angles), factors.covariance(), self.claim)
+
+    def _moved(self, plant: AbstractPlant, state: Moments, u: jax.Array) -> Moments:
+        if isinstance(plant, LinearPlant):
+            slopes = jnp.asarray(plant.matrix) @ state.factors.matrix()
+            moved = Image(plant.transition(state.mean, u), slopes, [])
+        else:
+            moved = self._image(plant.moves(u, state.mean), state)
+        noise = plant.noise.covariance if isinstance(plant.noise, AbstractNoise) else plant.noise_covariance(u)
+        linear = Columns(moved.slopes, state.factors.variances)
+        return Moments(
+            moved.mean + plant.noise_mean(), factors_of(joined([linear, *moved.curvature, columns_of(_known(noise))]))
+        )
+
+    def _signal(self, sensor: AbstractSensor, state: Moments) -> Image:
+        if isinstance(sensor, LinearSensor):
+            slopes = jnp.asarray(sensor.matrix) @ state.factors.matrix()
+            image = Image(sensor.measure(state.mean), slopes, [])
+        else:
+            angles = first(self.plant).angles
+            image = self._image(continued(sensor.measure, state.mean, angles, sensor.angles), state)
+        return image._replace(mean=image.mean + sensor.noise.mean)
+
+    def _image(self, function: Function, state: Moments) -> Image:
+        return (cubature_image if self.cubature else linear_image)(function, state)
+
+    def _spread(
+        self, spread: Array, sensor: AbstractSensor, state: FactoredBelief, signal: Image, of_signal: list[Columns]
+    ) -> list[Columns]:
+        """The columns of K_r (y, 1), y as the estimate has it or as it was before data."""
+        corner = np.zeros(spread.shape[-1])
+        corner[-1] = 1.0
+        if not self.random_gain:
+            return [Columns((spread @ corner).T, np.ones(len(spread)))]
+        known, image = state.estimate, signal
+        if state.before_data is not None:
+            known = state.before_data
+            image = self._signal(sensor, known)
+        y = jnp.concatenate([image.mean, jnp.ones(1)])
+        parts = [Columns(image.slopes, known.factors.variances), *of_signal]
+        columns = [Columns((spread @ y).T, np.ones(len(spread)))]
+        for part in parts:
+            columns += [Columns(spread[r, :, :-1] @ part.matrix, part.weights) for r in range(len(spread))]
+        return columns
+
+
+def _known(covariance: Array) -> Array:
+    return covariance if isinstance(covariance, jax.Array) else np.asarray(covariance)
+
+
+def linear_image(function: Function, state: Moments) -> Image:
+    """By the Jacobian J at the mean: slopes J L."""
+    return Image(function(state.mean), jax.jacfwd(function)(state.mean) @ state.factors.matrix(), [])
+
+
+def cubature_image(function: Function, state: Moments) -> Image:
+    """By the points m +- sqrt(n d_j) L_j: their odd part over sqrt(n d_j) is the slope, their even part a noise."""
+    n = len(state.mean)
+    steps = jnp.sqrt(n * state.factors.variances)
+    offsets = state.factors.matrix() * steps
+    both = jnp.concatenate([state.mean[:, None] + offsets, state.mean[:, None] - offsets], axis=1)
+    ahead, behind = jnp.split(jax.vmap(function, in_axes=1, out_axes=1)(both), 2, axis=1)
+    middle = (ahead + behind) / 2
+    mean = jnp.sum(middle, axis=1) / n
+    slopes = (ahead - behind) / 2 * jnp.stack([reciprocal(step) for step in steps])
+    return Image(mean, slopes, [Columns(middle - mean[:, None], np.full(n, 1 / n))])
+
+
+def _used(mean: jax.Array, factors: Factors, rows: jax.Array, noise: jax.Array) -> Moments:
+    """One component after another: rows (slopes, innovation), whose noises are uncorrelated."""
+    n, variances = len(mean), jnp.asarray(factors.variances)
+    left, news = jnp.concatenate([factors.matrix(), rows[:, :-1]]), jnp.concatenate([mean, -rows[:, -1]])
+    for i in range(len(rows)):
+        place = n + i
+        left, variances, gain = measured(left, variances, left[place], noise[i])
+        news = news - gain * news[place]
+    return Moments(news[:n], Factors(left[np.tril_indices(n, -1)], variances))
+
+
+def factored(base: AbstractFilter) -> AbstractFilter:
+    """The filter with a factored covariance, whose variances stay positive in single precision.
+
+    Raises:
+        ValueError: a filter for which this form is not derived.
+    """
+    expected = "a linear, extended or cubature filter, or a schedule of gains"
+    if not isinstance(base, GaussianFilter | LinearFilter):
+        raise fail("single precision", expected, type(base).__name__)
+    plant, sensor = first(base.plant), first(base.sensor)
+    linear = isinstance(plant, LinearPlant) and isinstance(sensor, LinearSensor)
+    transform = None if isinstance(base, LinearFilter) else base.transform
+    if not linear and not isinstance(transform, Cubature | Linearization):
+        raise fail("single precision", expected, f"one with {type(transform).__name__}")
+    spread = gain_spread(base.channel)
+    operators = spread.values if isinstance(spread, OverTime) else spread
+    random_gain = bool(np.any(operators[..., :-1]))
+    described = base.channel
+    over = isinstance(described, OverTime)
+    whole: SecondOrder = described.values if isinstance(described, OverTime) else described
+    by_prior = isinstance(base, LinearFilter)
+    return FactoredFilter(
+        plant=base.plant,
+        sensor=base.sensor,
+        mean_gain=OverTime(whole.mean_gain) if over else whole.mean_gain,
+        offset=OverTime(whole.offset) if over else whole.offset,
+        spread=spread,
+        initial_mean=plant.initial_mean if isinstance(base, LinearFilter) else base.initial_mean,
+        initial_covariance=plant.initial_covariance if isinstance(base, LinearFilter) else base.initial_covariance,
+        cubature=isinstance(transform, Cubature),
+        from_prior=by_prior and random_gain,
+        random_gain=random_gain,
+        angles=() if isinstance(base, LinearFilter) else base.observed_angles,
+        claim=base.claim,
+        states=base.states,
+        inputs=base.inputs,
+        received=base.received,
+    )

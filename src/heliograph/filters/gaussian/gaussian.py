@@ -1,0 +1,256 @@
+"""The filter that carries a mean and a covariance: cubature or extended, on the channel's second moments."""
+
+from dataclasses import replace
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects
+from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
+from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
+from heliograph.filters.linear.plan import plan
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import linear_smoother_step, moments_smoother_step, observed_through
+from heliograph.model.angle import received_angles
+from heliograph.model.channel import Channel, check_link, mean_gain
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.model.fading import memory_matters, without_memory
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AbstractPlant, AnyPlant, check_plant
+from heliograph.model.sensor import AbstractSensor, AnySensor, LinearSensor, is_linear
+from heliograph.numerics.angle import Angles, continued, nearest
+from heliograph.numerics.check import instance
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import times_vector
+from heliograph.numerics.types import Array, ArrayLike, Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import SecondOrder, has_random_gain
+
+Element = TypeVar("Element", AbstractRandomAffine, SecondOrder)
+
+
+class GaussianFilter(AbstractBeliefFilter):
+    """Predict by a transform, redraw, measure by the same transform, correct by an update that knows the channel.
+
+    A linear plant or sensor needs no transform: its moments are exact.
+
+    `channel` is what the filter believes; the world may have another. Its innovation covariance is M Cov(y) M' and the
+    spread of the random gain under the nominal law; its likelihood is Gaussian with it, whatever the update bounds.
+
+    `linear`: plant and sensor are, no gain is random and nothing is an angle, so that nothing but the mean depends on
+    data. `heard_angles`: which components of z are angles; z is then read within half a turn of what is expected.
+    """
+
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+    update: AbstractUpdate
+    linear: bool = eqx.field(static=True)
+    observed_angles: Angles = eqx.field(static=True)
+
+    @corrects
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
+        signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
+        unknown = signal.about_mean() if self.linear else signal
+        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.observed_angles, unknown)
+
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
+        """The update itself where it is linear, else the moments around it."""
+        plant, sensor, channel = at(self.plant, k), at(self.sensor, k), at(self.channel, k)
+        if not self.linear:
+            cross = predicted(plant, self.transform, before, jnp.asarray(u)).cross
+            return moments_smoother_step(after, prior, cross, "nominal", plant.angles)
+        observed_of = observed_through(channel.mean_gain, sensor.matrix)
+        process = plant.noise_covariance(jnp.asarray(u))
+        result = linear_smoother_step(
+            after, prior, plant.matrix, process, observed_of, innovation.value, innovation.covariance, self.claim
+        )
+        return replace(result, angles=plant.angles)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before, where they do not depend on data."""
+        return plan(self, inputs) if self.linear else self
+
+
+def signal_of(plant: AbstractPlant, sensor: AbstractSensor, transform: AbstractTransform, state: Belief) -> Signal:
+    """What the sensor is expected to send of this plant's state."""
+    if isinstance(sensor, LinearSensor):
+        measured = linear_transform(sensor.matrix, sensor.measure(state.mean), state.covariance)
+    else:
+        measured = transform.apply(continued(sensor.measure, state.mean, plant.angles, sensor.angles), *state)
+    mean = measured.mean + sensor.noise.mean
+    spread = measured.covariance + sensor.noise.covariance
+    known = (sensor.matrix, sensor.noise.covariance) if isinstance(sensor, LinearSensor) else ()
+    return Signal(mean, spread, measured.cross, spread + jnp.outer(mean, mean), *map(jnp.asarray, known))
+
+
+def corrected(
+    prior: Belief,
+    signal: Signal,
+    channel: SecondOrder,
+    update: AbstractUpdate,
+    z: jax.Array,
+    angles: Angles = (),
+    unknown: Signal | None = None,
+) -> tuple[Belief, Innovation]:
+    """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing.
+
+    `unknown`: what of the signal decides gain and covariance, where that is less than all.
+    """
+    unknown = signal if unknown is None else unknown
+    expected = channel.mean_gain @ signal.mean + channel.offset
+    z = nearest(z, expected, angles)
+    gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))
+    after = _use(prior, gain, bound, signal.mean, channel, z)
+    return after, gaussian_innovation(z, expected, innovation_covariance(unknown, channel))
+
+
+@runs_last
+def _use(
+    prior: Belief, gain: jax.Array, bound: jax.Array, expected: jax.Array, channel: SecondOrder, z: jax.Array
+) -> Belief:
+    present = ~jnp.isnan(z)
+    innovation = jnp.where(present, z - times_vector(channel.mean_gain, expected) - channel.offset, 0.0)
+    covariance_after = jnp.where(jnp.any(present, axis=0), bound, prior.covariance)
+    return Belief(prior.mean + times_vector(gain, innovation), covariance_after)
+
+
+def describe(channel: Channel, update: AbstractUpdate) -> SecondOrder | OverTime:
+    """The channel as an update reads it, for each step where it varies."""
+    if isinstance(channel, OverTime):
+        return over_time([update.describe(c) for c in unstack(channel)])
+    return update.describe(channel)
+
+
+def _build(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate,
+    initial_mean: ArrayLike | None,
+    initial_covariance: ArrayLike | None,
+    trusted: bool,
+) -> GaussianFilter:
+    start = check_plant(plant)
+    instance("update", update, AbstractUpdate, "one such as Polytope()")
+    check_link(first(sensor), first(channel), len(start.states))
+    angles = received_angles(plant, sensor, channel)
+    mean, spread, own_prior = prior_of(start, initial_mean, initial_covariance)
+    trusted = trusted and not memory_matters(channel)
+    channel = without_memory(channel)
+    described = describe(channel, update)
+    pairs = zip(_over_steps(channel), _over_steps(described), strict=True)
+    on_line = not start.circular and not first(sensor).circular
+    linear = on_line and is_linear(plant, sensor) and not any(has_random_gain(c, s) for c, s in pairs)
+    claim: Claim = "exact" if linear and trusted and not own_prior else "nominal"
+    return GaussianFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        transform=transform,
+        update=update.described(),
+        initial_mean=mean,
+        initial_covariance=spread,
+        linear=linear,
+        observed_angles=angles,
+        claim=claim,
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def _over_steps(item: Element | OverTime) -> list[Element]:
+    return unstack(item) if isinstance(item, OverTime) else [item]
+
+
+def gaussian_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform,
+    update: AbstractUpdate | None = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+) -> GaussianFilter:
+    """A filter that knows its channel's moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
+
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
+    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
+    plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    rule = Polytope() if update is None else update
+    return _build(plant, sensor, channel, transform, rule, initial_mean, initial_covariance, trusted=True)
+
+
+def cubature_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+) -> GaussianFilter:
+    """Cubature Kalman filter that knows its channel's moments.
+
+    Claim: "nominal"; "exact" where plant and sensor are linear, no gain is random and the initial law is the plant's
+    (then it is the Kalman filter). Of a channel that remembers it assumes no memory: where that matters, the claim is
+    nominal. `update` is `Polytope()` unless given; the initial mean and covariance are the
+    plant's unless given.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section III.
+    """
+    return gaussian_filter(plant, sensor, channel, Cubature(), update, initial_mean, initial_covariance)
+
+
+def extended_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    update: AbstractUpdate | None = None,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+) -> GaussianFilter:
+    """Extended Kalman filter that knows its channel's moments; Jacobians by automatic differentiation.
+
+    Claims, arguments and errors as `cubature_filter`.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, Section IV (the filter compared with).
+    """
+    return gaussian_filter(plant, sensor, channel, Linearization(), update, initial_mean, initial_covariance)
+
+
+def mean_gain_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    initial_mean: ArrayLike | None = None,
+    initial_covariance: ArrayLike | None = None,
+) -> GaussianFilter:
+    """The cubature filter that most people would write: it takes the mean gain as the truth.
+
+    Claim: "nominal", and badly so where gains are random; it is here to be compared with.
+
+    Raises:
+        ValueError: sensor, channel and plant that do not fit, or an initial covariance that is none.
+    Source: cubature fusion under amplify-and-forward relays, with every gain replaced by its mean.
+    """
+    believed = mean_gain(without_memory(channel))
+    return _build(plant, sensor, believed, Cubature(), Polytope(), initial_mean, initial_covariance, trusted=False)

@@ -1,0 +1,118 @@
+"""The scalars of Young's inequality that make a bound smallest, by Newton's method on their logarithms.
+
+At the least trace each scalar is a ratio of traces that the gain decides, beta = f(beta): with W = K' K of the gain for
+beta, tr(K S K') = tr(W S). A sweep gives log f and its slopes; both follow from W and Omega^-1 S, since for dOmega
+tr(dW X) = -2 tr(Omega^-1 dOmega W X).
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.numerics.small_matrix import inner, rounding, solver, times, trace, transpose
+from heliograph.numerics.types import Array
+
+START = 0.1
+SWEEPS = 200  # most steps towards the scalars; about 5 are needed
+LONGEST = 5.0  # Newton step in the logarithm of a scalar: a longer one is not trusted
+CONVERGED = 1e-5  # change of a logarithm after which one more Newton step leaves 1e-10 squared
+LOOP = 1000  # units of rounding below which an iteration makes no progress
+SMALLEST_SCALAR = 1e-12  # keeps 1/beta finite where nothing is gained by a larger one
+
+Parts = tuple[jax.Array, ...]
+Slopes = list[list[jax.Array]]  # slopes[i][j] = d log f_i / d log beta_j
+Sweep = Callable[..., tuple[jax.Array, Slopes]]  # (log beta, *parts) -> log f(beta), slopes
+
+
+def smallest_scalars(sweep: Sweep, given: Array, parts: Parts) -> jax.Array:
+    """Scalars (count, runs) as given, and where that is NaN those that `sweep` leaves as they are, each run's own.
+
+    Alternating minimisation creeps, so this is Newton's method, from one sweep after START. Where a step leads astray
+    the sweep itself is taken; a run that has settled is left as it is. The last step is taken by all, outside the loop:
+    its derivative is that of the root, by the implicit function theorem, in reverse too.
+    """
+    fixed = jax.lax.stop_gradient(parts)
+    free = jnp.isnan(given)
+
+    def moving(t: jax.Array, previous: jax.Array) -> jax.Array:
+        return jnp.any(free & (jnp.abs(t - previous) > rounding(CONVERGED, t, LOOP)), axis=0)
+
+    def again(carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
+        t, previous, sweeps = carry
+        refined, slopes = sweep(t, *fixed)
+        better = jnp.where(sweeps == 0, refined, newton_step(t, refined, slopes))
+        return jnp.where(moving(t, previous), better, t), t, sweeps + 1
+
+    first = jnp.log(jnp.where(free, START, given))
+    first = jnp.broadcast_to(first, (len(given), *fixed[-1].shape))
+    carry = first, jnp.where(free, -jnp.inf, first), jnp.asarray(0)
+    t = jax.lax.while_loop(lambda c: (c[2] < SWEEPS) & jnp.any(moving(c[0], c[1])), again, carry)[0]
+    refined, slopes = sweep(t, *parts)
+    return jnp.where(free, jnp.exp(newton_step(t, refined, jax.lax.stop_gradient(slopes))), given)
+
+
+def newton_step(t: jax.Array, refined: jax.Array, slopes: Slopes) -> jax.Array:
+    """t + (I - J)^-1 (f(t) - t) for one or two components."""
+    rest = refined - t
+    if len(rest) == 1:
+        step = rest / (1 - slopes[0][0])
+    else:
+        (a, b), (c, d) = (1 - slopes[0][0], -slopes[0][1]), (-slopes[1][0], 1 - slopes[1][1])
+        step = jnp.stack([d * rest[0] - b * rest[1], a * rest[1] - c * rest[0]]) / (a * d - b * c)
+    safe = jnp.all(jnp.abs(step) < LONGEST, axis=0)
+    return t + jnp.where(safe, step, rest)
+
+
+def young_omega(beta: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array) -> jax.Array:
+    """Omega of the gain for two scalars."""
+    return base + (1 / beta[0] + 1 / beta[1]) * shift + (1 + beta[1]) * mean_part
+
+
+def young_sweep(
+    t: jax.Array, base: jax.Array, shift: jax.Array, mean_part: jax.Array, power: jax.Array, whole: jax.Array
+) -> tuple[jax.Array, Slopes]:
+    """beta_1 = sqrt(tr W S / tr P), beta_2 = sqrt(tr W S / tr W M)."""
+    beta = jnp.exp(t)
+    weight, (s, m) = _weight(young_omega(beta, base, shift, mean_part), power, (shift, mean_part))
+    ws, wm = times(weight, shift), times(weight, mean_part)
+    moved, known = trace(ws), trace(wm)
+    by_first = [2 / beta[0] * inner(transpose(s), x) for x in (ws, wm)]  # d tr W X / d log beta_1
+    by_second = [2 / beta[1] * inner(transpose(s), x) - 2 * beta[1] * inner(transpose(m), x) for x in (ws, wm)]
+    item, one_slopes = _root_ratio(moved, [by_first[0], by_second[0]], whole, [None, None])
+    two, two_slopes = _root_ratio(moved, [by_first[0], by_second[0]], known, [by_first[1], by_second[1]])
+    return jnp.stack([item, two]), [one_slopes, two_slopes]
+
+
+def zero_mean_sweep(
+    t: jax.Array, base: jax.Array, shift: jax.Array, power: jax.Array, whole: jax.Array
+) -> tuple[jax.Array, Slopes]:
+    """beta = sqrt(tr W S / tr explained) with Omega = base + S / beta."""
+    beta = jnp.exp(t[0])
+    weight, (s,) = _weight(base + shift / beta, power, (shift,))
+    ws = times(weight, shift)
+    refined, slopes = _root_ratio(trace(ws), [2 / beta * inner(transpose(s), ws)], whole, [None])
+    return refined[None], [slopes]
+
+
+def _weight(omega: jax.Array, power: jax.Array, others: Sequence[jax.Array]) -> tuple[jax.Array, list[jax.Array]]:
+    """W = Omega^-1 C C' Omega^-1 of K = C' Omega^-1, and Omega^-1 X of others: in matrices of the data's size."""
+    solve = solver(omega)
+    first, *rest = jnp.split(solve(jnp.concatenate([power, *others], axis=1)), 1 + len(others), axis=1)
+    return solve(transpose(first)), rest
+
+
+def _root_ratio(
+    part: jax.Array, by_part: list[jax.Array], whole: jax.Array, by_whole: Sequence[jax.Array | None]
+) -> tuple[jax.Array, list[jax.Array]]:
+    """log sqrt(part / whole), at least that of SMALLEST_SCALAR, which it is where nothing arrives and both are zero.
+
+    With its slopes from those of both. No quotient or root of zero is taken, so that there are derivatives.
+    """
+    some = (part > 0) & (whole > 0)
+    part, whole = jnp.where(some, part, 1.0), jnp.where(some, whole, 1.0)
+    value = jnp.log(part / whole) / 2
+    free = some & (value > np.log(SMALLEST_SCALAR))
+    slopes = [p / part if w is None else p / part - w / whole for p, w in zip(by_part, by_whole, strict=True)]
+    return jnp.where(free, value, np.log(SMALLEST_SCALAR)), [jnp.where(free, slope / 2, 0.0) for slope in slopes]

@@ -1,0 +1,109 @@
+"""The central filter: it hears all nodes, predicts once, and uses their measurements one after another."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.model.estimate import Claim, Estimate, Innovation, weakest
+from heliograph.model.over_time import alike, at, first, stack
+from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
+
+
+class SequentialFilter(AbstractFilter):
+    """Predict with the first node's filter, then correct with each node's in turn; z is the nodes' measurements joined.
+
+    The posterior of one node is the prior of the next. Behind uncertain gains the first correction is not a conditional
+    mean, so a next one that assumes E[e yhat'] = 0 (`ZeroMean`) is no bound: the claim is "nominal" unless every part
+    is exact. The innovations are those of node after node, each given the nodes before it: the covariance has a block
+    for each, and the log-likelihood is their sum, which is that of all.
+    """
+
+    filters: tuple[GaussianFilter, ...]
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Belief:
+        """The first node's prior."""
+        return self.filters[0].init()
+
+    @predicts
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """As the first node's filter does."""
+        return self.filters[0].predict(state, u, k)
+
+    @corrects
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Use what arrived from each node in turn."""
+        z = jnp.asarray(z)
+        if all(alike(item, self.filters[0]) for item in self.filters):  # one correction compiled, run over the nodes
+            arrays, rest = eqx.partition(stack(self.filters), eqx.is_array)
+
+            def correct(belief: Belief, item: tuple[PyTree, jax.Array]) -> tuple[Belief, Innovation]:
+                single: GaussianFilter = eqx.combine(item[0], rest)
+                return single.correct(belief, item[1], k)
+
+            state, innovation = jax.lax.scan(correct, state, (arrays, z.reshape(len(self.filters), -1)))
+            return state, _joined([jax.tree.map(lambda leaf: leaf[i], innovation) for i in range(len(self.filters))])  # noqa: B023
+        ends, parts = np.cumsum([item.received for item in self.filters]), []
+        for item, part in zip(self.filters, jnp.split(z, ends[:-1]), strict=True):
+            state, single = item.correct(state, part, k)
+            parts.append(single)
+        return state, _joined(parts)
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """The belief, as the first node's filter tells it."""
+        estimate_ = self.filters[0].estimate(state)
+        return Estimate(estimate_.mean, estimate_.covariance, self.claim)
+
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
+        """The moments around all nodes' updates."""
+        item = self.filters[0]
+        cross = predicted(at(item.plant, k), item.transform, before, jnp.asarray(u)).cross
+        return moments_smoother_step(after, prior, cross, self.claim, first(item.plant).angles)
+
+
+def _joined(parts: Sequence[Innovation]) -> Innovation:
+    covariance = jax.scipy.linalg.block_diag(*(item.covariance for item in parts))
+    total = jnp.sum(jnp.stack([jnp.asarray(item.log_likelihood) for item in parts]))
+    return Innovation(jnp.concatenate([item.value for item in parts]), covariance, total)
+
+
+def sequential_filter(filters: Sequence[GaussianFilter]) -> SequentialFilter:
+    """The central filter made of the nodes' own filters, in the order of the network's nodes.
+
+    Claim: "exact" if every part is, else "nominal".
+
+    Raises:
+        ValueError: no filters, or filters of different state dimensions.
+    Source: cubature fusion under amplify-and-forward relays, Section I (centralised fusion, the reference).
+    """
+    parts = tuple(items("sequential filter", filters, "filters"))
+    for item in parts:
+        instance("sequential filter", item, GaussianFilter, "filters of single nodes (cubature, extended, ...)")
+    sizes = [(len(item.states), len(item.inputs)) for item in parts]
+    if len(set(sizes)) != 1:
+        raise fail("sequential filter", "filters of as many states and inputs each", sizes)
+    weakest_part = weakest([item.claim for item in parts])
+    return SequentialFilter(
+        filters=parts,
+        claim="exact" if weakest_part == "exact" else "nominal",
+        states=parts[0].states,
+        inputs=parts[0].inputs,
+        received=sum(item.received for item in parts),
+    )

@@ -1,0 +1,200 @@
+"""Measurement updates that know the channel: the gain that minimises a bound on the error covariance, and the bound.
+
+Notation inside: e prior error with covariance P, y = yhat + e_y the sensor's signal, z = G y + n what arrives,
+M = E[G] nominal, D_v = E_v[G] - M the shift under a possible law v.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from heliograph.filters.gaussian.correction import (
+    Scalars,
+    Signal,
+    as_array,
+    as_scalars,
+    young_correction,
+    zero_mean_correction,
+)
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.law import Discrete
+from heliograph.random_affine.moments.second_moments import (
+    QuadraticMap,
+    SecondOrder,
+    nominal_spread,
+    second_order,
+    symmetric_product,
+)
+
+
+@readable
+class AbstractUpdate(Module):
+    """How a channel's uncertainty is bounded, and the gain that minimises the bound."""
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """The channel's mean gain and its worst cases, computed once before any data."""
+        raise NotImplementedError
+
+    def described(self) -> "AbstractUpdate":
+        """What corrects once the channel is described: updates that differ in the description alone share it.
+
+        Filters with one and the same correction share a compiled program.
+        """
+        return self
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Gain K (n, m) and bound (n, n) after the update; the columns of absent components are zero."""
+        raise NotImplementedError
+
+
+class Polytope(AbstractUpdate):
+    """Bound by Young's inequality over the exact worst case of the uncertain probabilities.
+
+    e+ = e - K M e_y - K D_v y - K (zero mean given y) and, for every beta_1, beta_2 > 0,
+    E[e+ e+'] <= (1 + beta_1) P - K M Pyx - (.)' + K Omega K', with
+    Omega = spread(Y) + (1/beta_1 + 1/beta_2) shift(Y) + (1 + beta_2) M Pyy M'.
+    No assumption on E[e y'] beyond Pxy. Where the law is known shift = 0, both scalars are 0 and the bound is the
+    covariance itself. `scalars` None: the trace is minimised over them at each step.
+
+    Source: cubature fusion under amplify-and-forward relays, Theorems 1 and 2, with the worst cases taken exactly.
+    """
+
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = as_array(scalars)
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Worst cases over the polytope."""
+        return second_order(channel)
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        return young_correction(prior, signal, channel, present, self.scalars)
+
+
+class ZeroMean(AbstractUpdate):
+    """A tighter bound that trusts the filter's premise E[e | data] = 0, hence E[e yhat'] = 0.
+
+    Then only e_y, not all of y, is correlated with e:
+    E[e+ e+'] <= P + beta Pxy Pyy^-1 Pyx - K M Pyx - (.)' + K Omega K',
+    Omega = power(Pyy) + shift(Pyy) / beta + spread(yhat yhat').
+
+    `scalar` None: the trace is minimised over beta at each step.
+    """
+
+    scalar: np.ndarray
+
+    def __init__(self, scalar: float | None = None):
+        self.scalar = np.full(1, np.nan) if scalar is None else array("scalar of the bound", [scalar], (1,))
+        if np.any(self.scalar <= 0):
+            raise fail("scalar of the bound", "a positive number", scalar)
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Worst cases over the polytope."""
+        return second_order(channel)
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minimise the trace over K, and over beta unless it is fixed."""
+        return zero_mean_correction(prior, signal, channel, present, self.scalar)
+
+
+class Interval(AbstractUpdate):
+    """Young's bound with each hop's uncertainty as intervals of its moments, combined hop by hop.
+
+    With m, s = E g, E g^2 and radii r = sum |v_i| radius_i, q = sum v_i^2 radius_i of each hop:
+    var g <= s + q - max(|m| - r, 0)^2. Sound, looser than `Polytope`, and for chains of scalar hops only.
+
+    Source: cubature fusion under amplify-and-forward relays, equation (11), with the sign of its last term corrected.
+    """
+
+    scalars: np.ndarray
+
+    def __init__(self, scalars: Scalars | None = None):
+        self.scalars = as_array(scalars)
+
+    def describe(self, channel: AbstractRandomAffine) -> SecondOrder:
+        """Worst cases from intervals.
+
+        Raises:
+            ValueError: a channel that is not a chain of scalar hops.
+        """
+        return interval_description(channel, lambda hop: hop.second - max(abs(hop.mean) - hop.mean_radius, 0.0) ** 2)
+
+    def described(self) -> AbstractUpdate:
+        """Young's bound, as for a polytope."""
+        return Polytope(as_scalars(self.scalars))
+
+    def correct(
+        self, prior: jax.Array, signal: Signal, channel: SecondOrder, present: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Minimise the trace over K, and over the scalars unless they are fixed."""
+        return young_correction(prior, signal, channel, present, self.scalars)
+
+
+class HopRange(NamedTuple):
+    """One hop's amplitude, E g with its radius, the largest E g^2, and its noise's covariance (m, m)."""
+
+    amplitude: float
+    mean: float
+    mean_radius: float
+    second: float
+    noise: np.ndarray
+
+
+def _hop_range(hop: AbstractRandomAffine) -> HopRange:
+    if not isinstance(hop, GainAndNoise) or not _is_scalar(hop.matrix) or np.any(hop.noise.mean):
+        raise fail("interval bound", "a chain of hops, each one gain for all components and zero-mean noise", hop)
+    radius, law = (0.0, 0.0), hop.law
+    if isinstance(law, Discrete):
+        radius = (float(np.abs(law.values) @ law.radius), float(law.values**2 @ law.radius))
+    amplitude = float(hop.matrix[0, 0])
+    mean, second = float(law.moment(1)), float(law.moment(2))
+    return HopRange(amplitude, mean, radius[0], second + radius[1], np.asarray(hop.noise.covariance))
+
+
+def _is_scalar(matrix: jax.Array | np.ndarray) -> bool:
+    return matrix.shape[0] == matrix.shape[1] and bool(np.all(matrix == matrix[0, 0] * np.eye(len(matrix))))
+
+
+def interval_description(channel: AbstractRandomAffine, variance: Callable[[HopRange], float]) -> SecondOrder:
+    """Combine hops: V <- var S + (|m| + r)^2 V for the spread, S <- s S for the power, N <- (a^2 s) N + Q for noise.
+
+    `variance` says how large var g of a hop is taken to be.
+
+    Raises:
+        ValueError: a channel that is not a chain of scalar hops.
+    """
+    hops = [_hop_range(hop) for hop in (channel.maps if isinstance(channel, Series) else (channel,))]
+    spread, power, noise = 0.0, 1.0, np.zeros_like(hops[0].noise)
+    for hop in hops:
+        spread = variance(hop) * power + (abs(hop.mean) + hop.mean_radius) ** 2 * spread
+        power *= hop.second
+        noise = hop.amplitude**2 * hop.second * noise + hop.noise
+    amplitude = float(np.prod([hop.amplitude for hop in hops]))
+    nominal = float(np.prod([abs(hop.mean) for hop in hops]))
+    shift = float(np.prod([abs(hop.mean) + hop.mean_radius for hop in hops])) - nominal
+    gain = amplitude * float(np.prod([hop.mean for hop in hops])) * np.eye(len(noise))
+
+    def scaled(value: float, constant: np.ndarray) -> QuadraticMap:
+        center = np.zeros((len(noise), len(noise), len(noise) + 1, len(noise) + 1))
+        center[..., :-1, :-1] = amplitude**2 * value * symmetric_product(np.eye(len(noise)), np.eye(len(noise)))
+        center[..., -1, -1] = constant
+        return QuadraticMap(center, np.zeros_like(center))
+
+    zero = np.zeros_like(noise)
+    parts = scaled(spread + shift**2, noise), scaled(shift**2, zero), scaled(power, zero)
+    return SecondOrder(gain, np.zeros(len(noise)), *parts, nominal_spread(channel), shift > 0)

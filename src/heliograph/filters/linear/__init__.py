@@ -1,0 +1,1 @@
+"""Linear filters, their gains before any data, and their true errors."""

@@ -1,0 +1,264 @@
+"""A linear filter computed before any data: where nothing but its mean depends on what arrives."""
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import Any, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import array
+from heliograph.numerics.float64 import compiled, in_float64
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import times_vector
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+
+
+class Plan(NamedTuple):
+    """One step: m- = F m + f, m = m- + K (z - C m- - c), with the innovation's covariance S for complete data.
+
+    Shapes: transition F (N, N), drift f (N,), gain K (N, m), output C (m, N), offset c (m,), innovation S (m, m).
+    """
+
+    transition: jax.Array
+    drift: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    offset: jax.Array
+    innovation: jax.Array
+
+
+class PlannedMean(NamedTuple):
+    """The mean (N,), and the place of its covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after correction k."""
+
+    mean: Float[jax.Array, " N"]
+    stage: Int[jax.Array, ""]
+
+
+class PlannedFilter(AbstractFilter):
+    """A filter whose gains and covariances are known for each step; only the mean is left to compute.
+
+    For the inputs that it was planned for, and for complete data: a missing component makes the mean NaN. Built by
+    `planned` of a filter whose gains do not depend on data.
+
+    `past`: what each step retains for a sweep back, all of it that no data change; None where nobody asks for one.
+
+    Shapes: covariances (2 horizon + 1, n, n), before and after each correction; start (N,); xhat = want m.
+    """
+
+    steps: OverTime
+    covariances: Array
+    start: Array
+    projection: Array | None
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+    past: OverTime | None = None
+
+    @in_float64
+    def init(self) -> PlannedMean:
+        """The mean at the start."""
+        return PlannedMean(jnp.asarray(self.start), jnp.asarray(0))
+
+    @predicts
+    def predict(self, state: PlannedMean, u: ArrayLike = (), k: Step = 0) -> PlannedMean:
+        """F m + f; the input is in f."""
+        p: Plan = at(self.steps, k)
+        return PlannedMean(_affine(p.transition, state.mean, p.drift), _stage(state, 2 * k + 1))
+
+    @corrects
+    def correct(self, state: PlannedMean, z: ArrayLike, k: Step = 0) -> tuple[PlannedMean, Innovation]:
+        """m + K (z - C m - c)."""
+        p: Plan = at(self.steps, k)
+        expected = _affine(p.output, state.mean, p.offset)
+        mean = _affine(p.gain, jnp.asarray(z) - expected, state.mean)
+        return PlannedMean(mean, _stage(state, 2 * k + 2)), gaussian_innovation(jnp.asarray(z), expected, p.innovation)
+
+    @in_float64
+    def estimate(self, state: PlannedMean) -> Estimate:
+        """The mean, with the covariance that was planned."""
+        return self._estimate(state.mean, state.stage)
+
+    def after_step(self, state: PlannedMean, k: Step) -> Estimate:
+        """The same, its place taken from the step: it is then common to all runs."""
+        return self._estimate(state.mean, 2 * k + 2)
+
+    def smoother_step(
+        self,
+        before: PlannedMean,
+        prior: PlannedMean,
+        after: PlannedMean,
+        innovation_: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
+        """What was planned, with the mean and the innovation of these data."""
+        if self.past is None:
+            return super().smoother_step(before, prior, after, innovation_, z, u, k)
+        p, planned = at(self.steps, k), cast(AbstractSmootherStep, at(self.past, k))
+        innovation = jnp.asarray(z) - _affine(p.output, prior.mean, p.offset)
+        return planned.with_data(jnp.asarray(after.mean), jnp.asarray(prior.mean), innovation)
+
+    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
+        """With what the steps retained, whatever the data were."""
+        return replace(self, past=OverTime(steps))
+
+    def _estimate(self, mean: Float[Array, " N"], stage: Step) -> Estimate:
+        known = mean if self.projection is None else _affine(self.projection, mean, jnp.zeros(len(self.projection)))
+        return Estimate(known, jnp.asarray(self.covariances)[stage], self.claim)
+
+
+@runs_last
+def _affine(matrix: Array, x: Array, offset: Array) -> jax.Array:
+    return times_vector(matrix, jnp.asarray(x)) + offset
+
+
+def _stage(state: PlannedMean, stage: Step) -> jax.Array:
+    return jnp.asarray(stage, dtype=jnp.asarray(state.stage).dtype)
+
+
+def plan(
+    item: AbstractFilter, inputs: Float[Array, "horizon inputs"], projection: Array | None = None
+) -> PlannedFilter:
+    """Follow a filter over complete data and read its matrices off it; its state has a `mean` and a `covariance`.
+
+    Only the mean may depend on data, and affinely: then F, K and C are derivatives, the same at every mean.
+
+    Raises:
+        ValueError: inputs of another number than the filter's.
+    """
+    return _plan(item, array("inputs", inputs, (None, len(item.inputs))), projection)
+
+
+@compiled
+def _plan(item: AbstractFilter, inputs: Array, projection: Array | None) -> PlannedFilter:
+    quiet = jnp.zeros(item.received)
+
+    def body(state: PyTree, row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, tuple[Plan, jax.Array]]:
+        single, prior, after = followed(item, state, quiet, row[1], row[0])
+        return after, (single, jnp.stack([_seen(prior.covariance, projection), _seen(after.covariance, projection)]))
+
+    start = item.init()
+    start = jax.tree.map(jnp.asarray, start)
+    _, (steps, covariances) = jax.lax.scan(body, start, (jnp.arange(len(inputs)), jnp.asarray(inputs)))
+    items = covariances.reshape(-1, *covariances.shape[2:])
+    known = jnp.concatenate([_seen(start.covariance, projection)[None], items])
+    return PlannedFilter(
+        steps=OverTime(steps),
+        covariances=known,
+        start=start.mean,
+        projection=projection,
+        claim=item.claim,
+        states=item.states,
+        inputs=item.inputs,
+        received=item.received,
+    )
+
+
+def followed(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> tuple[Plan, PyTree, PyTree]:
+    """The matrices of a step from this state, whatever its mean, and the states after prediction and correction."""
+    none = jnp.zeros_like(state.mean)
+
+    def predict(mean: jax.Array) -> tuple[jax.Array, PyTree]:
+        prior = item.predict(state._replace(mean=mean), u, k)
+        return jnp.asarray(prior.mean), prior
+
+    transition, prior = jax.jacfwd(predict, has_aux=True)(none)
+    (_, gain), (output, _), after, innovation = _corrected(item, prior, none, z, k)
+    single = Plan(
+        transition=transition,
+        drift=jnp.asarray(prior.mean),
+        gain=gain,
+        output=-output,
+        offset=-jnp.asarray(innovation.value),
+        innovation=jnp.asarray(innovation.covariance),
+    )
+    return single, prior, after
+
+
+def _corrected(
+    item: AbstractFilter, prior: PyTree, mean: jax.Array, z: jax.Array, k: Step
+) -> tuple[tuple[jax.Array, ...], tuple[jax.Array, ...], PyTree, Innovation]:
+    """Derivatives of the corrected mean and of the innovation, each by prior mean and by z, and both themselves."""
+
+    def correct(mean: jax.Array, z: jax.Array) -> tuple[tuple[jax.Array, jax.Array], PyTree]:
+        after, innovation = item.correct(prior._replace(mean=mean), z, k)
+        return (jnp.asarray(after.mean), jnp.asarray(innovation.value)), (after, innovation)
+
+    (of_mean, of_innovation), (after, received) = jax.jacfwd(correct, (0, 1), has_aux=True)(mean, z)
+    return of_mean, of_innovation, after, received
+
+
+def linear_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Plan:
+    """The matrices of one step of a filter of which only the mean depends on data; of z only what is missing counts.
+
+    Where a component did not arrive, the columns of the gain and the rows of output and offset are zero.
+    """
+    if isinstance(item, PlannedFilter):
+        outcome: Plan = at(item.steps, k)
+        return outcome
+    single, _, _ = followed(item, state, jnp.where(jnp.isnan(z), z, 0.0), u, k)
+    present = ~jnp.isnan(z)
+    return single._replace(
+        gain=jnp.where(present, single.gain, 0.0),
+        output=jnp.where(present[:, None], single.output, 0.0),
+        offset=jnp.where(present, single.offset, 0.0),
+    )
+
+
+class Linearised(NamedTuple):
+    """One step of a filter along its own estimate: x- = m- + e-, e+ = e- - K (C e- + nu), S = Cov nu.
+
+    Shapes: predicted m- (n,), gain K (n, m), output C (m, n), noise S (m, m); zero for what did not arrive.
+    """
+
+    predicted: jax.Array
+    gain: jax.Array
+    output: jax.Array
+    noise: jax.Array
+
+
+def linearised_step(item: AbstractFilter, state: PyTree, z: jax.Array, u: jax.Array, k: Step) -> Linearised:
+    """The derivatives of a filter's own correction at its prediction, with its covariance held.
+
+    The filter's state has a `mean` and a `covariance`. S = Cov(innovation) - C P C', for its predicted P.
+    """
+    prior = item.predict(state, u, k)
+    (_, gain), (output, _), _, innovation = _corrected(item, prior, jnp.asarray(prior.mean), z, k)
+    present = ~jnp.isnan(z)
+    output = jnp.where(present[:, None], -output, 0.0)
+    total = jnp.where(present[:, None] & present, innovation.covariance, 0.0)
+    return Linearised(prior.mean, jnp.where(present, gain, 0.0), output, total - output @ prior.covariance @ output.T)
+
+
+def is_linear_filter(item: AbstractFilter) -> bool:
+    """Whether only the mean of the filter depends on data, and is an estimate of the plant's state and no more."""
+    leaves, tree = jax.tree.flatten(item)
+    return _is_linear(tree, tuple(map(_shape, leaves)))
+
+
+def _shape(leaf: Any) -> object:
+    if not eqx.is_array(leaf):
+        return leaf
+    return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype)  # type: ignore[no-untyped-call]
+
+
+@lru_cache(maxsize=1024)
+def _is_linear(tree: jax.tree_util.PyTreeDef, leaves: tuple[object, ...]) -> bool:
+    """What numbers have no part in, so that filters of one structure are traced once."""
+    with jax.enable_x64(True):
+        item = jax.tree.unflatten(tree, leaves)
+        planned = eqx.filter_eval_shape(lambda single: single.planned(jnp.zeros((1, len(single.inputs)))), item)
+    return isinstance(planned, PlannedFilter) and planned.projection is None
+
+
+def _seen(covariance: jax.Array, projection: Array | None) -> jax.Array:
+    return covariance if projection is None else jnp.asarray(projection) @ covariance @ jnp.asarray(projection).T

@@ -1,0 +1,276 @@
+"""Filters that use powers and products of what they hear: a lift of the measurement before a linear filter."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.innovation import log_density
+from heliograph.filters.linear.centre import Centre, centre_of, without_mean
+from heliograph.filters.linear.scheduled import LinearSystemFilter, ScheduledFilter, ScheduleState
+from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.linear.lift import check_model, lifted_system
+from heliograph.linear.memory import memory_system
+from heliograph.linear.recursion import lmmse
+from heliograph.linear.system import LinearSystem
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
+from heliograph.model.over_time import OverTime, at, first, steps_covered, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.moments.monomials import count, monomials, position
+
+
+class Centred(NamedTuple):
+    """The inner filter's state, and the mean (n,) of x that it does not see."""
+
+    inner: PyTree
+    mean: Float[Array, " n"]
+
+
+class PolynomialFilter(AbstractFilter):
+    """Give a filter all monomials of z up to `degree` in place of z; with a component, every monomial of it is missing.
+
+    `inner` is a `LinearSystemFilter` or a `ScheduledFilter` of the lifted system. The innovation is that of z itself,
+    among its monomials, with its exact covariance; the log-likelihood is Gaussian with it. `endless`: the last step's
+    matrices hold for ever, so that it may go on beyond them. `centre`: what is taken off z, and added to the estimate,
+    of an inner filter that knows x - E[x] only.
+
+    Raises:
+        ValueError: an inner filter that hears no such monomials.
+    """
+
+    inner: AbstractFilter
+    centre: Centre | None
+    degree: int = eqx.field(static=True)
+    endless: bool = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, inner: AbstractFilter, degree: int, endless: bool = False, centre: Centre | None = None):
+        instance("inner filter", inner, AbstractFilter, "a filter")
+        check_count("degree of the filter", degree)
+        self.inner, self.degree, self.endless, self.claim = inner, degree, endless, inner.claim
+        self.centre = centre
+        self.states, self.inputs = inner.states, inner.inputs
+        fitting = [m for m in range(1, inner.received + 1) if count(m + 1, degree) == inner.received + 1]
+        if not fitting:
+            raise fail("inner filter", f"one that hears monomials up to degree {degree}", f"{inner.received} numbers")
+        self.received = fitting[0]
+
+    @property
+    def horizon(self) -> int | None:
+        """The inner filter's, unless its last matrices hold for ever."""
+        return None if self.endless else self.inner.horizon
+
+    @in_float64
+    def init(self) -> PyTree:
+        """The inner filter's state, and the mean that it does not see."""
+        start = np.zeros(len(self.states)) if self.centre is None else self.centre.start
+        return Centred(self.inner.init(), jnp.asarray(start))
+
+    @predicts
+    def predict(self, state: Centred, u: ArrayLike = (), k: Step = 0) -> Centred:
+        """The inner filter's prediction."""
+        inner = self.inner.predict(state.inner, u, k)
+        if self.centre is None:
+            return Centred(inner, state.mean)
+        c = at(self.centre, k)
+        return Centred(inner, c.transition @ state.mean + c.drift)
+
+    @corrects
+    def correct(self, state: Centred, z: ArrayLike, k: Step = 0) -> tuple[Centred, Innovation]:
+        """Lift z and correct the inner filter."""
+        z = jnp.asarray(z)
+        z = z if self.centre is None else z - at(self.centre, k).received @ state.mean
+        after, innovation = self.inner.correct(state.inner, monomials(z, self.degree)[:-1], k)
+        return Centred(after, state.mean), _of_degree_one(innovation, z, self.degree)
+
+    @in_float64
+    def estimate(self, state: Centred) -> Estimate:
+        """The inner filter's, about the mean."""
+        return _moved(self.inner.estimate(state.inner), state.mean)
+
+    def after_step(self, state: Centred, k: Step) -> Estimate:
+        """The inner filter's, about the mean."""
+        return _moved(self.inner.after_step(state.inner, k), state.mean)
+
+    def smoother_step(
+        self,
+        before: Centred,
+        prior: Centred,
+        after: Centred,
+        innovation: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
+        """The inner filter's, on the lifted system, about the mean."""
+        z = jnp.asarray(z)
+        z = z if self.centre is None else z - at(self.centre, k).received @ prior.mean
+        inner = before.inner, prior.inner, after.inner, innovation, monomials(z, self.degree)[:-1]
+        return replace(self.inner.smoother_step(*inner, u, k), shift=jnp.asarray(after.mean))
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """The inner filter planned."""
+        return PolynomialFilter(self.inner.planned(inputs), self.degree, self.endless, self.centre)
+
+    def with_past(self, steps: AbstractSmootherStep) -> AbstractFilter:
+        """The inner filter with what the steps retained."""
+        return PolynomialFilter(self.inner.with_past(steps), self.degree, self.endless, self.centre)
+
+
+def _moved(estimate: Estimate, mean: Float[Array, " n"]) -> Estimate:
+    return Estimate(estimate.mean + mean, estimate.covariance, estimate.claim)
+
+
+def _of_degree_one(innovation: Innovation, z: Float[Array, " m"], degree: int) -> Innovation:
+    """The part of a lifted innovation that is z itself."""
+    m, places = len(z), position(len(z) + 1, degree)
+    values = np.array([places[(*(int(i == j) for j in range(m)), degree - 1)] for i in range(m)])
+    value, covariance = innovation.value[values], innovation.covariance[values][:, values]
+    return Innovation(value, covariance, log_density(value, covariance, jnp.abs(z)))
+
+
+def polynomial_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
+) -> PolynomialFilter:
+    """The best filter that is a polynomial of `degree` in each received z_k: 1 linear, 2 quadratic, 3 cubic.
+
+    For linear plants and sensors behind any channel, with noises of any law whose moments up to 2 degree exist. It
+    estimates the whole state, a dynamical bias included, and its covariance is recomputed where z has gaps. For many
+    complete runs `scheduled_polynomial_filter` does the same with saved gains.
+
+    Claim: "exact"; "nominal" where probabilities are uncertain (the nominal ones are trusted), or where rounding is
+    more than 1e-6 of a claimed variance, with a warning: behind a random gain, far from zero. Behind a known gain all
+    moments are about the mean. Covers `horizon` steps; a stream may go on beyond them where nothing varies over time
+    and the matrices have settled by then.
+
+    Raises:
+        ValueError: parts that do not fit, a plant with inputs, a lift of more than the stated memory.
+    Source: quadratic filtering with dynamical bias, Theorems 1 and 2, as repaired for random powers.
+    """
+    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    claim = lmmse(system, claim_of(channel)).claim
+    inner = LinearSystemFilter(system, claim, first(plant).states)
+    return PolynomialFilter(inner, degree, _is_steady(plant, sensor, channel, system), centre)
+
+
+def _lifted(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, degree: int, horizon: int
+) -> tuple[Centre | None, LinearSystem]:
+    """The lift of the model about its mean, where the gain is known."""
+    check_model(plant, sensor, channel)
+    centre = centre_of(plant, sensor, channel)
+    about = plant if centre is None else without_mean(plant)
+    return centre, lifted_system(about, sensor, channel, degree, horizon)
+
+
+def _is_steady(plant: AnyPlant, sensor: AnySensor, channel: Channel, system: LinearSystem) -> bool:
+    """Whether a model that does not vary has come to matrices that do not change any more, to rounding."""
+    if steps_covered((plant, sensor, channel)) is not None or system.horizon < 2:
+        return False
+    return all(np.allclose(part[-1], part[-2], rtol=1e-12, atol=0) for part in system.steps)
+
+
+def scheduled_polynomial_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int, degree: int = 2
+) -> PolynomialFilter:
+    """`polynomial_filter` with saved gains, for complete data: the same estimates at a fraction of the cost per step.
+
+    Raises:
+        ValueError: what `polynomial_filter` refuses.
+    Source: as `polynomial_filter`.
+    """
+    centre, system = _lifted(plant, sensor, channel, degree, horizon)
+    inner = ScheduledFilter(lmmse(system, claim_of(channel)), first(plant).states)
+    return PolynomialFilter(inner, degree, centre=centre)
+
+
+class MemoryState(NamedTuple):
+    """States of the linear filter and of the filter of the products."""
+
+    linear: ScheduleState
+    products: ScheduleState
+
+
+class MemoryFilter(AbstractFilter):
+    """The quadratic filter with memory: it hears z, its squares, and the products of z and the linear estimate.
+
+    With saved gains, for complete data; see `ScheduledFilter` for what gaps do, `PolynomialFilter` for the innovation.
+    """
+
+    linear: ScheduledFilter
+    products: ScheduledFilter
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, linear: ScheduledFilter, products: ScheduledFilter, claim: Claim):
+        self.linear, self.products, self.claim = linear, products, claim
+        self.states, self.inputs, self.received = linear.states, linear.inputs, linear.received
+
+    @in_float64
+    def init(self) -> MemoryState:
+        """Both filters' starts."""
+        return MemoryState(self.linear.init(), self.products.init())
+
+    @predicts
+    def predict(self, state: MemoryState, u: ArrayLike = (), k: Step = 0) -> MemoryState:
+        """Both filters' predictions."""
+        return MemoryState(self.linear.predict(state.linear, u, k), self.products.predict(state.products, u, k))
+
+    @corrects
+    def correct(self, state: MemoryState, z: ArrayLike, k: Step = 0) -> tuple[MemoryState, Innovation]:
+        """Correct the linear filter, then give (z, squares, products of z and its estimate) to the other."""
+        z = jnp.asarray(z)
+        linear, _ = self.linear.correct(state.linear, z, k)
+        lifted = jnp.concatenate([monomials(z, 2)[:-1], jnp.outer(z, linear.mean).reshape(-1)])
+        products, innovation = self.products.correct(state.products, lifted, k)
+        return MemoryState(linear, products), _of_degree_one(innovation, z, 2)
+
+    @in_float64
+    def estimate(self, state: MemoryState) -> Estimate:
+        """The filter of the products'."""
+        return self.products.estimate(state.products)
+
+    def after_step(self, state: MemoryState, k: Step) -> Estimate:
+        """The filter of the products'."""
+        return self.products.after_step(state.products, k)
+
+
+def memory_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, horizon: int) -> MemoryFilter:
+    """The quadratic filter whose products reach into the past through the linear filter's estimate.
+
+    Claim: as `polynomial_filter`; never worse than its quadratic filter.
+
+    Raises:
+        ValueError: what `polynomial_filter` refuses; a channel that remembers.
+    Source: a second-order Volterra filter with the linear estimate in place of the past measurements.
+    """
+    check_forgets("channel of a memory filter", as_maps("channel", [first(channel)])[0])
+    claim = claim_of(channel)
+    linear = lmmse(lifted_system(plant, sensor, channel, 1, horizon), claim)
+    products = lmmse(memory_system(plant, sensor, channel, linear), linear.claim)
+    names = first(plant).states
+    return MemoryFilter(ScheduledFilter(linear, names), ScheduledFilter(products, names), products.claim)
+
+
+def claim_of(channel: Channel) -> Claim:
+    """ "exact" if the channel's law is known, "nominal" if some probability is uncertain."""
+    if first(channel).remembers:
+        return "nominal" if uncertain_chain(channel) else claim_of_modes(channel)
+    items: list[AbstractRandomAffine] = unstack(channel) if isinstance(channel, OverTime) else [first(channel)]
+    return "exact" if all(c.corner_count() == 1 for c in items) else "nominal"

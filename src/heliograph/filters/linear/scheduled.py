@@ -1,0 +1,223 @@
+"""Filters whose gains were computed before any data, and the same recursion on-line for data with gaps."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.correction import covariance_after
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.plan import plan
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import linear_smoother_step
+from heliograph.linear.recursion import RANK_TOLERANCE
+from heliograph.linear.schedule import Gains, Schedule
+from heliograph.linear.system import LinearSystem, Steps
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.check import instance, names
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import eigh
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+
+
+class ScheduleState(NamedTuple):
+    """The schedule's state (N,), the estimate's mean (q,), what is expected next (m,), and whether all has arrived.
+
+    `stage` is the place of the covariance: 0 at the start, 2 k + 1 before and 2 k + 2 after the correction of step k.
+    """
+
+    value: Float[jax.Array, " N"]
+    mean: Float[jax.Array, " q"]
+    expected: Float[jax.Array, " m"]
+    complete: Bool[jax.Array, ""]
+    stage: Int[jax.Array, ""]
+
+
+class ScheduledFilter(AbstractFilter):
+    """Run a schedule: s+ = F s + K z + c, xhat = L s + J z + d. A step costs a few products of a matrix and a vector.
+
+    Predicted is what follows if what the schedule expects arrives, e = G s + g; a correction adds K (z - e) and
+    J (z - e). The claimed covariance is the schedule's, and it is computed for complete data. A component that did not
+    arrive counts as what the filter expected, and from then on the covariance is NaN: none is known any more, and the
+    record says so; what no gain of the step uses cannot be missed (a planned silence). Where data have gaps, use
+    `LinearSystemFilter`, which recomputes its gains. Before its first prediction a schedule estimates nothing (NaN).
+
+    Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
+    """
+
+    gains: OverTime
+    covariances: np.ndarray
+    start: np.ndarray
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, schedule: Schedule, states: Sequence[str] | None = None):
+        instance("schedule", schedule, Schedule, "a Schedule")
+        g = schedule.gains
+        self.gains = OverTime(_if_expected(g))
+        known = np.stack([g.predicted, g.covariance], axis=1).reshape(-1, *g.covariance.shape[1:])
+        self.covariances = np.concatenate([np.full_like(known[:1], np.nan), known])
+        self.start, self.claim = schedule.start, schedule.claim
+        self.states, self.inputs = names("state names", states, g.direct.shape[1], "x"), ()
+        self.received = g.direct.shape[2]
+
+    @in_float64
+    def init(self) -> ScheduleState:
+        """The schedule's start."""
+        mean, expected = jnp.full(len(self.states), jnp.nan), jnp.full(self.received, jnp.nan)
+        return ScheduleState(jnp.asarray(self.start), mean, expected, jnp.asarray(True), jnp.asarray(0))
+
+    @predicts
+    def predict(self, state: ScheduleState, u: ArrayLike = (), k: Step = 0) -> ScheduleState:
+        """What follows if what is expected arrives."""
+        g: Gains = at(self.gains, k)
+        s = state.value
+        return ScheduleState(
+            g.transition @ s + g.offset,
+            g.output @ s + g.output_offset,
+            g.expected @ s + g.expected_offset,
+            state.complete,
+            jnp.asarray(2 * k + 1, dtype=state.stage.dtype),
+        )
+
+    @corrects
+    def correct(self, state: ScheduleState, z: ArrayLike, k: Step = 0) -> tuple[ScheduleState, Innovation]:
+        """Add what was not expected, times the gains of step k."""
+        g: Gains = at(self.gains, k)
+        z = jnp.asarray(z)
+        present = ~jnp.isnan(z)
+        observed = jnp.where(present, z - state.expected, 0.0)
+        unused = jnp.all(g.gain == 0, axis=0) & jnp.all(g.direct == 0, axis=0)
+        after = ScheduleState(
+            state.value + g.gain @ observed,
+            state.mean + g.direct @ observed,
+            state.expected,
+            state.complete & jnp.all(present | unused),
+            jnp.asarray(2 * k + 2, dtype=state.stage.dtype),
+        )
+        return after, gaussian_innovation(z, state.expected, jnp.where(state.complete, g.innovation, jnp.nan))
+
+    @in_float64
+    def estimate(self, state: ScheduleState) -> Estimate:
+        """The estimate's mean, with the schedule's covariance while all has arrived."""
+        return self._estimate(state, state.stage)
+
+    def after_step(self, state: ScheduleState, k: Step) -> Estimate:
+        """The same, its place taken from the step: it is then common to all runs."""
+        return self._estimate(state, 2 * k + 2)
+
+    def _estimate(self, state: ScheduleState, stage: Step) -> Estimate:
+        claimed = jnp.where(state.complete, jnp.asarray(self.covariances)[stage], jnp.nan)
+        return Estimate(state.mean, claimed, self.claim)
+
+
+def _if_expected(g: Gains) -> Gains:
+    """The gains with e = G s + g in place of z: (F + K G) s + c + K g, (L + J G) s + d + J g."""
+    return g._replace(
+        transition=g.transition + g.gain @ g.expected,
+        offset=g.offset + np.einsum("tim,tm->ti", g.gain, g.expected_offset),
+        output=g.output + g.direct @ g.expected,
+        output_offset=g.output_offset + np.einsum("tim,tm->ti", g.direct, g.expected_offset),
+    )
+
+
+class LinearSystemFilter(AbstractFilter):
+    """The best linear filter of a linear system, with its covariance carried along: exact also for data with gaps.
+
+    A component of z that did not arrive is left out of the step, as if that channel were off. Which components arrive
+    must not depend on their values.
+    """
+
+    steps: OverTime
+    mean: np.ndarray
+    covariance: np.ndarray
+    projection: np.ndarray
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, system: LinearSystem, claim: Claim = "exact", states: Sequence[str] | None = None):
+        instance("system", system, LinearSystem, "a LinearSystem")
+        self.steps = OverTime(system.steps)
+        self.mean, self.covariance, self.projection = system.mean, system.covariance, system.projection
+        self.claim, self.inputs = claim, ()
+        self.states = names("state names", states, len(system.projection), "x")
+        self.received = system.steps.offset.shape[-1]
+
+    @in_float64
+    def init(self) -> Belief:
+        """The system's start."""
+        return Belief(jnp.asarray(self.mean), jnp.asarray(self.covariance))
+
+    @predicts
+    def predict(self, state: Belief, u: ArrayLike = (), k: Step = 0) -> Belief:
+        """A y + a and A P A' + Cov(w)."""
+        s: Steps = at(self.steps, k)
+        return Belief(s.transition @ state.mean + s.drift, s.transition @ state.covariance @ s.transition.T + s.process)
+
+    @corrects
+    def correct(self, state: Belief, z: ArrayLike, k: Step = 0) -> tuple[Belief, Innovation]:
+        """Use what arrived of z."""
+        s: Steps = at(self.steps, k)
+        z, (mean, spread) = jnp.asarray(z), state
+        present = ~jnp.isnan(z)
+        expected, total = s.output @ mean + s.offset, s.output @ spread @ s.output.T + s.noise
+        cross = jnp.where(present[:, None], s.output @ spread, 0.0)
+        observed, both = jnp.where(present[:, None], s.output, 0.0), present[:, None] & present
+        used, noise = jnp.where(both, total, 0.0), jnp.where(both, s.noise, 0.0)
+        solved = pseudo_solve(used, cross)
+        after = Belief(
+            mean + solved.T @ jnp.where(present, z - expected, 0.0),
+            covariance_after(spread, cross, used, solved, observed, noise),
+        )
+        return after, gaussian_innovation(z, expected, total)
+
+    @in_float64
+    def estimate(self, state: Belief) -> Estimate:
+        """What is to be known of the belief."""
+        projection = jnp.asarray(self.projection)
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
+
+    def smoother_step(
+        self, before: Belief, prior: Belief, after: Belief, innovation_: Innovation, z: ArrayLike, u: ArrayLike, k: Step
+    ) -> AbstractSmootherStep:
+        """The update itself."""
+        s: Steps = at(self.steps, k)
+        innovation = jnp.asarray(z) - s.output @ prior.mean - s.offset
+        total = s.output @ prior.covariance @ s.output.T + s.noise
+        return linear_smoother_step(
+            after,
+            prior,
+            s.transition,
+            s.process,
+            s.output,
+            innovation,
+            total,
+            self.claim,
+            self.projection,
+            pseudo_solve,
+        )
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs, self.projection)
+
+
+def pseudo_solve(innovation: jax.Array, cross: jax.Array) -> jax.Array:
+    """O^+ C as in heliograph.linear.recursion; rows of zeros (absent components) are skipped."""
+    deviation = jnp.sqrt(jnp.maximum(jnp.diagonal(innovation), 0.0))
+    scale = jnp.where(deviation > 0, 1 / jnp.where(deviation > 0, deviation, 1.0), 0.0)
+    values, vectors = eigh(scale[:, None] * innovation * scale)
+    used = values > RANK_TOLERANCE * values[-1]
+    inverse = jnp.where(used, 1 / jnp.where(used, values, 1.0), 0.0)
+    root = scale[:, None] * vectors
+    return jnp.asarray((root * inverse) @ (root.T @ cross))

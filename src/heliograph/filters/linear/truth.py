@@ -1,0 +1,120 @@
+"""The true error of a filter whose gains depend on no data, before any data: whatever the filter believes."""
+
+from dataclasses import dataclass
+
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.linear.plan import Plan, PlannedFilter
+from heliograph.filters.modes.modal import ObservationModel, observation_models
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.over_time import at, first
+from heliograph.model.past import with_past
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import array, check_horizon, fail, instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float
+
+
+@readable
+@dataclass(frozen=True)
+class TrueError:
+    """What a filter claims of its error, and what it is: both (time, n, n), after each correction."""
+
+    states: tuple[str, ...]
+    claimed: Float[np.ndarray, "time n n"]
+    true: Float[np.ndarray, "time n n"]
+
+    @property
+    def ratio(self) -> Float[np.ndarray, "time n"]:
+        """True over claimed variance of each state."""
+        return np.asarray(np.diagonal(self.true, axis1=1, axis2=2) / np.diagonal(self.claimed, axis1=1, axis2=2))
+
+
+@in_float64
+def true_error(
+    filter: AbstractFilter,
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    horizon: int,
+    inputs: ArrayLike | None = None,
+) -> TrueError:
+    """E[(x - xhat)(x - xhat)'] of a linear filter in a world that it need not have been made for, exactly.
+
+    With r = (x, 1, s), s the filter's state, N_j = E[r r' 1{mode j}] is propagated through plant, channel and gains.
+    The channel may remember or not, or be late, and nothing is assumed of where the gains come from.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a filter whose gains depend on data, a plant or sensor that is not linear, parts that do not fit, a
+            channel that loses data.
+    Source: the moments of jump linear systems, as in Costa, Fragoso and Marques (2005), for the filter's state too.
+    """
+    check_linear("true error", plant, sensor)
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    start, n = first(plant), len(first(plant).states)
+    check_link(first(sensor), first(channel), n, late=True)
+    if filter.received != first(channel).outputs or len(filter.states) != n:
+        got = f"one of {len(filter.states)} that hears {filter.received}"
+        raise fail("filter", f"one of {n} states that hears {first(channel).outputs} numbers", got)
+    u = array("inputs", np.zeros((check_horizon(horizon), 0)) if inputs is None else inputs, (horizon, None))
+    planned = filter.planned(u)
+    if not isinstance(planned, PlannedFilter):
+        raise fail("filter", "one whose gains depend on no data", type(filter).__name__)
+    if first(channel).past:
+        plant, sensor, channel = with_past(plant, sensor, channel)
+    begin, total = first(plant), len(first(plant).states)
+    initial, world = observation_models(channel)
+    projection = np.eye(n) if planned.projection is None else np.asarray(planned.projection)
+    mean = np.concatenate([begin.initial_mean, [1.0], planned.start])
+    square = np.outer(mean, mean)
+    square[:total, :total] += begin.initial_covariance
+    moments, true = np.asarray(initial)[:, None, None] * square, []
+    row = np.concatenate([np.eye(n, total + 1), -projection], axis=1)
+    for k in range(horizon):
+        rows = np.eye(len(moments)) if k == 0 else np.asarray(at(world, k).transition)
+        moments = _moved(moments, at(plant, k), at(planned.steps, k), u[k], rows)
+        moments = _corrected_moments(moments, at(sensor, k), at(world, k), at(planned.steps, k))
+        true.append(row @ moments.sum(axis=0) @ row.T)
+    return TrueError(start.states, np.asarray(planned.covariances)[2 : 2 * horizon + 1 : 2], np.array(true))
+
+
+def _moved(moments: np.ndarray, plant: LinearPlant, plan: Plan, u: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """x+ = A x + b + w and s- = F s + f, and the modes move."""
+    n = len(plant.matrix)
+    size = moments.shape[-1]
+    move = np.zeros((size, size))
+    move[:n, :n], move[n, n] = plant.matrix, 1.0
+    move[:n, n] = plant.input_matrix @ u + np.asarray(plant.noise_mean())
+    move[n + 1 :, n + 1 :], move[n + 1 :, n] = plan.transition, plan.drift
+    noise = np.zeros((size, size))
+    noise[:n, :n] = plant.noise_covariance(jnp.asarray(u))
+    moved: np.ndarray = np.einsum("ij,iab->jab", rows, move @ moments @ move.T + moments[:, n, n, None, None] * noise)
+    return moved
+
+
+def _corrected_moments(moments: np.ndarray, sensor: LinearSensor, world: ObservationModel, plan: Plan) -> np.ndarray:
+    """s = s- + K (z - C s- - c), z = (G, n) of the mode of y~ = C~ x~ + v."""
+    n, p = sensor.matrix.shape[1], sensor.matrix.shape[0]
+    size, gain = moments.shape[-1], np.asarray(plan.gain)
+    measure, noise = np.zeros((p + 1, n + 1)), np.zeros((p + 1, p + 1))
+    measure[:p, :n], measure[:p, n], measure[p, n] = sensor.matrix, sensor.noise.mean, 1.0
+    noise[:p, :p] = sensor.noise.covariance
+    result = []
+    for moment, mean, spread in zip(moments, np.asarray(world.mean), np.asarray(world.spread), strict=True):
+        law = moment[n, n]
+        use = np.eye(size)
+        use[n + 1 :, : n + 1] += gain @ mean @ measure
+        use[n + 1 :, n + 1 :] -= gain @ plan.output
+        use[n + 1 :, n] -= gain @ plan.offset
+        second = measure @ moment[: n + 1, : n + 1] @ measure.T + law * noise
+        added = np.einsum("mlab,ab->ml", spread, second) + law * mean @ noise @ mean.T
+        after = use @ moment @ use.T
+        after[n + 1 :, n + 1 :] += gain @ added @ gain.T
+        result.append(after)
+    return np.array(result)

@@ -1,0 +1,1 @@
+"""Filters of links with modes: observed, observed late, or hidden."""

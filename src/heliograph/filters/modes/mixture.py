@@ -1,0 +1,230 @@
+"""A filter that knows the full finite-support laws: every combination of gains and noises, then one Gaussian again."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.innovation import log_density, mixed_innovation
+from heliograph.filters.modes.combinations import COMPONENT_LIMIT, atoms_of
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.model.angle import received_angles
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, is_linear
+from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.check import fail, scalar
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import cholesky, psd_solve, symmetrize
+from heliograph.numerics.module import Module
+from heliograph.numerics.small_matrix import with_rounding
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, memories
+from heliograph.random_affine.chain import Autoregression
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.modes import JointModes, joint_modes
+
+
+class Components(Module):
+    """All combinations of one step: in their `mode` of the links they have the probability `weight`.
+
+    transition: of the modes from the step before; one mode where nothing remembers.
+
+    Shapes: weight, mode (a,), gain (a, m, n), offset (a, m), noise (a, m, m), transition (M, M).
+    """
+
+    weight: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+    noise: np.ndarray
+    mode: np.ndarray
+    transition: np.ndarray
+
+
+class MixtureBelief(NamedTuple):
+    """One Gaussian for the state, and the modes' probabilities; `moved` once the chain was used.
+
+    Shapes: mean (n,), covariance (n, n), law (M,).
+    """
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    law: Float[jax.Array, " M"]
+    moved: Bool[jax.Array, ""]
+
+
+class MixtureFilter(AbstractFilter):
+    """One Gaussian for the state; at each step every combination of the measurement's atoms, then moments matched.
+
+    With z = G_a x + c_a + N(0, R_a) and probability p_a, the posterior is a mixture of as many Gaussians with weights
+    p_a N(z; G_a m + c_a, G_a P G_a' + R_a); its mean and covariance are kept (GPB1). Behind links that remember p_a is
+    the mode's probability times that of the combination in it; the modes' probabilities are carried along, but not what
+    the state owes to the mode. Nominal: after the first step the prior is not Gaussian, and process noise enters by its
+    covariance only. The log-likelihood is that of the mixture, log sum_a p_a N(z; ...); the innovation's covariance is
+    the mixture's too. A value that no combination leaves says nothing: its log-likelihood is -inf, the state stays.
+
+    Source: Ackerson and Fu, On state estimation in switching environments (1970), with random gains as modes.
+    """
+
+    plant: AnyPlant
+    components: Components | OverTime
+    initial: Float[Array, " M"]
+    observed_angles: Angles = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @property
+    def of_atoms(self) -> bool:
+        """It is a mixture over atoms."""
+        return True
+
+    @in_float64
+    def init(self) -> MixtureBelief:
+        """The prior, and the law of the modes at the first use."""
+        start = at(self.plant, 0)
+        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+        return MixtureBelief(mean, spread, jnp.asarray(self.initial), jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
+        """A m + B u + E w and A P A' + Q; the modes move from their second use on."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
+        law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)
+        return MixtureBelief(plant.transition(state.mean, u) + plant.noise_mean(), spread, law, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: MixtureBelief, z: ArrayLike, k: Step = 0) -> tuple[MixtureBelief, Innovation]:
+        """Weigh the combinations by what arrived of z."""
+        c, z, (mean, spread, law, _) = at(self.components, k), jnp.asarray(z), state
+        prior = law[c.mode] * jnp.asarray(c.weight)
+        present = ~jnp.isnan(z)
+        both = present[:, None] & present
+
+        def condition(gain: jax.Array, offset: jax.Array, noise: jax.Array) -> tuple[jax.Array, ...]:
+            cross = jnp.where(present[:, None], gain @ spread, 0.0)
+            total = jnp.where(both, gain @ spread @ gain.T + noise, 0.0) + jnp.diag(jnp.where(present, 0.0, 1.0))
+            value = wrapped(z - gain @ mean - offset, self.observed_angles)
+            observed = jnp.where(present, value, 0.0)
+            solved = psd_solve(total, jnp.concatenate([cross, observed[:, None]], axis=1))
+            free = jnp.diagonal(cholesky(total)) > 0
+            likelihood = log_density(value, total, jnp.abs(z) + jnp.abs(z - value))
+            return likelihood, jnp.sum(~free), cross.T @ solved[:, -1], cross.T @ solved[:, :-1], value, total
+
+        likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
+        weighed = sharpest(likelihood, certain) + jnp.log(prior)
+        excluded = jnp.max(weighed) == -jnp.inf  # no combination leaves such a value: it says nothing
+        weight = jax.nn.softmax(jnp.where(excluded, jnp.log(prior), weighed))
+        shift = weight @ moved
+        apart = moved - shift
+        after = (
+            with_rounding(spread, len(z))
+            - jnp.einsum("a,aij->ij", weight, known)
+            + jnp.einsum("a,ai,aj->ij", weight, apart, apart)
+        )
+        value = nearest(value, value[jnp.argmax(prior)], self.observed_angles)
+        innovation = mixed_innovation(prior, value, jnp.where(both, total, jnp.nan), jax.nn.logsumexp(weighed))
+        modes = jnp.zeros(len(law)).at[c.mode].add(weight)
+        result = MixtureBelief(mean + shift, symmetrize(after), modes, state.moved)
+        return jax.tree.map(lambda old, new: jnp.where(excluded, old, new), state, result), innovation
+
+    @in_float64
+    def estimate(self, state: MixtureBelief) -> Estimate:
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.plant).angles), state.covariance, self.claim)
+
+    def smoother_step(
+        self,
+        before: MixtureBelief,
+        prior: MixtureBelief,
+        after: MixtureBelief,
+        innovation: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
+        """The moments around the update."""
+        cross = before.covariance @ at(self.plant, k).matrix.T
+        return moments_smoother_step(after, prior, cross, "nominal", first(self.plant).angles)
+
+
+def sharpest(likelihood: Float[Array, " a"], certain: Int[Array, " a"]) -> Float[Array, " a"]:
+    """-inf for a combination that another one, which z agrees with, outweighs by a density that knows no bound.
+
+    A combination that says `certain` components exactly has a point mass there, against which a density is nothing.
+    """
+    agrees = jnp.isfinite(likelihood)
+    most = jnp.max(jnp.where(agrees, certain, -1))
+    return jnp.where(agrees & (certain < most), -jnp.inf, likelihood)
+
+
+def mixture_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel, resolution: float = 0.0) -> MixtureFilter:
+    """The near limit of what the measurements hold, for gains and noises of finitely many values.
+
+    Gains may be constant or discrete, noises of finite support (used atom by atom) or Gaussian. `resolution` is a
+    standard deviation added to z, for a z that is not the model's to the last digit: a combination of atoms that
+    leaves z without any randomness, as a link that is off does, is believed where z agrees with it, and only there.
+
+    Behind links that remember it carries the modes' probabilities, in one Gaussian for all; `imm_filter` and
+    `gpb2_filter` keep one for each mode. Behind slow fading its claim is too small.
+
+    Claim: "nominal".
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a gain that drifts, parts that do not fit, a law with no
+            atoms, more than COMPONENT_LIMIT combinations.
+    Source: Ackerson and Fu (1970), first-order generalised pseudo-Bayes.
+    """
+    if not is_linear(plant, sensor):
+        got = f"{type(first(plant)).__name__} and {type(first(sensor)).__name__}"
+        raise fail("mixture filter", "a LinearPlant and a LinearSensor", got)
+    check_link(first(sensor), first(channel), len(first(plant).states))
+    angles = received_angles(plant, sensor, channel)
+    floor, start = float(scalar("resolution", resolution, 0.0, 1e100)) ** 2, first(plant)
+    if isinstance(channel, AbstractRandomAffine) and not isinstance(sensor, OverTime):
+        modes = [_modes(channel)]
+        components: Components | OverTime = _components(sensor, modes[0], modes[0], floor)
+    else:
+        steps = min(item.steps for item in (sensor, channel) if isinstance(item, OverTime))
+        sensors, channels = (unstack(i)[:steps] if isinstance(i, OverTime) else [i] * steps for i in (sensor, channel))
+        modes = [_modes(c) for c in channels if isinstance(c, AbstractRandomAffine)]
+        items = zip(sensors, modes, [modes[0], *modes[:-1]], strict=True)
+        components = over_time([_components(s, now, before, floor) for s, now, before in items])
+    return MixtureFilter(
+        plant=plant,
+        components=components,
+        initial=modes[0].initial,
+        observed_angles=angles,
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def _modes(channel: AbstractRandomAffine) -> JointModes:
+    if any(isinstance(memory, Autoregression) for memory in memories(channel).values()):
+        raise fail("mixture filter", "gains of finitely many values", "one that drifts")
+    return joint_modes(channel)
+
+
+def _components(sensor: AnySensor, now: JointModes, before: JointModes, floor: float) -> Components:
+    assert isinstance(sensor, LinearSensor)  # checked before
+    received = GainAndNoise(Constant(1.0), sensor.matrix, sensor.noise)
+    parts = [(c, i) for i, m in enumerate(now.maps) for c in atoms_of(Series([received, m])) if c.weight > 0]
+    if len(parts) > COMPONENT_LIMIT:
+        raise fail("mixture filter", f"at most {COMPONENT_LIMIT:,} combinations of atoms", f"{len(parts):,}")
+    mode = np.array([i for _, i in parts])
+    weight, gain, offset, noise = (np.array(column) for column in zip(*(c for c, _ in parts), strict=True))
+    noise = noise + floor * np.eye(noise.shape[-1])
+    return Components(weight, gain, offset, noise, mode, np.asarray(before.transition))

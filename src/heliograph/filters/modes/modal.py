@@ -1,0 +1,300 @@
+"""The best linear filter behind links that remember: it estimates the state together with the mode of the links.
+
+With x~ = (x, 1) and modes theta, zeta^j = x~ 1{theta = j}. Its step and what is heard of it are linear and their noises
+white, E[zeta+ | past] = F zeta with F[j, i] = Pi[i, j] A~_j, and E[z | zeta, past] = sum_j Hbar_j C~ zeta^j, so that a
+Kalman filter of zeta is the best linear filter of x = sum_j zeta^j. All moments are those of x~ = (x - c, 1), c = E[x]
+without data: a mean far from zero, which the modes' indicators multiply, would leave no digits for the rest.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.correction import absent, gain_and_covariance
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.plan import plan
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import linear_smoother_step
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import symmetrize
+from heliograph.numerics.module import Module
+from heliograph.numerics.traced import stacked
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.second_moments import nominal_spread
+
+
+class ObservationModel(Module):
+    """A channel at one step, mode by mode: E[(G, n) | mode], E[((G, n) - mean) Y ((G, n) - mean)' | mode] as a tensor.
+
+    transition: of the modes from the step before to this one; radius: how far each may be off.
+
+    Shapes: transition and radius (M, M), mean (M, m, p + 1), spread (M, m, m, p + 1, p + 1).
+    """
+
+    transition: Float[Array, "M M"]
+    radius: Float[Array, "M M"]
+    mean: Float[Array, "M m p1"]
+    spread: Float[Array, "M m m p1 p1"]
+
+
+class ModalBelief(NamedTuple):
+    """Estimate of zeta, mode after mode, its error's covariance, E[x~ x~' 1{mode}] before any data, and if it moved.
+
+    centre c = E[x] without data; P(mode) c is part of the mean, whose sum over the modes is that of x.
+
+    Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1), centre (n,).
+    """
+
+    mean: Float[jax.Array, " N"]
+    covariance: Float[jax.Array, "N N"]
+    moments: Float[jax.Array, "M n1 n1"]
+    centre: Float[jax.Array, " n"]
+    moved: Bool[jax.Array, ""]
+
+
+class ModalFilter(AbstractFilter):
+    """The linear minimum-mean-square-error filter of a linear plant behind links that remember.
+
+    The estimate of zeta holds that of the modes' probabilities; its covariance is singular, since the modes' indicators
+    sum to 1, and is never inverted. Which components arrive must not depend on the modes. The innovation's covariance
+    is exact; it is not Gaussian, so its Gaussian likelihood is nominal.
+
+    Source: Costa, Linear minimum mean square error estimation for discrete-time Markovian jump linear systems (1994).
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: ObservationModel | OverTime
+    initial: Float[Array, " M"]
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ModalBelief:
+        """The prior, independent of the mode."""
+        law, (centre, covariance, second) = jnp.asarray(self.initial), prior_of_modes(at(self.plant, 0), self.initial)
+        moments = law[:, None, None] * second
+        return ModalBelief(jnp.kron(law, jnp.append(centre, 1.0)), covariance, moments, centre, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
+        """The plant moves x~, the chain the mode; at the first use the mode has its initial law.
+
+        Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
+        """
+        step, move, noise, centre, rows = self._moves(state, u, k)
+        modes, size = len(state.moments), len(move)
+        carried = move @ state.moments @ move.T
+        added = (state.moments[:, -1, -1] @ rows)[:, None, None] * noise
+        moments = jnp.einsum("ij,iab->jab", rows, carried) + added
+        chosen = rows[:, :, None] * (jnp.eye(modes) - rows[:, None, :])  # Cov(1{j}, 1{l} | mode i)
+        fresh = jnp.einsum("ijl,iab->jalb", chosen, carried).reshape(modes * size, modes * size) + blocks(added)
+        covariance = symmetrize(step @ state.covariance @ step.T + fresh)
+        law = state.moments[:, -1, -1]
+        mean = step @ (state.mean - known_part(law, state.centre)) + known_part(law @ rows, centre)
+        return ModalBelief(mean, covariance, moments, centre, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: ModalBelief, z: ArrayLike, k: Step = 0) -> tuple[ModalBelief, Innovation]:
+        """Use what arrived of z.
+
+        Cov(z - E[z | zeta]) = sum_j T_j(C~ E_j C~' + P(j) R~) + P(j) Hbar_j R~ Hbar_j', T_j the spread of mode j.
+        """
+        observed, added, common = self._observe(state, k)
+        expected = common + observed @ (state.mean - known_part(state.moments[:, -1, -1], state.centre))
+        mean, covariance, innovation = linear_observation(state.mean, state.covariance, observed, added, expected, z)
+        return state._replace(mean=mean, covariance=covariance), innovation
+
+    def _moves(self, state: ModalBelief, u: ArrayLike, k: Step) -> tuple[jax.Array, ...]:
+        """F, the plant's A~ and Q~, where c moves, and the rows of the chain."""
+        move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
+        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(state.moments)))
+        return jnp.kron(rows.T, move), move, noise, centre, rows
+
+    def _observe(self, state: ModalBelief, k: Step) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """What is heard of zeta beyond what all modes send, Cov(z - E[z | zeta]), and what all modes send."""
+        channel = at(self.channel, k)
+        gains, (measure, noise) = jnp.asarray(channel.mean), measured_about(at(self.sensor, k), state.centre)
+        law = state.moments[:, -1, -1]
+        second = measure @ state.moments @ measure.T + law[:, None, None] * noise
+        added = jnp.einsum("jmlab,jab->ml", jnp.asarray(channel.spread), second)
+        added = added + jnp.einsum("j,jma,ab,jlb->ml", law, gains, noise, gains)
+        observed, common = without_common(gains @ measure, law)
+        return joined(observed), added, common
+
+    @in_float64
+    def estimate(self, state: ModalBelief) -> Estimate:
+        """x = sum_j zeta^j."""
+        projection = sum_of_modes(len(self.states), len(self.initial))
+        return Estimate(projection @ state.mean, projection @ state.covariance @ projection.T, self.claim)
+
+    def smoother_step(
+        self,
+        before: ModalBelief,
+        prior: ModalBelief,
+        after: ModalBelief,
+        innovation: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
+        """The update of zeta itself."""
+        output, _, _ = self._observe(prior, k)
+        return linear_smoother_step(
+            after,
+            prior,
+            self._moves(before, u, k)[0],
+            None,
+            output,
+            innovation.value,
+            innovation.covariance,
+            self.claim,
+            sum_of_modes(len(self.states), len(self.initial)),
+        )
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all covariances and gains computed before."""
+        return plan(self, inputs, sum_of_modes(len(self.states), len(self.initial)))
+
+
+def sum_of_modes(n: int, modes: int) -> Float[np.ndarray, "n N"]:
+    """The matrix that takes zeta to x = sum_j zeta^j."""
+    return np.tile(np.eye(n, n + 1), (1, modes))
+
+
+def linear_observation(
+    mean: Float[jax.Array, " N"],
+    covariance: Float[jax.Array, "N N"],
+    received: Float[jax.Array, "m N"],
+    added: Float[jax.Array, "m m"],
+    expected: Float[jax.Array, " m"],
+    z: ArrayLike,
+) -> tuple[jax.Array, jax.Array, Innovation]:
+    """Mean and covariance of zeta after what arrived of z, whose covariance given zeta is `added`."""
+    z = jnp.asarray(z)
+    present = ~jnp.isnan(z)
+    both = present[:, None] & present
+    cross = received @ covariance
+    total = cross @ received.T + added
+    gain, after = gain_and_covariance(
+        covariance,
+        jnp.where(present[:, None], cross, 0.0),
+        jnp.where(both, total, 0.0) + absent(present),
+        jnp.where(present[:, None], received, 0.0),
+        jnp.where(both, added, 0.0) + absent(present),
+    )
+    return mean + gain @ jnp.where(present, z - expected, 0.0), after, gaussian_innovation(z, expected, total)
+
+
+def move_matrix(plant: LinearPlant, u: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """A~ = [[A, B u + E w], [0, 1]] and Q~ = diag(Q, 0)."""
+    shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+    move = padded(jnp.asarray(plant.matrix)).at[:-1, -1].set(shift).at[-1, -1].set(1.0)
+    return move, padded(plant.noise_covariance(u))
+
+
+def measure_matrix(sensor: LinearSensor) -> tuple[jax.Array, jax.Array]:
+    """C~ = [[C, E v], [0, 1]] and R~ = diag(R, 0)."""
+    measure = padded(jnp.asarray(sensor.matrix)).at[:-1, -1].set(sensor.noise.mean).at[-1, -1].set(1.0)
+    return measure, padded(jnp.asarray(sensor.noise.covariance))
+
+
+def prior_of_modes(start: LinearPlant, law: Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """c, Cov(zeta) = diag(p) x P_0~ + (diag(p) - p p') x e e' with e = E[x~] = (0, 1), and E[x~ x~'], at the start."""
+    spread, law = padded(jnp.asarray(start.initial_covariance)), jnp.asarray(law)
+    square = jnp.zeros_like(spread).at[-1, -1].set(1.0)
+    covariance = jnp.kron(jnp.diag(law), spread) + jnp.kron(jnp.diag(law) - jnp.outer(law, law), square)
+    return jnp.asarray(start.initial_mean), covariance, spread + square
+
+
+def known_part(law: jax.Array, centre: jax.Array) -> jax.Array:
+    """P(mode) c, mode after mode."""
+    return jnp.kron(law, jnp.append(centre, 0.0))
+
+
+def moved_about(plant: LinearPlant, u: ArrayLike, centre: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """A~ and Q~ of x - c, which no known input moves, and c one step later."""
+    move, noise = move_matrix(plant, jnp.asarray(u))
+    return move.at[:-1, -1].set(0.0), noise, move[:-1] @ jnp.append(centre, 1.0)
+
+
+def measured_about(sensor: LinearSensor, centre: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """C~ and R~ of the same: y = C (x - c) + C c + E v."""
+    measure, noise = measure_matrix(sensor)
+    return measure.at[:-1, -1].add(measure[:-1, :-1] @ centre), noise
+
+
+def without_common(output: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What the modes send beside what is sent on average (the indicators sum to 1: it tells nothing of them), and that.
+
+    Shapes: output (M, m, n + 1), law (M,) -> (M, m, n + 1), (m,).
+    """
+    common = law @ output[:, :, -1] / jnp.sum(law)
+    return output.at[:, :, -1].add(-common), common
+
+
+def joined(output: jax.Array) -> jax.Array:
+    """(M, m, n + 1) as one matrix (m, N) that reads zeta."""
+    return jnp.concatenate(list(output), axis=1)
+
+
+def padded(a: jax.Array) -> jax.Array:
+    """[[A, 0], [0, 0]]."""
+    return jnp.pad(a, ((0, 1), (0, 1)))
+
+
+def blocks(parts: jax.Array) -> jax.Array:
+    """(M, s, s) on the diagonal of (M s, M s)."""
+    modes, size, _ = parts.shape
+    placed = jnp.eye(modes)[:, None, :, None] * parts[:, :, None, :]
+    return placed.reshape(modes * size, modes * size)
+
+
+def modal_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModalFilter:
+    """The best linear filter behind a channel that remembers; `linear_filter` has checked that the parts fit."""
+    start, (initial, described) = first(plant), observation_models(channel)
+    return ModalFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        initial=initial,
+        claim=claim_of_modes(channel),
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def observation_models(channel: Channel) -> tuple[Float[Array, " M"], ObservationModel | OverTime]:
+    """Law of the modes at the first step, and what is heard at each; a channel that forgets has one mode."""
+    if not isinstance(channel, OverTime):
+        modes = joint_modes(channel)
+        return modes.initial, observation_model(modes, modes)
+    steps = [joint_modes(c) for c in unstack(channel)]
+    items = [observation_model(step, before) for step, before in zip(steps, [steps[0], *steps[:-1]], strict=True)]
+    return steps[0].initial, over_time(items)
+
+
+def observation_model(now: JointModes, before: JointModes) -> ObservationModel:
+    """What a filter reads of the modes at one step, and of the transition that leads there from the step before."""
+    mean = stacked([m.moments(1).mean[:-1] for m in now.maps])
+    spread = stacked([nominal_spread(m).center for m in now.maps])
+    return ObservationModel(before.transition, before.radius, mean, spread)
+
+
+def claim_of_modes(channel: Channel) -> Claim:
+    """ "exact" if the law of every mode is known, "nominal" if some probability in it is uncertain."""
+    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
+    return "exact" if all(m.corner_count() == 1 for c in steps for m in joint_modes(c).maps) else "nominal"

@@ -1,0 +1,209 @@
+"""Filters that are told what the links remember: now, or one step late, when the last update is redone with it."""
+
+from itertools import product
+from math import prod
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
+from heliograph.filters.linear.linear import LinearBelief, moved, signal, used
+from heliograph.filters.modes.modal import claim_of_modes
+from heliograph.filters.modes.side_information import with_flag
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
+from heliograph.model.over_time import OverTime, at, first, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import fail
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, Bool, Float
+from heliograph.random_affine.base import AbstractRandomAffine, given, memories
+from heliograph.random_affine.combine import Mixture
+from heliograph.random_affine.modes import degree_in
+from heliograph.random_affine.moments.second_moments import QuadraticMap, SecondOrder, nominal_spread
+
+Moved = tuple[jax.Array, jax.Array, jax.Array]
+
+
+class ModeObservedBelief(NamedTuple):
+    """The belief; that before the last correction, what was heard then, and how the plant moved since.
+
+    Shapes: z (m,), move ((n, n), (n,), (n, n)).
+    """
+
+    belief: LinearBelief
+    before: LinearBelief
+    z: Float[jax.Array, " m"]
+    move: Moved
+    begun: Bool[jax.Array, ""]
+
+    @property
+    def mean(self) -> Float[jax.Array, " n"]:
+        """The estimate's mean."""
+        return self.belief.mean
+
+
+class ModeObservedFilter(AbstractFilter):
+    """The best linear filter given what the links remember, at each step with z, or of the step before (`late`).
+
+    It hears z and the states of the memories after it, as `with_flag` delivers them. Late, the last update is redone
+    with the mode that is now known, then z is used under the law of the mode that follows. Where a state is missing z
+    is not used.
+
+    Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: Channel
+    late: bool = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ModeObservedBelief:
+        """The prior."""
+        start = at(self.plant, 0)
+        mean, spread = jnp.asarray(start.initial_mean), jnp.asarray(start.initial_covariance)
+        belief = LinearBelief(mean, spread, mean, spread)
+        nothing = jnp.full(first(self.channel).outputs, jnp.nan)
+        still = jnp.eye(len(mean)), jnp.zeros(len(mean)), jnp.zeros_like(spread)
+        return ModeObservedBelief(belief, belief, nothing, still, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModeObservedBelief, u: ArrayLike = (), k: Step = 0) -> ModeObservedBelief:
+        """Both moments over step k."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+        move = jnp.asarray(plant.matrix), shift, jnp.asarray(plant.noise_covariance(u))
+        return state._replace(belief=_over(state.belief, move), move=move)
+
+    @corrects
+    def correct(self, state: ModeObservedBelief, z: ArrayLike, k: Step = 0) -> tuple[ModeObservedBelief, Innovation]:
+        """Use z with what is known of the mode."""
+        sensor, channel, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        m = channel.outputs
+        z, published = observed[:m], observed[m:]
+        known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
+        certain = jnp.nan_to_num(published)
+        if self.late:
+            last = jnp.maximum(jnp.asarray(k) - 1, 0)
+            redone = _use(state.before, at(self.sensor, last), _given(at(self.channel, last), certain), state.z)[0]
+            redone = _over(redone, state.move)
+            prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
+            then, start = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
+            described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, start)
+        else:
+            prior, described = state.belief, _given(channel, certain)
+        usable = jnp.where(known, z, jnp.nan)
+        after, expected, covariance = _use(prior, sensor, described, usable)
+        innovation = gaussian_innovation(z, expected, covariance)
+        value, spread = innovation.value, jnp.asarray(innovation.covariance)
+        for item in published:
+            flag_innovation, spread = with_flag(spread, item)
+            value = jnp.append(value, flag_innovation)
+        belief = ModeObservedBelief(after, prior, usable, state.move, jnp.asarray(True))
+        return belief, Innovation(value, spread, innovation.log_likelihood)
+
+    @in_float64
+    def estimate(self, state: ModeObservedBelief) -> Estimate:
+        """The estimate's mean and covariance."""
+        return Estimate(state.belief.mean, state.belief.covariance, self.claim)
+
+
+def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
+    matrix, shift, noise = move
+    pairs = ((belief.mean, belief.covariance), (belief.state_mean, belief.state_covariance))
+    error, local = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
+    return LinearBelief(*error, *local)
+
+
+def _use(
+    prior: LinearBelief, sensor: LinearSensor, described: SecondOrder, z: jax.Array
+) -> tuple[LinearBelief, jax.Array, jax.Array]:
+    """The update, what was expected and the innovation's covariance."""
+    of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
+    y = signal(prior[1:], *of, jnp.asarray(sensor.noise.covariance))
+    gain, bound = Polytope().correct(prior.covariance, y, described, ~jnp.isnan(z))
+    through = jnp.asarray(described.mean_gain), jnp.asarray(described.offset)
+    mean, covariance, expected = used(prior.mean, prior.covariance, gain, bound, *of, *through, z)
+    after = LinearBelief(mean, covariance, prior.state_mean, prior.state_covariance)
+    return after, expected, jnp.asarray(innovation_covariance(y, described))
+
+
+def _given(channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+    held = memories(channel).values()
+    return _nominal(given(channel, [m.read(number) for m, number in zip(held, numbers, strict=True)]))
+
+
+def _following(last: AbstractRandomAffine | None, channel: AbstractRandomAffine, numbers: jax.Array) -> SecondOrder:
+    """The law of the step after one in which the memories' states were these; without one, of the first step."""
+    items = []
+    for (identity, memory), number in zip(memories(channel if last is None else last).items(), numbers, strict=True):
+        items.append(memory.following(None if last is None else memory.read(number), degree_in(channel, identity)))
+    chosen = list(product(*(range(len(weights)) for _, weights in items)))
+    maps = [given(channel, [items[i][0][j] for i, j in enumerate(places)]) for places in chosen]
+    weights = [prod(items[i][1][j] for i, j in enumerate(places)) for places in chosen]
+    return _nominal(Mixture(maps, jnp.stack([jnp.asarray(w) for w in weights])))
+
+
+def _nominal(channel: AbstractRandomAffine) -> SecondOrder:
+    """Mean and spread under the nominal law, of numbers that may be traced."""
+    mean, spread = jnp.asarray(channel.moments(1).mean[:-1]), nominal_spread(channel)
+    spread = QuadraticMap(jnp.asarray(spread.center), jnp.asarray(spread.radius))
+    none = QuadraticMap(jnp.zeros_like(spread.center), jnp.zeros_like(spread.radius))
+    return SecondOrder(mean[:, :-1], mean[:, -1], spread, none, none, spread, False)
+
+
+def mode_known_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
+    """The best linear filter that is told, with each measurement, what the links remember: modes, or drifting gains.
+
+    It takes what `with_flag(link)` delivers; a `Node` refuses flags of the step before. Claim: "exact", given what is
+    told; "nominal" where probabilities within a mode are uncertain.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
+    Source: the Kalman filter given the modes, with the spread of De Koning (1984) within each.
+    """
+    return _mode_observed(plant, sensor, channel, late=False)
+
+
+def mode_late_filter(plant: AnyPlant, sensor: AnySensor, channel: Channel) -> ModeObservedFilter:
+    """The best linear filter that is told, with each measurement, what the links remembered at the step before.
+
+    It takes what `with_flag(link, late=True)` delivers; a `Node` refuses flags of the same step. Claim: as
+    `mode_known_filter`.
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, a channel with erasures, or parts that do not fit.
+    Source: the Kalman filter given the modes, and one update with the law of the mode that follows the last.
+    """
+    return _mode_observed(plant, sensor, channel, late=True)
+
+
+def _mode_observed(plant: AnyPlant, sensor: AnySensor, channel: Channel, late: bool) -> ModeObservedFilter:
+    check_linear("filter that is told the mode", plant, sensor)
+    steps = unstack(channel) if isinstance(channel, OverTime) else [channel]
+    if any(step.erases for step in steps if isinstance(step, AbstractRandomAffine)):
+        expected = "a channel without erasures (told_filter with flags=np.eye(modes) takes them)"
+        raise fail("filter that is told the mode", expected, "one that loses packets")
+    start = first(plant)
+    check_link(first(sensor), first(channel), len(start.states))
+    return ModeObservedFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=channel,
+        late=late,
+        claim="nominal" if late and uncertain_chain(channel) else claim_of_modes(channel),
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs + len(memories(channel)),
+    )

@@ -1,0 +1,214 @@
+"""Filters that weigh the modes of links that remember: a Gaussian for each mode, or one for all, mixed at each step.
+
+Each knows the chain, hears through each mode's map with a Gaussian update, and weighs modes by how likely what came is.
+They differ in when Gaussians are merged; all keep only two moments of a mixture, so that they claim nothing exact.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.modes.merging import (
+    AbstractMerging,
+    MergeAll,
+    MergeByMode,
+    MergeByNextMode,
+    ModalBeliefs,
+    merged,
+)
+from heliograph.filters.modes.mode_observations import describe_modes, receive
+from heliograph.filters.modes.side_information import SideInformation
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.building import moments_smoother_step
+from heliograph.model.angle import received_angles
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.check import instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+NODES = 3  # modes that stand for a gain that drifts
+
+
+class MultipleModelFilter(AbstractFilter):
+    """A filter of the state and of the mode of links that remember; built by `imm_filter` and its kin.
+
+    Nominal: mixtures are cut down to two moments. The innovation is that of the mixture, its log-likelihood too.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SideInformation | OverTime
+    initial: Float[Array, " M"]
+    merging: AbstractMerging
+    transform: AbstractTransform
+    observed_angles: Angles = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ModalBeliefs:
+        """The prior in every component; the modes of the first use."""
+        start, modes = at(self.plant, 0), len(self.initial)
+        mean = jnp.tile(jnp.asarray(start.initial_mean), (modes, 1))
+        spread = jnp.tile(jnp.asarray(start.initial_covariance), (modes, 1, 1))
+        return ModalBeliefs(mean, spread, jnp.diag(jnp.asarray(self.initial)), jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
+        """The chain moves, then the plant, component by component; at the first use the chain has its initial law."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
+        state = self.merging.moved(state, rows)
+        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
+        mean = together(plant, mean, jnp.sum(state.weight, axis=1))
+        return ModalBeliefs(mean, spread, state.weight, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: ModalBeliefs, z: ArrayLike, k: Step = 0) -> tuple[ModalBeliefs, Innovation]:
+        """Hear z with each component in each mode, and weigh them by it."""
+        (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
+        i, j = self.merging.pairs(len(self.initial))
+        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
+
+        belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
+        after, weight, mixed = receive(
+            belief, signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
+        )
+        posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
+        (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
+        return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed
+
+    @in_float64
+    def estimate(self, state: ModalBeliefs) -> Estimate:
+        """Mean and covariance of the whole mixture, angles between -pi and pi."""
+        whole = _whole(state)
+        return Estimate(wrapped(whole.mean, first(self.plant).angles), whole.covariance, self.claim)
+
+    def smoother_step(
+        self,
+        before: ModalBeliefs,
+        prior: ModalBeliefs,
+        after: ModalBeliefs,
+        innovation: Innovation,
+        z: ArrayLike,
+        u: ArrayLike,
+        k: Step,
+    ) -> AbstractSmootherStep:
+        """Moments of the whole mixture around the update; nothing later is said of the modes."""
+        local = _whole(before)
+        cross = predicted(at(self.plant, k), self.transform, local, jnp.asarray(u)).cross
+        return moments_smoother_step(_whole(after), _whole(prior), cross, "nominal", first(self.plant).angles)
+
+
+def _whole(state: ModalBeliefs) -> Belief:
+    """Mean and covariance of the whole mixture."""
+    result, _ = merged(state.mean, state.covariance, jnp.sum(state.weight, axis=1, keepdims=True))
+    return Belief(result.mean[0], result.covariance[0])
+
+
+def together(plant: AbstractPlant, mean: jax.Array, weight: jax.Array) -> jax.Array:
+    """Means (components, n) with their angles near those of the likeliest component, so that they can be averaged."""
+    return plant.near(mean, mean[jnp.argmax(weight)]) if plant.circular else mean
+
+
+def _build(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    merging: AbstractMerging,
+    transform: AbstractTransform | None,
+    nodes: int,
+) -> MultipleModelFilter:
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    check_link(first(sensor), first(channel), len(start.states))
+    angles = received_angles(plant, sensor, channel)
+    initial, described = describe_modes(channel, nodes)
+    return MultipleModelFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        initial=initial,
+        merging=merging,
+        transform=Cubature() if transform is None else transform,
+        observed_angles=angles,
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )
+
+
+def imm_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The interacting multiple model filter of a plant behind links that remember: one Gaussian for each mode.
+
+    Before each step they are mixed by where the next mode may come from, mu_(i|j) = Pi_ij mu_i / c_j; after it the
+    modes are weighed by the likelihood of z. A gain that is random within a mode is known by its second moments, and a
+    drift by `nodes` modes of its own; losses inside the channel, told, say something of the mode too. `transform` is
+    `Cubature()` unless given, and not used for linear parts.
+
+    Claim: "nominal". It tends to claim too little where modes are hard to tell for many steps.
+
+    Raises:
+        ValueError: parts that do not fit, more modes than can be listed, a mode whose output is certain beside others.
+    Source: Blom and Bar-Shalom, The interacting multiple model algorithm (1988).
+    """
+    return _build(plant, sensor, channel, MergeByNextMode(), transform, nodes)
+
+
+def gpb1_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The filter with one Gaussian for all modes of links that remember, and the modes' probabilities beside it.
+
+    Arguments as for `imm_filter`; M updates a step, and none of the memory that couples the state with the mode.
+
+    Claim: "nominal", and too small where fading is slow: what the state owes to the mode is forgotten at each step.
+
+    Raises:
+        ValueError: as for `imm_filter`.
+    Source: Ackerson and Fu, On state estimation in switching environments (1970).
+    """
+    return _build(plant, sensor, channel, MergeAll(), transform, nodes)
+
+
+def gpb2_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> MultipleModelFilter:
+    """The filter with a Gaussian for each mode, each heard with in every next mode before they are merged: M^2 updates.
+
+    Arguments as for `imm_filter`.
+
+    Claim: "nominal". With few modes that the data tells apart it is close to all that can be known; behind slow fading
+    of many modes it claims too little, as the others do.
+
+    Raises:
+        ValueError: as for `imm_filter`.
+    Source: Chang and Athans, State estimation for discrete systems with switching parameters (1978).
+    """
+    return _build(plant, sensor, channel, MergeByMode(), transform, nodes)

@@ -1,0 +1,166 @@
+"""Particles for the modes of links that remember, and a Gaussian for the state in each: the limit of filters."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief, predicted
+from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.modes.merging import merged
+from heliograph.filters.modes.mode_observations import describe_modes, receive
+from heliograph.filters.modes.multiple_model import together
+from heliograph.filters.modes.side_information import SideInformation
+from heliograph.model.angle import received_angles
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import Angles, wrapped
+from heliograph.numerics.check import check_count, instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float, Int
+
+NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
+
+
+class Particles(NamedTuple):
+    """Each particle's Gaussian, present mode and weight; the bits that the next random numbers come from.
+
+    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,); `moved` once the chain was used.
+    """
+
+    mean: Float[jax.Array, "N n"]
+    covariance: Float[jax.Array, "N n n"]
+    mode: Int[jax.Array, " N"]
+    weight: Float[jax.Array, " N"]
+    key: Int[jax.Array, " 2"]
+    moved: Bool[jax.Array, ""]
+
+
+class ParticleFilter(AbstractFilter):
+    """Particles draw the modes; given their path the state is Gaussian (Rao-Blackwell). Built by `particle_filter`.
+
+    Its random numbers come from the seed and from the data, so that every run has its own and the same data give the
+    same estimate.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SideInformation | OverTime
+    initial: Float[Array, " M"]
+    transform: AbstractTransform
+    observed_angles: Angles = eqx.field(static=True)
+    particles: int = eqx.field(static=True)
+    seed: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> Particles:
+        """The prior in every particle, modes in the shares of their law at the first use."""
+        start, n = at(self.plant, 0), self.particles
+        mean = jnp.tile(jnp.asarray(start.initial_mean), (n, 1))
+        spread = jnp.tile(jnp.asarray(start.initial_covariance), (n, 1, 1))
+        mode = _chosen(jnp.asarray(self.initial), (jnp.arange(n) + 0.5) / n)
+        return Particles(mean, spread, mode, jnp.full(n, 1 / n), jax.random.PRNGKey(self.seed), jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: Particles, u: ArrayLike = (), k: Step = 0) -> Particles:
+        """Draw each particle's next mode, and move its Gaussian."""
+        plant, u = at(self.plant, k), jnp.asarray(u)
+        key = jax.random.fold_in(state.key, 0)
+        rows = jnp.asarray(at(self.channel, k).transition)[state.mode]
+        drawn = jax.vmap(_chosen)(rows, jax.random.uniform(key, state.weight.shape, state.weight.dtype))
+        mean, spread, _ = jax.vmap(lambda *local: predicted(plant, self.transform, Belief(*local), u))(*state[:2])
+        mode = jnp.where(state.moved, drawn, state.mode)
+        mean = together(plant, mean, state.weight)
+        return Particles(mean, spread, mode, state.weight, key, jnp.asarray(True))
+
+    @corrects
+    def correct(self, state: Particles, z: ArrayLike, k: Step = 0) -> tuple[Particles, Innovation]:
+        """Hear z with each particle, weigh them by it, and draw them anew where half of them weigh next to nothing."""
+        (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
+        belief = Belief(state.mean, state.covariance)
+        signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
+
+        after, weight, mixed = receive(belief, signals, channel, state.mode, state.weight, z, self.observed_angles)
+        after = after._replace(mean=together(plant, after.mean, weight))
+        key = _folded(state.key, z)
+        chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))
+        poor = 1 / jnp.sum(weight**2) < self.particles / 2  # the effective number of particles
+        which = jnp.where(poor, chosen, jnp.arange(self.particles))
+        weight = jnp.where(poor, 1 / self.particles, weight)
+        return Particles(after.mean[which], after.covariance[which], state.mode[which], weight, key, state.moved), mixed
+
+    @in_float64
+    def estimate(self, state: Particles) -> Estimate:
+        """Mean and covariance of the whole mixture, angles between -pi and pi."""
+        whole, _ = merged(state.mean, state.covariance, state.weight[:, None])
+        return Estimate(wrapped(whole.mean[0], first(self.plant).angles), whole.covariance[0], self.claim)
+
+
+def _chosen(law: jax.Array, place: jax.Array) -> jax.Array:
+    """Invert the distribution function."""
+    return jnp.searchsorted(jnp.cumsum(law)[:-1], place)
+
+
+def _systematic(weight: jax.Array, start: jax.Array) -> jax.Array:
+    """Indices at (start + 0 ... N - 1) / N of the distribution function: each within one of N times its weight."""
+    return _chosen(weight, (start + jnp.arange(len(weight))) / len(weight))
+
+
+def _folded(key: jax.Array, z: jax.Array) -> jax.Array:
+    """A key made of another one and of the bits of a measurement."""
+    bits = jax.lax.bitcast_convert_type(jnp.where(jnp.isnan(z), 0.0, z), jnp.uint32)
+    for part in bits.ravel():
+        key = jax.random.fold_in(key, part)
+    return key
+
+
+def particle_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    particles: int = 300,
+    seed: int = 0,
+    transform: AbstractTransform | None = None,
+    nodes: int = NODES,
+) -> ParticleFilter:
+    """A Rao-Blackwellised particle filter of a plant behind links that remember: what others can be compared with.
+
+    Each particle draws a path of modes and carries the Gaussian filter of that path; systematic resampling where the
+    effective number of particles is below half. A gain that drifts has `nodes` modes. Its random numbers come from
+    `seed` and from the data. Error of the mixture's moments: in proportion to 1 / root of `particles`.
+
+    Claim: "nominal": with finitely many particles, and Gaussians in each, it approaches the truth from either side.
+
+    Raises:
+        ValueError: a count of particles below 1, and as for `imm_filter`.
+    Source: Doucet, Gordon and Krishnamurthy, Particle filters for state estimation of jump Markov linear systems,
+        2001.
+    """
+    start = instance("plant", first(plant), AbstractPlant, "a plant")
+    check_link(first(sensor), first(channel), len(start.states))
+    angles = received_angles(plant, sensor, channel)
+    initial, described = describe_modes(channel, nodes)
+    return ParticleFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=described,
+        initial=initial,
+        transform=Cubature() if transform is None else transform,
+        observed_angles=angles,
+        particles=check_count("particles", particles),
+        seed=check_count("seed", seed, 0),
+        claim="nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs,
+    )

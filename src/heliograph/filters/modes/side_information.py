@@ -1,0 +1,290 @@
+"""Filters that are told something of the modes: which packets arrived, a flag with each packet, or the mode itself."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.correction import absent, gain_and_bound
+from heliograph.filters.innovation import log_density
+from heliograph.filters.linear.scheduled import pseudo_solve
+from heliograph.filters.modes.modal import joined, measured_about, moved_about, padded, sum_of_modes, without_common
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import uncertain_chain
+from heliograph.model.over_time import OverTime, at, first, over_time, unstack
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, check_linear
+from heliograph.numerics.check import array, probabilities
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+from heliograph.random_affine.modes import JointModes, joint_modes
+from heliograph.random_affine.moments.second_moments import symmetric_product
+from heliograph.random_affine.side_information import Outcome, outcomes, second_moments
+
+
+class SideInformation(Module):
+    """A channel at one step, by mode and by what arrives.
+
+    transition: of the modes from the step before to this one. Of each pattern of components that arrive: `present`, its
+    `chance` in each mode, and in that mode and pattern E[(G, n)] and the spread, as a tensor. flags: P(flag | mode).
+
+    Shapes: transition (M, M), present (A, m), chance (M, A), mean (M, A, m, p + 1), spread (M, A, m, m, p + 1, p + 1),
+    flags (M, F).
+    """
+
+    transition: Float[Array, "M M"]
+    present: Bool[Array, "A m"]
+    chance: Float[Array, "M A"]
+    mean: Float[Array, "M A m p1"]
+    spread: Float[Array, "M A m m p1 p1"]
+    flags: Float[Array, "M F"]
+
+
+class SideInformationBelief(NamedTuple):
+    """s, the estimate of zeta, and E[r r' 1{mode} | what was told] of r = (x~, s, e), with the error e = zeta - s.
+
+    x~ = (x - c, 1), c = E[x] before any data, and zeta holds x~ 1{mode}, mode after mode. That s + e = zeta is told
+    twice on purpose: no covariance is the difference of larger ones.
+
+    Shapes: with N = M (n + 1): centre (n,), mean (N,), moments (M, n + 1 + 2 N, n + 1 + 2 N).
+    """
+
+    centre: Float[jax.Array, " n"]
+    mean: Float[jax.Array, " N"]
+    moments: Float[jax.Array, "M r r"]
+    moved: Bool[jax.Array, ""]
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """E[e e' | what was told]."""
+        count = len(self.mean)
+        return jnp.sum(self.moments, axis=0)[-count:, -count:]
+
+
+class SideInformationFilter(AbstractFilter):
+    """A linear filter that weighs the modes by what is told with each packet, and knows its error given all that.
+
+    A flag (and whether a packet arrived) changes the law of the modes, and with it what the estimate so far is worth:
+    s = E[zeta r'] E[r r']^+ r is found anew from moments given the flags, with r = (1, s, z). Its covariance is exact
+    given what was told; a filter that kept all data could do a little better, since earlier gains were right under
+    earlier laws.
+
+    It hears z and, where there are `flags`, the number of the flag after it; the likelihood is that of z given these.
+    What is lost for reasons that the channel does not know must not depend on the modes. Moments are those of x - E[x],
+    and the error has its own: a mean far from zero costs no digits, and with one mode no precise measurement does. With
+    several, x is the sum of its parts in each: a variance below 1e-15 of the state's own is rounding, of either sign.
+
+    Source: the filter of Costa (1994) with moments conditional on what is told.
+    """
+
+    plant: AnyPlant
+    sensor: AnySensor
+    channel: SideInformation | OverTime
+    initial: Float[Array, " M"]
+    flagged: bool = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> SideInformationBelief:
+        """The prior, independent of the mode."""
+        start, law = at(self.plant, 0), jnp.asarray(self.initial)
+        square = padded(jnp.asarray(start.initial_covariance)).at[-1, -1].set(1.0)
+        item = jnp.zeros(len(square)).at[-1].set(1.0)
+        expected = jnp.kron(law, item)
+        known = jnp.outer(expected, item)  # s = known x~
+        r = _stacked(jnp.eye(len(square)), known, _deviations(len(law), len(square)) - known)
+        moments = law[:, None, None] * (r @ square @ r.swapaxes(1, 2))
+        return SideInformationBelief(jnp.asarray(start.initial_mean), expected, moments, jnp.asarray(False))
+
+    @predicts
+    def predict(self, state: SideInformationBelief, u: ArrayLike = (), k: Step = 0) -> SideInformationBelief:
+        """s+ = F s; where the mode goes from i to j, e+ = F e + (1_j - p_i) x A~ x~ + 1_j x w~."""
+        plant, channel = at(self.plant, k), at(self.channel, k)
+        move, noise, centre = moved_about(plant, u, state.centre)
+        modes, size = len(state.moments), len(move)
+        rows = jnp.where(state.moved, jnp.asarray(channel.transition), jnp.eye(modes))
+        step, law = jnp.kron(rows.T, move), state.moments[:, size - 1, size - 1]
+        whole = jax.scipy.linalg.block_diag(move, step, step)
+        chosen = jnp.einsum("ijl,ab->ijlab", jnp.eye(modes) - rows[:, None], jnp.eye(size))
+        change = jnp.broadcast_to(jnp.eye(len(whole)), (modes, modes, *whole.shape))
+        change = change.at[:, :, -len(step) :, :size].set(chosen.reshape(modes, modes, -1, size))
+        carried = change @ (whole @ state.moments @ whole.T)[:, None] @ change.swapaxes(2, 3)
+        fresh = _stacked(jnp.eye(size), jnp.zeros((len(step), size)), _deviations(modes, size))
+        moments = jnp.einsum("ij,ijab->jab", rows, carried)
+        moments = moments + (law @ rows)[:, None, None] * (fresh @ noise @ fresh.swapaxes(1, 2))
+        return SideInformationBelief(centre, step @ state.mean, moments, jnp.asarray(True))
+
+    @corrects
+    def correct(
+        self, state: SideInformationBelief, z: ArrayLike, k: Step = 0
+    ) -> tuple[SideInformationBelief, Innovation]:
+        """Weigh the modes by the flag and by what arrived, project s anew, then use z."""
+        sensor, known, observed = at(self.sensor, k), at(self.channel, k), jnp.asarray(z)
+        z, flag = (observed[:-1], observed[-1]) if self.flagged else (observed, jnp.asarray(0.0))
+        flag_there, there = ~jnp.isnan(flag), ~jnp.isnan(z)
+        number = jnp.clip(jnp.where(flag_there, flag, 0.0).astype(int), 0, known.flags.shape[1] - 1)
+        spelled = jnp.where(flag_there, jnp.asarray(known.flags)[:, number], 1.0)
+        kind = pattern_of(known, there)
+        weight = jnp.asarray(known.chance)[:, kind] * spelled
+        size = len(self.states) + 1
+        total = weight @ state.moments[:, size - 1, size - 1]
+        moments = weight[:, None, None] * state.moments / total
+        prior = _projected(state._replace(moments=moments), size)
+        after, value, covariance = _used(
+            prior, sensor, jnp.asarray(known.mean)[:, kind], jnp.asarray(known.spread)[:, kind], z, there
+        )
+        likelihood = log_density(value, covariance, jnp.abs(z) + jnp.abs(value))
+        covariance = jnp.where(there[:, None] & there, covariance, jnp.nan)
+        if self.flagged:
+            nis, covariance = with_flag(covariance, flag)
+            value = jnp.append(value, nis)
+        return after, Innovation(value, covariance, likelihood)
+
+    @in_float64
+    def estimate(self, state: SideInformationBelief) -> Estimate:
+        """x - c = sum_j zeta^j."""
+        projection = sum_of_modes(len(self.states), len(self.initial))
+        return Estimate(
+            state.centre + projection @ state.mean, projection @ state.covariance @ projection.T, self.claim
+        )
+
+
+def _deviations(modes: int, size: int) -> jax.Array:
+    """zeta = 1_i x x~ in mode i, as matrices (M, M (n + 1), n + 1)."""
+    return jnp.einsum("il,ab->ilab", jnp.eye(modes), jnp.eye(size)).reshape(modes, modes * size, size)
+
+
+def _stacked(x: jax.Array, s: jax.Array, e: jax.Array) -> jax.Array:
+    """r = (x~, s, e) as a matrix for each mode, where x~ and s are the same in all."""
+    both = jnp.concatenate([x, s])
+    return jnp.concatenate([jnp.broadcast_to(both, (len(e), *both.shape)), e], axis=1)
+
+
+def _projected(state: SideInformationBelief, size: int) -> SideInformationBelief:
+    """The best s in (1, s) under these moments: s + D (1, s), D = E[e (1, s)'] E[(1, s)(1, s)']^+."""
+    count, total = len(state.mean), jnp.sum(state.moments, axis=0)
+    known = slice(size - 1, size + count)
+    change = pseudo_solve(total[known, known], total[known, -count:]).T
+    turn = jnp.eye(len(total)).at[size:-count, known].add(change).at[-count:, known].add(-change)
+    moments = turn @ state.moments @ turn.T
+    return state._replace(mean=state.mean + change @ jnp.append(1.0, state.mean), moments=moments)
+
+
+def _used(
+    state: SideInformationBelief,
+    sensor: LinearSensor,
+    mean: jax.Array,
+    spread: jax.Array,
+    z: jax.Array,
+    there: jax.Array,
+) -> tuple[SideInformationBelief, jax.Array, jax.Array]:
+    """The update with what arrived, e+ = (I - K H) e - K noise; what was not expected, and its covariance."""
+    measure, noise = measured_about(sensor, state.centre)
+    size = measure.shape[1]
+    law = state.moments[:, size - 1, size - 1]
+    second = measure @ state.moments[:, :size, :size] @ measure.T + law[:, None, None] * noise
+    added = jnp.einsum("jmlab,jab->jml", spread, second) + law[:, None, None] * (mean @ noise @ mean.swapaxes(1, 2))
+    output, common = without_common(mean @ measure, law)
+    output = joined(jnp.where(law[:, None, None] > 0, output, 0.0))
+    prior = state.covariance
+    cross, value = output @ prior, z - common - output @ state.mean
+    total = cross @ output.T + jnp.sum(added, axis=0)
+    seen = jnp.where(there[:, None] & there, total, 0.0) + absent(there)
+    gain, _ = gain_and_bound(prior, jnp.where(there[:, None], cross, 0.0), seen)
+    both = jnp.concatenate([gain, -gain])  # of what was not expected, in s and in e
+    change = jnp.eye(state.moments.shape[-1]).at[size:, -len(prior) :].add(both @ output)
+    moments = change @ state.moments @ change.T
+    moments = moments.at[:, size:, size:].add(both @ added @ both.T)
+    after = state._replace(mean=state.mean + gain @ jnp.where(there, value, 0.0), moments=moments)
+    return after, value, total
+
+
+def pattern_of(channel: SideInformation, there: Bool[Array, " m"]) -> jax.Array:
+    """The smallest pattern that can be and in which everything that is there arrives."""
+    present, possible = jnp.asarray(channel.present), jnp.any(jnp.asarray(channel.chance) > 0, axis=0)
+    fits = jnp.all(present | ~there, axis=1) & possible
+    return jnp.argmin(jnp.where(fits, jnp.sum(present, axis=1), present.shape[1] + 1))
+
+
+def with_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Innovation of a flag, which is told and not estimated: 0, or NaN if missing; no covariance with anything."""
+    nis = jnp.where(jnp.isnan(flag), jnp.nan, 0.0)
+    lost = jnp.isnan(jnp.append(jnp.diagonal(covariance), nis))
+    wide = jnp.pad(covariance, ((0, 1), (0, 1)))
+    return nis, jnp.where(lost[:, None] | lost, jnp.nan, jnp.nan_to_num(wide))
+
+
+def side_information_filter(
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: ArrayLike | None = None
+) -> SideInformationFilter:
+    """The linear filter that uses what is told of the modes: which packets arrived, and a flag with each.
+
+    `channel` may lose data with probabilities that depend on the mode (`erasure` in its modes). `flags` are P(flag |
+    mode), the modes as in `joint_modes`; the filter then hears (z, flag), as `with_flag` delivers it. Flags that reveal
+    the mode make it the Kalman filter given the modes.
+
+    Claim: "exact"; "nominal" where probabilities are uncertain.
+
+    Shapes: flags (modes, flags).
+
+    Raises:
+        ValueError: a plant or sensor that is not linear, parts that do not fit, flags that are no probabilities.
+    Source: the filter of Costa (1994) with moments conditional on what is told.
+    """
+    check_linear("told filter", plant, sensor)
+    start = first(plant)
+    check_link(first(sensor), first(channel), len(start.states))
+    steps = [joint_modes(c) for c in (unstack(channel) if isinstance(channel, OverTime) else [channel])]
+    modes = len(steps[0].initial)
+    chances = np.ones((modes, 1)) if flags is None else array("flags", flags, (modes, None))
+    for i, row in enumerate(chances):
+        probabilities(f"flags in mode {i}", row)
+    described = by_pattern(steps, chances)
+    known = all(m.corner_count() == 1 for step in steps for m in step.maps) and not uncertain_chain(channel)
+    return SideInformationFilter(
+        plant=plant,
+        sensor=sensor,
+        channel=over_time(described) if isinstance(channel, OverTime) else described[0],
+        initial=steps[0].initial,
+        flagged=flags is not None,
+        claim="exact" if known else "nominal",
+        states=start.states,
+        inputs=start.inputs,
+        received=first(channel).outputs + (flags is not None),
+    )
+
+
+def by_pattern(steps: Sequence[JointModes], flags: Float[np.ndarray, "M F"]) -> list[SideInformation]:
+    """The modes at each step by what arrives, with the patterns of all steps, and how they moved there."""
+    items = [[outcomes(m) for m in step.maps] for step in steps]
+    results = {tuple(o.arrived) for modes in items for parts in modes for o in parts}
+    kinds = sorted(results, key=lambda kind: (sum(kind), kind))
+    before = [steps[0], *steps[:-1]]
+    return [_side_information(modes, kinds, last, flags) for modes, last in zip(items, before, strict=True)]
+
+
+def _side_information(
+    items: list[list[Outcome]], kinds: list[tuple[bool, ...]], before: JointModes, flags: Float[np.ndarray, "M F"]
+) -> SideInformation:
+    m, p = items[0][0].map.outputs, items[0][0].map.inputs + 1
+    shape = (len(items), len(kinds))
+    chance, mean, second = np.zeros(shape), np.zeros((*shape, m, p)), np.zeros((*shape, m, m, p, p))
+    for j, parts in enumerate(items):
+        for part in parts:
+            a, (first_order, second_order) = kinds.index(tuple(part.arrived)), second_moments(part.map)
+            chance[j, a] += part.probability
+            mean[j, a] += part.probability * first_order
+            second[j, a] += part.probability * second_order
+    divisor = np.where(chance > 0, chance, 1.0)
+    mean, second = mean / divisor[..., None, None], second / divisor[..., None, None, None, None]
+    spread = second - np.array([[symmetric_product(item, item) for item in row] for row in mean])
+    return SideInformation(before.transition, np.array(kinds).reshape(len(kinds), m), chance, mean, spread, flags)

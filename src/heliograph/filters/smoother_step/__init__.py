@@ -1,0 +1,1 @@
+"""Smoother steps: data of a filter step that a backward pass needs."""

@@ -1,0 +1,121 @@
+"""How a step comes to be retained: from the states around a correction, and what it heard."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.plausibility import innovation_distance
+from heliograph.filters.smoother_step.base import AbstractSmootherStep
+from heliograph.filters.smoother_step.linear import LinearSmootherStep
+from heliograph.filters.smoother_step.moments import MomentsSmootherStep
+from heliograph.model.estimate import Claim, Innovation
+from heliograph.numerics.angle import Angles
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import diagonal, times, transpose
+from heliograph.numerics.small_matrix import solve as small_solve
+from heliograph.numerics.types import Array, Float
+
+
+def with_nis(step: AbstractSmootherStep, innovation: Innovation) -> AbstractSmootherStep:
+    """The step with how much its innovation surprised the filter, in units of what it believes."""
+    nis, count = innovation_distance(innovation)
+    return replace(step, nis=nis, received=count)
+
+
+class HasMoments(Protocol):
+    """A state of a filter: what it says of the mean (N,) and the covariance (N, N)."""
+
+    @property
+    def mean(self) -> Float[jax.Array, " N"]:
+        """Mean."""
+
+    @property
+    def covariance(self) -> Float[jax.Array, "N N"]:
+        """Covariance."""
+
+
+def moments_smoother_step(
+    after: HasMoments, prior: HasMoments, cross: Array, claim: Claim, angles: Angles = ()
+) -> MomentsSmootherStep:
+    """From the states after and before a correction, and Cov(x before the step, x after its prediction)."""
+    return MomentsSmootherStep(
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
+        prior_mean=jnp.asarray(prior.mean),
+        prior_covariance=jnp.asarray(prior.covariance),
+        cross=jnp.asarray(cross),
+        claim=claim,
+        projection=None,
+        shift=None,
+        nis=None,
+        received=None,
+        angles=angles,
+    )
+
+
+def linear_smoother_step(
+    after: HasMoments,
+    prior: HasMoments,
+    transition: Array,
+    process: Array | None,
+    output: Array,
+    innovation: Array,
+    total: Array,
+    claim: Claim,
+    projection: Array | None = None,
+    solve: Callable[[jax.Array, jax.Array], jax.Array] | None = None,
+) -> LinearSmootherStep:
+    """From the states after and before a correction, A, Q (None: not known apart), H, e, and the gain's S.
+
+    Rows of what did not arrive are left out: e is NaN there. `solve` gives S^+ B where S is singular; without it a
+    component that others determine is left out.
+    """
+    given = jnp.asarray(prior.covariance), jnp.asarray(output), jnp.asarray(total), jnp.asarray(innovation)
+    if solve is None:
+        gain, weigh, received, innovation = _parts(*given)
+    else:
+        received, total, innovation = _of_what_arrived(*given[1:])
+        weigh = solve(total, received).T
+        gain = given[0] @ weigh
+    return LinearSmootherStep(
+        mean=jnp.asarray(after.mean),
+        covariance=jnp.asarray(after.covariance),
+        transition=jnp.asarray(transition),
+        process=None if process is None else jnp.asarray(process),
+        gain=gain,
+        output=received,
+        weigh=weigh,
+        innovation=innovation,
+        claim=claim,
+        projection=None if projection is None else jnp.asarray(projection),
+        shift=None,
+        nis=None,
+        received=None,
+        angles=(),
+    )
+
+
+@runs_last
+def _parts(prior: jax.Array, output: jax.Array, total: jax.Array, innovation: jax.Array) -> tuple[jax.Array, ...]:
+    received, total, innovation = _of_what_arrived(output, total, innovation)
+    weigh = transpose(small_solve(total, received))
+    return times(prior, weigh), weigh, received, innovation
+
+
+def _of_what_arrived(
+    output: jax.Array, total: jax.Array, innovation: jax.Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """H, S and e without the rows of what did not arrive, for which S has ones."""
+    present = ~jnp.isnan(innovation)
+    both = present[:, None] & present[None]
+    alone = diagonal(jnp.where(present, 0.0, 1.0))
+    return jnp.where(present[:, None], output, 0.0), jnp.where(both, total, alone), jnp.where(present, innovation, 0.0)
+
+
+@runs_last
+def observed_through(gain: jax.Array, matrix: jax.Array) -> jax.Array:
+    """H = M C."""
+    return times(gain, matrix)

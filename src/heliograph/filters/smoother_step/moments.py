@@ -1,0 +1,70 @@
+"""What any update leaves behind for a sweep back: the moments around it."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.smoother_step.base import AbstractSmootherStep, Moments, Point, applied, less
+from heliograph.numerics.over_runs import runs_last
+from heliograph.numerics.small_matrix import solve, times, transpose
+from heliograph.numerics.types import Float
+
+
+class MomentsSmootherStep(AbstractSmootherStep):
+    """Any update: mean and covariance before it too, and cross = Cov(y before the step, y after its prediction).
+
+    J = cross (P-)^+: y_s = y + J (y_s+ - y-), P_s = P + J (P_s+ - P-) J'. Exact where the covariances are.
+
+    Source: Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems (1965).
+    """
+
+    prior_mean: Float[jax.Array, "*time N"]
+    prior_covariance: Float[jax.Array, "*time N N"]
+    cross: Float[jax.Array, "*time N N"]
+
+    def end(self) -> Moments:
+        """The filter's own."""
+        return Moments(self.mean, self.covariance)
+
+    def back(self, later: Moments, mean: jax.Array, covariance: jax.Array) -> Moments:
+        """What was not expected of the state after the step, through J."""
+        gain = self._gain()
+        news = applied(gain, later.mean - self.prior_mean)
+        return Moments(mean + news, less(covariance, gain, self.prior_covariance - later.covariance))
+
+    def smoothed(self, later: Moments) -> Moments:
+        """As it is."""
+        return later
+
+    def ahead(self, point: Point) -> Point:
+        """x_j + M (y - y-) and P_j - M (P- - P) M', M the product of all J since j."""
+        gain = _product_of(point.link, self._gain())
+        news = applied(gain, self.mean - self.prior_mean)
+        return Point(point.mean + news, less(point.covariance, gain, self.prior_covariance - self.covariance), gain)
+
+    def without_data(self) -> AbstractSmootherStep:
+        """Without both means."""
+        none = jnp.zeros_like(self.mean)
+        return replace(self, mean=none, prior_mean=none, shift=None, nis=None, received=None)
+
+    def with_data(self, mean: jax.Array, prior_mean: jax.Array, innovation: jax.Array) -> AbstractSmootherStep:
+        """Both means."""
+        return replace(self, mean=mean, prior_mean=prior_mean)
+
+    def _link(self, n: int) -> jax.Array:
+        return jnp.broadcast_to(jnp.eye(n), self.covariance.shape)
+
+    def _gain(self) -> jax.Array:
+        return _solved(self.prior_covariance, self.cross)
+
+
+@runs_last
+def _solved(a: jax.Array, b: jax.Array) -> jax.Array:
+    """B A^+."""
+    return transpose(solve(a, transpose(b)))
+
+
+@runs_last
+def _product_of(a: jax.Array, b: jax.Array) -> jax.Array:
+    return times(a, b)

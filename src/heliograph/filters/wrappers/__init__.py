@@ -1,0 +1,1 @@
+"""Filters made of another filter: delayed, relayed, predicted, fed back, with clocks."""

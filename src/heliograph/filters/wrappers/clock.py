@@ -1,0 +1,199 @@
+"""A filter of nodes' clocks that learns of a clock only what the data can tell."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.gaussian import GaussianFilter, gaussian_filter, signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, PolynomialMoments
+from heliograph.filters.gaussian.update import Polytope
+from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import at, first
+from heliograph.model.plant import AnyPlant, check_plant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.angle import nearest, wrapped
+from heliograph.numerics.check import fail, items
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.linalg import eigh, symmetrize
+from heliograph.numerics.types import ArrayLike, Bool, Float, Int
+from heliograph.random_affine.moments.second_moments import SecondOrder
+
+Observe = Callable[[jax.Array], jax.Array]
+SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of none tells nothing of when it was
+SHARE = 1e-3  # of what the outputs say of an offset: with less left when all other states may be anything, it is none
+RANK = 1e-12  # of the largest eigenvalue: directions below are not seen at all
+
+
+class ClockBelief(NamedTuple):
+    """Mean and covariance of plant and clocks, the last input, since when each number was not heard, and which clocks
+    the last data could tell of.
+
+    Shapes: mean (n,), covariance (n, n), inputs (inputs,), silence (received,), observed (clocks,).
+    """
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    inputs: Float[jax.Array, " inputs"]
+    silence: Int[jax.Array, " received"]
+    observed: Bool[jax.Array, " clocks"]
+
+
+class ClockFilter(AbstractFilter):
+    """A Gaussian filter of a plant with clocks, in which a clock that cannot be observed is considered, not estimated.
+
+    An offset o enters as y - o dy/dt. It is observable against another clock on the same plant, and while the plant
+    moves: of one node alone, all moved in time by o gives the same data, and at rest no time is told from another. The
+    filter linearises at estimates that differ from step to step, and would claim to know what nobody can. So at each
+    step it asks, of each clock,
+    - whether dy/dt is more than three standard deviations from 0 in some output,
+    - whether, over as many steps as there are states, along the motion without noise, the derivatives by o of what is
+      heard are no combination of those by all other states; a common shift in time is one. What was silent for as many
+      steps is not heard, nor what only noise comes from.
+    If not, offset and drift keep mean and covariance, and the others are corrected as those who do not know them
+    (Schmidt): K = 0 there, P+ = P - K C - C' K' + K S K'.
+
+    Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
+    """
+
+    base: GaussianFilter
+    offsets: tuple[int, ...] = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> ClockBelief:
+        """The prior; no data."""
+        mean, covariance = map(jnp.asarray, self.base.init())
+        silence = jnp.full(self.received, len(self.states))
+        none = jnp.zeros(len(self.offsets), dtype=bool)
+        return ClockBelief(mean, covariance, jnp.zeros(len(self.inputs)), silence, none)
+
+    @predicts
+    def predict(self, state: ClockBelief, u: ArrayLike = (), k: Step = 0) -> ClockBelief:
+        """Plant and clocks over step k."""
+        moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
+        inputs, silence = jnp.asarray(u, dtype=float), state.silence + 1
+        return state._replace(mean=moved.mean, covariance=moved.covariance, inputs=inputs, silence=silence)
+
+    @corrects
+    def correct(self, state: ClockBelief, z: ArrayLike, k: Step = 0) -> tuple[ClockBelief, Innovation]:
+        """Use what arrived of z, for those clocks alone that can be observed."""
+        base = self.base
+        channel: SecondOrder = at(base.channel, k)
+        sensor, prior = at(base.sensor, k), Belief(state.mean, state.covariance)
+        signal = signal_of(at(base.plant, k), sensor, base.transform, prior)
+        expected = jnp.asarray(channel.mean_gain @ signal.mean + channel.offset)
+        z = nearest(jnp.asarray(z), expected, base.observed_angles)
+        present, total = ~jnp.isnan(z), jnp.asarray(innovation_covariance(signal, channel))
+        silence = jnp.where(present, 0, state.silence)
+        arrived_values = jnp.where((silence < len(self.states))[:, None], jnp.asarray(channel.mean_gain), 0.0)
+        observed = self._observed(state, lambda x: arrived_values @ sensor.measure(x), k) & jnp.any(present)
+        gain, _ = base.update.correct(prior.covariance, signal, channel, present)
+        gain = gain * self._estimated(observed)[:, None]
+        mean = prior.mean + gain @ jnp.where(present, z - expected, 0.0)
+        after = _considered(prior.covariance, gain, signal, channel, total)
+        belief = ClockBelief(mean, after, state.inputs, silence, observed)
+        return belief, gaussian_innovation(z, expected, total)
+
+    def _estimated(self, observed: jax.Array) -> jax.Array:
+        """1 for the states that are estimated, 0 for offset and drift of clocks that are not."""
+        values = jnp.ones(len(self.states))
+        for i, place in enumerate(self.offsets):
+            values = values.at[place : place + 2].set(jnp.where(observed[i], 1.0, 0.0))
+        return values
+
+    def _observed(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
+        """Whether each clock can be observed."""
+        slope = jax.jacfwd(observe)
+        rate, curve = slope(state.mean), jax.jacfwd(slope)(state.mean)
+        seen = self._alone(state, observe, k)
+        result = []
+        for i, place in enumerate(self.offsets):
+            variance = jnp.einsum("ri,ij,rj->r", curve[:, place], state.covariance, curve[:, place])
+            moves = jnp.any(rate[:, place] ** 2 > SIGNIFICANT * variance)
+            result.append(moves & (seen[i] > SHARE))
+        return jnp.stack(result)
+
+    def _alone(self, state: ClockBelief, observe: Observe, k: Step) -> jax.Array:
+        """Share of the outputs' derivatives by each offset that is no combination of those by the other states."""
+        plant, n = at(self.base.plant, k), len(self.states)
+
+        def follow(carry: tuple[jax.Array, jax.Array], _: None) -> tuple[tuple[jax.Array, jax.Array], jax.Array]:
+            x, reach = carry
+            observed = jax.jacfwd(observe)(x) @ reach
+            step = jax.jacfwd(lambda x: plant.transition(x, state.inputs))(x)
+            return (plant.transition(x, state.inputs), step @ reach), observed.T @ observed
+
+        _, parts = jax.lax.scan(follow, (state.mean, jnp.eye(n)), None, length=n)
+        return jnp.stack([_share(jnp.sum(parts, axis=0), place) for place in self.offsets])
+
+    @in_float64
+    def estimate(self, state: ClockBelief) -> Estimate:
+        """The belief, angles between -pi and pi."""
+        return Estimate(wrapped(state.mean, first(self.base.plant).angles), state.covariance, self.claim)
+
+
+def _share(square: jax.Array, place: int) -> jax.Array:
+    """1 - r' R^+ r of one column of O among the others, with R = their correlations, O'O = `square`."""
+    size = jnp.sqrt(jnp.diagonal(square))
+    scale = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
+    correlations = scale[:, None] * square * scale
+    others = [i for i in range(square.shape[0]) if i != place]
+    among, local = correlations[jnp.ix_(jnp.array(others), jnp.array(others))], correlations[jnp.array(others), place]
+    values, vectors = eigh(among)
+    used = values > RANK * values[-1]
+    known = jnp.sum(jnp.where(used, (vectors.T @ local) ** 2 / jnp.where(used, values, 1.0), 0.0))
+    return jnp.where(size[place] > 0, 1 - known, 0.0)
+
+
+def _considered(prior: jax.Array, gain: jax.Array, signal: Signal, channel: SecondOrder, total: jax.Array) -> jax.Array:
+    """P - K C - C' K' + K S K', true of any gain."""
+    used = gain @ jnp.asarray(channel.mean_gain) @ signal.cross.T
+    return symmetrize(prior - used - used.T + gain @ total @ gain.T)
+
+
+def clock_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    clocks: Sequence[str],
+    transform: AbstractTransform | None = None,
+) -> ClockFilter:
+    """A filter of plant and clocks, as `with_clocks` makes them, that knows when a clock cannot be observed.
+
+    `clocks` are the names of their nodes, `sensor` that of all nodes together (`joint_sensor`). Moments of h are those
+    of a product of Gaussians, exact where h is linear beside the clocks; another `transform` where it is not.
+
+    Claim: "nominal".
+
+    Raises:
+        ValueError: names that are no clocks of the plant, uncertain probabilities, parts that do not fit.
+    Source: Schmidt (1966) for states that are considered; the observability matrix along a trajectory.
+    """
+    states = check_plant(plant).states
+    names = [f"{name}_offset" for name in items("clocks", clocks, "names of nodes")]
+    if not names or any(name not in states for name in names):
+        raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))
+    chosen = PolynomialMoments(2) if transform is None else transform
+    base = gaussian_filter(plant, sensor, channel, chosen, Polytope())
+    described = jax.tree.leaves(base.channel, is_leaf=lambda part: isinstance(part, SecondOrder))
+    if any(isinstance(part, SecondOrder) and part.uncertain for part in described):
+        raise fail("channel of a clock filter", "known probabilities", "uncertain ones")
+    return ClockFilter(
+        base=base,
+        offsets=tuple(states.index(name) for name in names),
+        claim="nominal",
+        states=base.states,
+        inputs=base.inputs,
+        received=base.received,
+    )

@@ -1,0 +1,272 @@
+"""Filters behind links that hear late: in the time of what is heard, told of it, or of all that was sent."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.linear.plan import PlannedFilter
+from heliograph.filters.modes.side_information import with_flag
+from heliograph.filters.wrappers.held import HeldFilter, relayed_filter, with_relays
+from heliograph.model.channel import Channel, check_link
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, first, over_time, stack, unstack
+from heliograph.model.past import with_past
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor
+from heliograph.numerics.check import check_count, fail, instance
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float, Int, PyTree
+from heliograph.random_affine.atoms import known
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.combine import Series
+from heliograph.random_affine.delay import Delayed, of_line, sent
+from heliograph.random_affine.in_line import Relayed
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+
+
+class PartFilter(AbstractFilter):
+    """A filter of a larger system that tells of its first states alone. Built by `part_filter`."""
+
+    base: AbstractFilter
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, base: AbstractFilter, states: int):
+        self.base, self.claim, self.states = base, base.claim, base.states[:states]
+        self.inputs, self.received = base.inputs, base.received
+
+    @in_float64
+    def init(self) -> PyTree:
+        """The filter's own."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """The filter's own."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """The filter's own."""
+        return self.base.correct(state, z, k)
+
+    @in_float64
+    def estimate(self, state: PyTree) -> Estimate:
+        """The first states."""
+        return self._part(self.base.estimate(state))
+
+    def after_step(self, state: PyTree, k: Step) -> Estimate:
+        """The first states."""
+        return self._part(self.base.after_step(state, k))
+
+    def _part(self, estimate_: Estimate) -> Estimate:
+        n = len(self.states)
+        return Estimate(estimate_.mean[..., :n], estimate_.covariance[..., :n, :n], self.claim)
+
+    def planned(self, inputs: Float[Array, "horizon inputs"]) -> AbstractFilter:
+        """With all that does not depend on data computed before."""
+        plan, n = self.base.planned(inputs), len(self.states)
+        if not isinstance(plan, PlannedFilter):
+            return PartFilter(plan, n)
+        projection = jnp.eye(len(self.base.states)) if plan.projection is None else jnp.asarray(plan.projection)
+        return replace(plan, covariances=plan.covariances[:, :n, :n], projection=projection[:n], states=self.states)
+
+
+def part_filter(filter: AbstractFilter, states: int) -> PartFilter:
+    """The first so many states of what a filter estimates, as of a plant that was given others (`with_past`).
+
+    Claim: the filter's own.
+
+    Raises:
+        ValueError: no filter, more states than it has.
+    Source: a part of a linear estimate is the estimate of that part.
+    """
+    instance("filter", filter, AbstractFilter, "a filter")
+    if check_count("states", states) > len(filter.states):
+        raise fail("states", f"at most the filter's {len(filter.states)}", states)
+    return PartFilter(filter, states)
+
+
+class LateState(NamedTuple):
+    """The state of the filter of the time that was last heard of, the inputs since then, and the last step."""
+
+    base: PyTree
+    inputs: Float[jax.Array, "delay inputs"]
+    step: Int[jax.Array, ""]
+
+
+class LateFilter(AbstractFilter):
+    """A filter behind a link that is late by a constant: it runs in the time of what it hears, and predicts to now.
+
+    That is the best linear filter with the past as states, without its cost. Built by `late_filter`.
+    """
+
+    base: AbstractFilter
+    delay: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def __init__(self, base: AbstractFilter, delay: int):
+        self.base, self.delay, self.claim, self.states = base, delay, base.claim, base.states
+        self.inputs, self.received = base.inputs, base.received
+
+    @in_float64
+    def init(self) -> LateState:
+        """Nothing was heard of any time."""
+        start = jax.tree.map(jnp.asarray, self.base.init())
+        return LateState(start, jnp.zeros((self.delay, len(self.inputs))), jnp.asarray(-1))
+
+    @predicts
+    def predict(self, state: LateState, u: ArrayLike = (), k: Step = 0) -> LateState:
+        """Over step k - delay, with the input of that step."""
+        line = jnp.concatenate([state.inputs, jnp.asarray(u)[None]])
+        then = jnp.asarray(k) - self.delay
+        moved = self._moved(state.base, line[0], then)
+        return LateState(moved, line[1:], jnp.asarray(k, dtype=state.step.dtype))
+
+    def _moved(self, base: PyTree, u: jax.Array, k: jax.Array) -> PyTree:
+        """Over step k, if there was one."""
+        after = self.base.predict(base, u, jnp.maximum(k, 0))
+        return jax.tree.map(lambda new, old: jnp.where(k >= 0, new, old), after, base)
+
+    @corrects
+    def correct(self, state: LateState, z: ArrayLike, k: Step = 0) -> tuple[LateState, Innovation]:
+        """Use what was sent at step k - delay; what is heard before anything was sent says nothing."""
+        then = jnp.asarray(k) - self.delay
+        observed = jnp.where(then >= 0, jnp.asarray(z), jnp.nan)
+        step = jnp.maximum(then, 0)
+        base, innovation = self.base.correct(state.base, observed, step)
+        _, early = self.base.correct(state.base, z, step)
+        published = jax.tree.map(lambda now, before: jnp.where(then >= 0, now, before), innovation, early)
+        return state._replace(base=base), Innovation(published.value, published.covariance, innovation.log_likelihood)
+
+    @in_float64
+    def estimate(self, state: LateState) -> Estimate:
+        """Predicted over the last `delay` steps."""
+
+        def move(j: jax.Array, base: PyTree) -> PyTree:
+            return self._moved(base, jnp.asarray(state.inputs)[j], state.step - self.delay + 1 + j)
+
+        return self.base.estimate(jax.lax.fori_loop(0, self.delay, move, jax.tree.map(jnp.asarray, state.base)))
+
+
+def late_filter(filter: AbstractFilter, delay: int) -> LateFilter:
+    """Any filter behind a link that is late by a constant: made for the link without delay, it filters time past.
+
+    Claim: the filter's own, of a prediction over `delay` steps.
+
+    Raises:
+        ValueError: no filter, a delay that is no whole number of steps.
+    Source: prediction from the estimate of the time last heard of; equal to augmenting the state with past signals.
+    """
+    return LateFilter(instance("filter", filter, AbstractFilter, "a filter"), check_count("delay", delay, 0))
+
+
+class KnownDelayFilter(AbstractFilter):
+    """The best linear filter behind a link that tells how late each value is, as the last number that is received.
+
+    It estimates what was sent as well, so that one y heard twice is one, with two channel noises: joint noise
+    R 11' + N I. Given all delays it is the best linear estimate.
+
+    base: a filter of (x, y_k, ..., y_{k-D}) whose `channel` may be replaced by `channels` at a delay (0, ..., D).
+    """
+
+    base: AbstractFilter
+    channels: SecondOrder
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> PyTree:
+        """The prior."""
+        return self.base.init()
+
+    @predicts
+    def predict(self, state: PyTree, u: ArrayLike = (), k: Step = 0) -> PyTree:
+        """Over step k, and the line moves on."""
+        return self.base.predict(state, u, k)
+
+    @corrects
+    def correct(self, state: PyTree, z: ArrayLike, k: Step = 0) -> tuple[PyTree, Innovation]:
+        """Use what arrived, by the link of its delay; without the delay nothing is used."""
+        z, delay = jnp.asarray(z)[:-1], jnp.asarray(z)[-1]
+        known, longest = ~jnp.isnan(delay), len(self.channels.offset) - 1
+        d = jnp.clip(jnp.where(known, delay, 0.0).astype(int), 0, longest)
+        here = jax.tree.map(lambda leaf: jnp.asarray(leaf)[d] if eqx.is_array(leaf) else leaf, self.channels)
+        base = eqx.tree_at(lambda item: item.channel, self.base, here)
+        after, innovation = base.correct(state, z, k)
+        used = jax.tree.map(lambda new, old: jnp.where(known, new, old), after, state)
+        flag_innovation, covariance = with_flag(innovation.covariance, delay)
+        likelihood = jnp.where(known, innovation.log_likelihood, 0.0)
+        return used, Innovation(jnp.append(innovation.value, flag_innovation), covariance, likelihood)
+
+    @in_float64
+    def estimate(self, state: PyTree) -> Estimate:
+        """The plant's states."""
+        n, published = len(self.states), self.base.estimate(state)
+        return Estimate(published.mean[:n], published.covariance[:n, :n], self.claim)
+
+
+Make = Callable[[AnyPlant, AnySensor, Channel], AbstractFilter]
+
+
+def behind_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> AbstractFilter:
+    """The filter that `make` makes of links that are not late, behind those that are."""
+    start, n = first(channel), len(first(plant).states)
+    check_link(first(sensor), start, n, late=True)
+    if isinstance(start, Delayed) and start.timestamped:
+        return _known_delays(plant, sensor, channel, make)
+    if isinstance(channel, Delayed) and channel.constant:
+        return LateFilter(make(plant, sensor, channel.link), channel.past)
+    if isinstance(start, Relayed):
+        return _behind_relays(plant, sensor, channel, make)
+    return PartFilter(make(*with_past(plant, sensor, channel)), n)
+
+
+def _behind_relays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> HeldFilter:
+    if not isinstance(channel, Relayed):
+        raise fail("channel with relays that are late by chance", "one that does not vary", "one in over_time")
+    larger, last, link, lines = with_relays(plant, sensor, channel)
+    return relayed_filter(plant, channel, make(larger, last, link), lines)
+
+
+def _known_delays(plant: AnyPlant, sensor: AnySensor, channel: Channel, make: Make) -> KnownDelayFilter:
+    if not isinstance(channel, Delayed):
+        raise fail("channel with told delays", "one that does not vary", "one in over_time")
+    check_forgets("link with told delays", channel.link)
+    larger, everything, _ = with_past(plant, sensor, channel)
+    items = [channel.given(d) for d in range(channel.past + 1)]
+    base, start = make(larger, everything, items[0]), first(plant)
+    return KnownDelayFilter(
+        base=base,
+        channels=stack([second_order(item) for item in items]),
+        claim=base.claim,
+        states=start.states,
+        inputs=start.inputs,
+        received=channel.outputs,
+    )
+
+
+def as_current(channel: Channel) -> Channel:
+    """The channel for those who take what is late as current: all that its line holds is y_k."""
+    if isinstance(channel, OverTime):
+        return over_time([as_current(item) for item in unstack(channel)])
+    return _at_once(as_maps("channel", [channel])[0])
+
+
+def _at_once(channel: AbstractRandomAffine) -> AbstractRandomAffine:
+    if isinstance(channel, Relayed):
+        return Series([_at_once(stage) for stage in channel.stages])
+    return Series([known(np.tile(np.eye(sent(channel)), (1 + channel.past, 1))), of_line(channel)])

@@ -1,0 +1,105 @@
+"""The filter whose prediction the sensor knows and takes off before it sends: only what is new costs power."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.belief import Belief
+from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
+from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
+from heliograph.filters.gaussian.update import AbstractUpdate
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.fading import memory_matters
+from heliograph.model.over_time import OverTime, at, first
+from heliograph.model.plant import AnyPlant
+from heliograph.model.sensor import AnySensor, is_linear, refuse_angles
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import Array, ArrayLike, Float
+
+
+class FedBackBelief(NamedTuple):
+    """Mean (n,) and covariance (n, n) of the state, and what the sensor takes off y at this step, (m,)."""
+
+    mean: Float[jax.Array, " n"]
+    covariance: Float[jax.Array, "n n"]
+    reference: Float[jax.Array, " m"]
+
+
+class FedBackFilter(AbstractFilter):
+    """It tells the sensor its estimate after each step; z = G (y - r) + n with r = h(f(xhat, u)), which both compute.
+
+    y - r has the mean E[y] - r, zero for a linear model, and the covariance of the innovation: that alone costs power,
+    and that alone the gain's randomness multiplies. On the way back nothing is lost.
+    """
+
+    base: GaussianFilter
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    def reference(self, known: Float[Array, " n"], u: Float[Array, " inputs"], k: Step) -> Float[jax.Array, " m"]:
+        """What is taken off y at step k, from the estimate after the step before and the input over step k."""
+        plant, sensor = at(self.base.plant, k), at(self.base.sensor, k)
+        expected = plant.transition(jnp.asarray(known), jnp.asarray(u)) + plant.noise_mean()
+        result: jax.Array = sensor.measure(expected) + sensor.noise.mean
+        return result
+
+    @in_float64
+    def init(self) -> FedBackBelief:
+        """The prior."""
+        mean, covariance = map(jnp.asarray, self.base.init())
+        return FedBackBelief(mean, covariance, jnp.zeros(len(first(self.base.sensor).outputs)))
+
+    @predicts
+    def predict(self, state: FedBackBelief, u: ArrayLike = (), k: Step = 0) -> FedBackBelief:
+        """Mean and covariance of f(x, u) + w, and what the sensor will take off."""
+        moved = self.base.predict(Belief(state.mean, state.covariance), u, k)
+        return FedBackBelief(*moved, self.reference(state.mean, jnp.asarray(u), k))
+
+    @corrects
+    def correct(self, state: FedBackBelief, z: ArrayLike, k: Step = 0) -> tuple[FedBackBelief, Innovation]:
+        """Use the measurement of y - r."""
+        base, prior = self.base, Belief(state.mean, state.covariance)
+        y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
+        left = y.mean - state.reference
+        sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
+        after, innovation = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z))
+        return FedBackBelief(*after, state.reference), innovation
+
+    @in_float64
+    def estimate(self, state: FedBackBelief) -> Estimate:
+        """The belief."""
+        return Estimate(state.mean, state.covariance, self.claim)
+
+
+def fed_back_filter(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: Channel,
+    transform: AbstractTransform | None = None,
+    update: AbstractUpdate | None = None,
+) -> FedBackFilter:
+    """The filter that a sensor hears back: at each step it sends y less what the filter expects, z = G (y - r) + n.
+
+    A node that has this filter is simulated so. z is what arrives, nothing added back. `transform` is `Cubature()`
+    unless given, `update` as for `cubature_filter`; a linear plant and sensor need no transform.
+
+    Claim: "exact" for a linear plant and sensor, however random the gains: with E[y - r] = 0 and
+    E (y - r)(y - r)' = C P C' + R the best gain is K = P C' M' (M S M' + Sigma(S))^-1. Else "nominal".
+
+    Raises:
+        ValueError: parts that do not fit, angles.
+    Source: Schalkwijk and Kailath, A coding scheme for additive noise channels with feedback (1966), for a state that
+        moves; Elia, Remote stabilization over fading channels (2005).
+    """
+    base = gaussian_filter(plant, sensor, channel, Cubature() if transform is None else transform, update)
+    refuse_angles("filter that is fed back", plant, sensor)
+    described = base.channel.values if isinstance(base.channel, OverTime) else base.channel
+    exact = is_linear(plant, sensor) and not described.uncertain and not memory_matters(channel) and update is None
+    claim: Claim = "exact" if exact else "nominal"
+    return FedBackFilter(base=base, claim=claim, states=base.states, inputs=base.inputs, received=base.received)

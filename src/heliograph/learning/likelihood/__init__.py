@@ -1,0 +1,1 @@
+"""Likelihoods of recordings: what a fit maximises, and how."""

@@ -1,0 +1,197 @@
+"""How likely a recording is when laws of gains count in full, not by two moments alone, and whether that fits."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.special import logsumexp, ndtr
+from scipy.stats import kstest
+
+from heliograph.filters.gaussian.gaussian import GaussianFilter, cubature_filter, signal_of
+from heliograph.filters.modes.combinations import Component, atoms_of
+from heliograph.learning.likelihood.law_nodes import with_nodes
+from heliograph.model.over_time import at
+from heliograph.model.plant import AbstractPlant, AnyPlant
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import nearest
+from heliograph.numerics.check import fail, instance
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
+from heliograph.random_affine.combine import Stack
+from heliograph.simulation.likelihood import rows
+
+NODES = 64  # values of each law: a hop's density to three digits where its noise is a tenth of its spread
+ROWS = 256  # steps whose densities are computed at once
+
+
+@readable
+class Predictive(NamedTuple):
+    """What a law says of each step, given the steps before.
+
+    log_likelihood: log p(what arrived), 0 where nothing did. pit: P(less than what arrived) of each component given
+    those before it, uniform and independent where the law is right; NaN where it did not arrive.
+
+    Shapes: log_likelihood (steps,), pit (steps, received).
+    """
+
+    log_likelihood: Float[np.ndarray, " steps"]
+    pit: Float[np.ndarray, "steps received"]
+
+    def uniform(self) -> tuple[float, float]:
+        """Kolmogorov's distance of all pits from the uniform law, and its p-value if the law is right.
+
+        Raises:
+            ValueError: nothing arrived.
+        """
+        values = self.pit[~np.isnan(self.pit)]
+        if not len(values):
+            raise fail("pits", "at least one measurement that arrived", "none")
+        result = kstest(values, "uniform")
+        return float(result.statistic), float(result.pvalue)
+
+
+def predictive(
+    plant: AnyPlant,
+    sensor: AnySensor,
+    channel: AbstractRandomAffine,
+    measurements: ArrayLike,
+    inputs: ArrayLike | None = None,
+    nodes: int = NODES,
+) -> Predictive:
+    """Density of each measurement with the laws of the channel's gains as `nodes` values each.
+
+    p(z_k | past) = sum_j w_j N(z; G_j y + c_j, G_j P_y G_j' + N_j), where y and P_y are what the cubature filter that
+    knows the channel's moments expects of the sensor, and j runs over the combinations of gains. Parts of a stack are
+    heard one after another: y and P_y are corrected by each, moments matched. Told losses say nothing. Nominal, as the
+    filter is: its prior is taken for Gaussian.
+
+    Shapes: measurements (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: a channel that remembers or varies over time, too many combinations of gains in one part, data of
+            the wrong shape.
+    """
+    instance("plant", plant, AbstractPlant, "one plant, that does not vary over time")
+    instance("sensor", sensor, AbstractSensor, "one sensor, that does not vary over time")
+    instance("channel", channel, AbstractRandomAffine, "one channel, that does not vary over time")
+    check_forgets("channel of a predictive likelihood", channel)
+    received = arrived(channel)
+    item = cubature_filter(plant, sensor, received)
+    z = rows("measurements", measurements, None, item.received, missing=True)
+    u = rows("inputs", np.zeros((len(z), 0)) if inputs is None else inputs, len(z), len(item.inputs), missing=False)
+    y, spread, near = expected_signals(item, z, u)
+    return of_signals((np.asarray(y), np.asarray(spread), np.asarray(near)), Parts.of(received, nodes))
+
+
+class Part(NamedTuple):
+    """What one part of a stack can be: arrays over the combinations of its gains and noises.
+
+    Shapes: log_weight (a,), gain (a, m, p), offset (a, m), noise (a, m, m).
+    """
+
+    log_weight: np.ndarray
+    gain: np.ndarray
+    offset: np.ndarray
+    noise: np.ndarray
+
+
+class Parts(tuple[Part, ...]):
+    """The parts of a channel, from the first output to the last."""
+
+    @staticmethod
+    def of(channel: AbstractRandomAffine, nodes: int) -> "Parts":
+        """Combinations of each part of a stack, of everything else as a whole."""
+        parts = channel.maps if isinstance(channel, Stack) else (channel,)
+        return Parts(_part(atoms_of(with_nodes(part, nodes))) for part in parts)
+
+
+def _part(components: list[Component]) -> Part:
+    possible = [component for component in components if component.weight > 0]
+    weight, gain, offset, noise = (np.array(column) for column in zip(*possible, strict=True))
+    return Part(np.log(weight), gain, offset, noise)
+
+
+@compiled
+def expected_signals(
+    item: GaussianFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean (steps, p) and covariance (steps, p, p) of the signal before each step, and z (angles near them)."""
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, ...]]:
+        k, z_k, u_k = row
+        prior = item.predict(state, u_k, k)
+        plant, sensor, channel = at((item.plant, item.sensor, item.channel), k)
+        y = signal_of(plant, sensor, item.transform, prior)
+        near = nearest(z_k, channel.mean_gain @ y.mean + channel.offset, item.observed_angles)
+        return item.correct(prior, z_k, k)[0], (y.mean, y.covariance, near)
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    result: tuple[jax.Array, ...] = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return result[0], result[1], result[2]
+
+
+def of_signals(expected: tuple[np.ndarray, np.ndarray, np.ndarray], parts: Parts) -> Predictive:
+    """Densities and pits of z (steps, m), from the moments (steps, p) and (steps, p, p) of the signals before each."""
+    y, spread, z = expected
+    blocks = [_block(y[i : i + ROWS], spread[i : i + ROWS], z[i : i + ROWS], parts) for i in range(0, len(z), ROWS)]
+    return Predictive(*(np.concatenate(column) for column in zip(*blocks, strict=True)))
+
+
+def _block(y: np.ndarray, spread: np.ndarray, z: np.ndarray, parts: Parts) -> tuple[np.ndarray, np.ndarray]:
+    total, pits, start = np.zeros(len(z)), [], 0
+    for i, part in enumerate(parts):
+        stop = start + part.gain.shape[1]
+        weight, error, root = _weighed(y, spread, z[:, start:stop], part)
+        for j in range(stop - start):
+            now = np.exp(weight[..., j] - logsumexp(weight[..., j], axis=1, keepdims=True))
+            pits.append(np.where(np.isnan(z[:, start + j]), np.nan, np.sum(now * ndtr(error[..., j]), axis=1)))
+        last = logsumexp(weight[..., -1], axis=1)
+        total += last
+        if i + 1 < len(parts):
+            y, spread = _corrected(
+                y, spread, z[:, start:stop], part, np.exp(weight[..., -1] - last[:, None]), error, root
+            )
+        start = stop
+    return total, np.stack(pits, axis=1)
+
+
+def _weighed(y: np.ndarray, spread: np.ndarray, z: np.ndarray, part: Part) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Log-weights of the combinations before each component and after the last (t, a, m + 1), L^-1 (z - E z), and L."""
+    there = ~np.isnan(z)[:, None]
+    both = there[..., None] & there[..., None, :]
+    total = np.einsum("amp,tpq,anq->tamn", part.gain, spread, part.gain) + part.noise
+    total = np.where(both, total, np.where(np.eye(z.shape[1], dtype=bool), 1.0, 0.0))
+    root = np.linalg.cholesky(total)
+    value = np.where(there, z[:, None] - np.einsum("amp,tp->tam", part.gain, y) - part.offset, 0.0)
+    error = np.linalg.solve(root, value[..., None])[..., 0]
+    scale = np.diagonal(root, axis1=-2, axis2=-1)
+    density = np.where(there, -(error**2 + np.log(2 * np.pi)) / 2 - np.log(scale), 0.0)
+    weight = part.log_weight[:, None] + np.concatenate(
+        [np.zeros((*density.shape[:2], 1)), np.cumsum(density, axis=2)], axis=2
+    )
+    return weight, error, root
+
+
+def _corrected(
+    y: np.ndarray,
+    spread: np.ndarray,
+    z: np.ndarray,
+    part: Part,
+    weight: np.ndarray,
+    error: np.ndarray,
+    root: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Moments of the signal given this part too: those of the mixture over its combinations, weight (t, a)."""
+    there = ~np.isnan(z)[:, None, :, None]
+    cross = np.where(there, np.einsum("amp,tpq->tamq", part.gain, spread), 0.0)
+    white = np.linalg.solve(root, cross)  # L^-1 G P
+    moved = np.einsum("tamq,tam->taq", white, error)
+    shift = np.einsum("ta,taq->tq", weight, moved)
+    apart = moved - shift[:, None]
+    known = np.einsum("ta,tamq,tamr->tqr", weight, white, white)
+    between = np.einsum("ta,taq,tar->tqr", weight, apart, apart)
+    return y + shift, spread - known + between

@@ -1,0 +1,98 @@
+"""Recordings as a fit takes them: of several nodes, joined; of several lengths, filled up with rows of nothing."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from heliograph.learning.likelihood.objective import Data
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.types import ArrayLike
+from heliograph.simulation.likelihood import rows
+from heliograph.simulation.network import Network
+
+FEWEST = 10  # numbers that arrived for each free one
+
+
+def gathered(network: Network, recording: object, inputs: ArrayLike | Sequence[ArrayLike] | None, free: int) -> Data:
+    """All recordings, checked against the network.
+
+    Raises:
+        ValueError: what a recording may not be: of other shapes, too short, without any change.
+    """
+    several = (
+        recording if isinstance(recording, list | tuple) and not hasattr(recording, "measurements") else [recording]
+    )
+    if not len(several):
+        raise fail("recordings", "at least one", "none")
+    parts = [part for i, item in enumerate(several) for part in _parts(network, item, _inputs_of(inputs, i, several))]
+    for z, _ in parts:
+        network.check_horizon(len(z))
+    longest = max(len(z) for z, _ in parts)
+    data = Data(
+        np.stack([_filled(z, longest, np.nan) for z, _ in parts]),
+        np.stack([_filled(u, longest, None) for _, u in parts]),
+        tuple(len(z) for z, _ in parts),
+    )
+    _check_enough(data, free)
+    return data
+
+
+def _inputs_of(inputs: object, index: int, several: Sequence[object]) -> object:
+    if not isinstance(inputs, list | tuple):
+        return inputs
+    if len(inputs) != len(several):
+        raise fail("inputs", f"those of each of the {len(several)} recordings", f"{len(inputs)} of them")
+    return inputs[index]
+
+
+def _parts(network: Network, recording: Any, inputs: Any) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Measurements (steps, received) and inputs (steps, inputs) of each run of a recording."""
+    held = getattr(recording, "measurements", recording)
+    local = getattr(recording, "inputs", None) if inputs is None else inputs
+    if not isinstance(held, Mapping):
+        if len(network.names) > 1:
+            raise fail("recording", f"measurements by node, of {list(network.names)}", shown(recording))
+        held = {network.names[0]: held}
+    if set(held) != set(network.names):
+        raise fail("recording", f"measurements of the nodes {list(network.names)}", list(held))
+    runs = _runs([np.asarray(held[name]) for name in network.names])
+    results = []
+    for run in runs:
+        columns: list[np.ndarray] = []
+        for name, z in zip(network.names, run, strict=True):
+            like = len(columns[0]) if columns else None
+            found_rows = rows(f"measurements of {name!r}", z, like, network.nodes[name].received, missing=True)
+            columns.append(np.asarray(found_rows))
+        steps, count = len(columns[0]), len(network.inputs)
+        if local is None and count:
+            raise fail("inputs", f"an array ({steps}, {count}) of {list(network.inputs)}", "none")
+        u = np.zeros((steps, 0)) if local is None else rows("inputs", local, steps, count, missing=False)
+        results.append((np.concatenate(columns, axis=1), np.asarray(u)))
+    return results
+
+
+def _runs(values: list[np.ndarray]) -> list[list[np.ndarray]]:
+    """The runs of a simulation one by one; a recording is one."""
+    if all(value.ndim == 3 for value in values):
+        return [list(item) for item in zip(*values, strict=True)]
+    return [values]
+
+
+def _filled(values: np.ndarray, length: int, filler: float | None) -> np.ndarray:
+    """Rows added up to a length: of a filler, or of the last one."""
+    more = length - len(values)
+    end = values[-1:] if filler is None else np.full((1, values.shape[1]), filler)
+    return np.concatenate([values, np.repeat(end, more, axis=0)]) if more else values
+
+
+def _check_enough(data: Data, free: int) -> None:
+    z = data.measurements
+    count = int(np.count_nonzero(~np.isnan(z)))
+    if count < FEWEST * free:
+        raise fail("recording", f"at least {FEWEST * free} numbers that arrived for {free} free ones", count)
+    flat = z.reshape(-1, z.shape[-1])
+    received = [column[~np.isnan(column)] for column in flat.T]
+    still = [i for i, column in enumerate(received) if len(column) and np.ptp(column) == 0]
+    if len(still) == sum(len(column) > 0 for column in received):
+        raise fail("recording", "measurements that vary", f"{array('m', received[still[0]], (None,))[0]:g} throughout")

@@ -1,0 +1,125 @@
+"""The likelihood of recordings over the free numbers: climbed, cut along one of them, and measured at its top."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from heliograph.learning.likelihood.maximise import Evaluated, Maximum, maximise
+from heliograph.learning.likelihood.objective import Data, Evaluation, Objective, at_points
+from heliograph.numerics.types import Bool, Float
+
+LANES = 8  # points at a time
+ROOM = 2.5e7  # numbers that those may take with their derivatives: 200 MB
+DIFFERENCE = 1e-3  # standard errors over which scores are differenced
+REACH = np.array([0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.5, 7.0])  # standard errors at which a profile is cut first
+REFINEMENTS = 2
+
+Watch = Callable[[Maximum], None]
+
+
+class StoppedError(Exception):
+    """Somebody stopped a climb: the best so far."""
+
+    def __init__(self, best: Maximum):
+        super().__init__()
+        self.best = best
+
+
+@dataclass(frozen=True)
+class Surface:
+    """One objective over all recordings; the points asked for last are kept, for they are often asked for again."""
+
+    objective: Objective
+    data: Data
+    _last: list[tuple[np.ndarray, Evaluation]] = field(default_factory=list, repr=False, compare=False)
+
+    @property
+    def lanes(self) -> int:
+        """Points at a time, fewer for long recordings."""
+        r, t, m = self.data.measurements.shape
+        p = self.objective.description.parameters.size
+        return int(np.clip(ROOM // (r * t * m * (m + 2) * (p + 1)), 1, LANES))
+
+    def result(self, x: Float[np.ndarray, "points p"]) -> Evaluation:
+        """All that is known at points."""
+        if not (self._last and np.array_equal(self._last[0][0], x)):
+            self._last[:] = [(np.array(x), at_points(self.objective, np.asarray(x), self.data, self.lanes))]
+        return self._last[0][1]
+
+    def evaluate(self, x: Float[np.ndarray, "points p"]) -> Evaluated:
+        """Likelihood, gradient and information at points."""
+        result = self.result(x)
+        return result.total, result.gradient, result.information
+
+    def climb(
+        self, start: Float[np.ndarray, "points p"], active: Bool[np.ndarray, "points p"], watch: Watch
+    ) -> Maximum:
+        """To the top from each start.
+
+        Raises:
+            StoppedError: with the best so far, where somebody interrupts.
+        """
+        best: list[Maximum] = []
+
+        def seen(now: Maximum) -> None:
+            best[:] = [now]
+            watch(now)
+
+        try:
+            return maximise(self.evaluate, start, active, seen)
+        except KeyboardInterrupt:
+            if not best:
+                raise
+            raise StoppedError(best[0]) from None
+
+    def hessian(self, x: Float[np.ndarray, " p"], active: Bool[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
+        """-d2 l by central differences of the scores, among active coordinates; the information for the others."""
+        information: np.ndarray = self.result(x[None]).information[0]
+        local = np.diag(information)
+        width = np.where(local > 0, DIFFERENCE / np.sqrt(np.where(local > 0, local, 1.0)), 0.0)
+        moving = np.flatnonzero(active & (local > 0))
+        shifts = np.zeros((len(moving), len(x)))
+        shifts[np.arange(len(moving)), moving] = width[moving]
+        if not len(moving):
+            return information
+        gradient = self.result(np.concatenate([x + shifts, x - shifts])).gradient
+        result: np.ndarray = information.copy()
+        slopes = -(gradient[: len(moving)] - gradient[len(moving) :]) / (2 * width[moving][:, None])
+        block = slopes[:, moving]
+        result[np.ix_(moving, moving)] = (block + block.T) / 2
+        return result
+
+    def crossing(
+        self,
+        x: Float[np.ndarray, " p"],
+        top: float,
+        place: int,
+        reach: Float[np.ndarray, " points"],
+        drop: float,
+        active: Bool[np.ndarray, " p"],
+    ) -> float:
+        """Where the likelihood, its other active coordinates at their best, has fallen by `drop` below `top`.
+
+        `reach`: values of the coordinate, away from its best, to begin with. Infinite where it has not fallen there.
+        """
+        others = active.copy()
+        others[place] = False
+        inside, outside = x[place], np.nan
+        low = 0.0
+        for _ in range(1 + REFINEMENTS):
+            start = np.repeat(x[None], len(reach), axis=0)
+            start[:, place] = reach
+            total = maximise(self.evaluate, start, np.repeat(others[None], len(reach), axis=0)).total
+            fallen = np.sqrt(np.maximum(2 * (top - np.where(np.isfinite(total), total, -np.inf)), 0.0))
+            beyond = np.flatnonzero(fallen >= np.sqrt(2 * drop))
+            if not len(beyond):
+                return float(np.sign(reach[-1] - reach[0]) * np.inf)
+            at = int(beyond[0])
+            if at > 0:
+                inside, low = reach[at - 1], fallen[at - 1]
+            outside, high = reach[at], fallen[at]
+            reach = np.linspace(inside, outside, len(reach) + 1)[1:]
+        if not np.isfinite(high):
+            return float(outside)
+        return float(inside + (outside - inside) * (np.sqrt(2 * drop) - low) / (high - low))

@@ -1,0 +1,1 @@
+"""Laws of losses, learned and compared."""

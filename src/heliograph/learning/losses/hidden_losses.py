@@ -1,0 +1,159 @@
+"""Losses of a link that is good or bad for a while, which nobody is told: its two-mode filter and its likelihood."""
+
+import numpy as np
+
+from heliograph.learning.losses.loss_law import AbstractLossLaw, Packets
+from heliograph.learning.losses.shares import Share, logits, maximum, shares_at
+from heliograph.learning.losses.stretches import Fates, as_fates
+from heliograph.model.channel import erasure
+from heliograph.model.fading import gilbert_elliott
+from heliograph.random_affine.base import AbstractRandomAffine
+
+STEP = 1e-20  # of the complex step, whose error is its square
+UNKNOWN, START = 2, 3  # what a run of packets can be beside arrived (0) and lost (1)
+
+STARTS = (  # loss when good, loss when bad, fail, recover: bursts, long spells, two rates that hardly differ
+    logits(0.02, 0.9, 0.05, 0.5),
+    logits(0.05, 0.5, 0.005, 0.02),
+    logits(0.1, 0.3, 0.1, 0.1),
+)
+
+
+class HiddenModeLosses(AbstractLossLaw):
+    """A hidden mode, good or bad, that fails and recovers as a chain; a packet is lost with the mode's probability.
+
+    Source: Gilbert (1960), Elliott (1963).
+    """
+
+    good_loss: Share
+    bad_loss: Share
+    fail: Share
+    recover: Share
+
+    @staticmethod
+    def fit(fates: object, intervals: bool = True) -> "HiddenModeLosses":
+        """Maximum likelihood from three starts, with intervals by the profile of the likelihood.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        runs = Runs.of(as_fates(fates))
+        top, value = maximum(runs.likelihood, [*STARTS])
+        good, bad, fails, recovers = shares_at(runs.likelihood, top, value, intervals)
+        if good.estimate > bad.estimate:
+            good, bad, fails, recovers = bad, good, recovers, fails
+        return HiddenModeLosses(good, bad, fails, recovers)
+
+    def shares(self) -> dict[str, Share]:
+        """Losses of each mode and the chain's probabilities, with likelihood intervals."""
+        return {name: getattr(self, name) for name in ("good_loss", "bad_loss", "fail", "recover")}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """By the filter of the mode: P(lost) = sum_i P(mode i | past) loss_i."""
+        good, bad, fails, recovers = (share.estimate for share in self.shares().values())
+        away = fails + recovers
+        is_bad = fails / away if away else 0.5  # two modes that never change: nobody knows which it is
+        result = np.zeros(len(fate))
+        for k, seen in enumerate(fate.tolist()):
+            p = (1 - is_bad) * good + is_bad * bad
+            result[k] = p
+            if seen == 1 and p > 0:
+                is_bad = is_bad * bad / p
+            elif seen == 0 and p < 1:
+                is_bad = is_bad * (1 - bad) / (1 - p)
+            is_bad = (1 - is_bad) * fails + is_bad * (1 - recovers)
+        return result
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """`gilbert_elliott` of the link with each mode's losses."""
+        good, bad = (erasure(link, 1 - share.estimate) for share in (self.good_loss, self.bad_loss))
+        return gilbert_elliott(good, bad, self.fail.estimate, self.recover.estimate)
+
+
+class Runs:
+    """Stretches as runs of equal fates, whose matrices are powers: the likelihood needs one product for each run.
+
+    The likelihood of a stretch is 1' A_n T' A_(n-1) ... T' A_1 p, with A the diagonal of the fate's probabilities in
+    each mode, T the transition and p its stationary law. Between stretches stands p 1', which starts anew; one more T'
+    after the last A changes nothing, 1' T' = 1', so that each A is followed by one.
+    """
+
+    def __init__(self, kind: np.ndarray, length: np.ndarray):
+        self.kind = kind
+        items = {int(item): kind == item for item in np.unique(kind)}
+        self.places = {name: (here, *np.unique(length[here], return_inverse=True)) for name, here in items.items()}
+
+    @staticmethod
+    def of(fates: Fates) -> "Runs":
+        """Put stretches one after another, each behind a START."""
+        code = np.concatenate([[START, *np.where(np.isnan(f), UNKNOWN, f).tolist()] for f in fates]).astype(int)
+        first = np.flatnonzero(np.concatenate([[True], (np.diff(code) != 0) | (code[1:] == START)]))
+        return Runs(code[first], np.diff(np.append(first, len(code))))
+
+    def likelihood(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        """Log-likelihood at logits of (loss when good, when bad, fail, recover), and its gradient by complex steps."""
+        shifted = np.broadcast_to(x, (5, 4)).astype(complex)
+        shifted[np.arange(4), np.arange(4)] += 1j * STEP
+        total = self._log(1 / (1 + np.exp(-shifted)))
+        return float(total[4].real), np.asarray(total[:4].imag / STEP)
+
+    def _log(self, shares: np.ndarray) -> np.ndarray:
+        """Log-likelihoods for several sets of shares (sets, 4)."""
+        good, bad, fails, recovers = shares.T
+        item = np.ones_like(good)
+        moved = _matrices([[1 - fails, recovers], [fails, 1 - recovers]])  # T', columns from the present mode
+        emitted = {0: [1 - good, 1 - bad], 1: [good, bad], UNKNOWN: [item, item]}
+        away = fails + recovers
+        start = _matrices([[recovers / away] * 2, [fails / away] * 2])  # p 1'
+        parts = np.zeros((len(shares), len(self.kind), 2, 2), dtype=complex)
+        scales = np.zeros((len(shares), len(self.kind)), dtype=complex)
+        for kind, (here, lengths, place) in self.places.items():
+            if kind == START:
+                parts[:, here] = start[:, None]
+                continue
+            step = moved * np.stack(emitted[kind], axis=-1)[:, None, :]  # T' A
+            power, scale = _powers(step, lengths)
+            parts[:, here], scales[:, here] = power[:, place], scale[:, place]
+        whole, scale = _product(parts)
+        ahead = whole.sum(axis=-2)[..., 0]  # all columns of what starts with p 1' agree
+        return np.asarray(np.log(ahead) + scale + scales.sum(axis=1))
+
+
+def _matrices(rows: list[list[np.ndarray]]) -> np.ndarray:
+    """(sets, 2, 2)."""
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _scaled(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """In units of its largest real part, and the logarithm of that."""
+    size = np.max(matrix.real, axis=(-2, -1))
+    size = np.where(size > 0, size, 1.0)
+    return matrix / size[..., None, None], np.log(size)
+
+
+def _powers(matrix: np.ndarray, lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """matrix^length for each length, scaled, and the logarithms of the scales: by the binary digits of the lengths."""
+    shape = (len(matrix), len(lengths))
+    result = np.broadcast_to(np.eye(2, dtype=complex), (*shape, 2, 2))
+    scale, (square, square_scale) = np.zeros(shape), _scaled(matrix)
+    left = lengths.copy()
+    while np.any(left):
+        odd = (left & 1).astype(bool)
+        result = np.where(odd[:, None, None], square[:, None] @ result, result)
+        result, more = _scaled(result)
+        scale = scale + more + np.where(odd, square_scale[:, None], 0.0)
+        left = left >> 1
+        square, more = _scaled(square @ square)
+        square_scale = 2 * square_scale + more
+    return result, scale
+
+
+def _product(parts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The product of (sets, runs, 2, 2), the last run first, scaled, and the logarithm of the scale: pair by pair."""
+    scale = np.zeros(len(parts))
+    while parts.shape[1] > 1:
+        if parts.shape[1] % 2:
+            parts = np.concatenate([parts, np.broadcast_to(np.eye(2), (len(parts), 1, 2, 2))], axis=1)
+        parts, more = _scaled(parts[:, 1::2] @ parts[:, ::2])
+        scale = scale + more.sum(axis=1)
+    return parts[:, 0], scale

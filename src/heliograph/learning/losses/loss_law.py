@@ -1,0 +1,161 @@
+"""What a law of losses is: the probability that a packet is lost, given what became of those before it."""
+
+from typing import TypeVar
+
+import numpy as np
+
+from heliograph.learning.losses.shares import Share, wilson
+from heliograph.learning.losses.stretches import as_fates
+from heliograph.model.channel import erasure
+from heliograph.model.fading import gilbert_elliott, markov_fading
+from heliograph.numerics.check import check_count, fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Float
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.chain import MarkovChain
+
+Law = TypeVar("Law", bound="AbstractLossLaw")
+Packets = Float[np.ndarray, " packets"]
+
+
+@readable
+class AbstractLossLaw(Module):
+    """A law of told losses. A subclass says `shares` and `predicted`, and `channel` where one has such losses.
+
+    The log-likelihood of a recording is the sum of log P(fate | fates before) over the packets whose fate is known;
+    each stretch starts in the stationary law.
+    """
+
+    def shares(self) -> dict[str, Share]:
+        """The estimates with their intervals, by name."""
+        raise NotImplementedError
+
+    def predicted(self, fate: Packets) -> Packets:
+        """P(lost) of each packet of a stretch, given those before it."""
+        raise NotImplementedError
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """The link with such losses, which the receiver is told of.
+
+        Raises:
+            ValueError: a law that no channel has.
+        """
+        raise fail(f"channel with {type(self).__name__}", "a law with finitely many states", "a rate that drifts")
+
+    def log_likelihoods(self, fates: object) -> Packets:
+        """log P(fate | those before), packet by packet, of all stretches; NaN where the fate is unknown.
+
+        Raises:
+            ValueError: what is no fates (see `heliograph.learning`).
+        """
+        parts = as_fates(fates)
+        lost, p = np.concatenate(parts), np.concatenate([self.predicted(part) for part in parts])
+        with np.errstate(divide="ignore"):
+            result: Packets = np.where(np.isnan(lost), np.nan, np.where(lost == 1, np.log(p), np.log1p(-p)))
+        return result
+
+
+class IndependentLosses(AbstractLossLaw):
+    """Each packet is lost with one probability, whatever became of the others: `lost` of `packets`."""
+
+    lost: int
+    packets: int
+
+    @staticmethod
+    def fit(fates: object) -> "IndependentLosses":
+        """Count.
+
+        Raises:
+            ValueError: what is no fates.
+        """
+        known = np.concatenate(as_fates(fates))
+        return IndependentLosses(int(np.nansum(known)), int(np.sum(~np.isnan(known))))
+
+    def shares(self) -> dict[str, Share]:
+        """k / n with Wilson's interval."""
+        return {"loss": wilson(self.lost, self.packets)}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """(k + 1/2) / (n + 1): a loss is never impossible."""
+        return np.full(len(fate), (self.lost + 0.5) / (self.packets + 1))
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """The link behind an erasure."""
+        return erasure(link, 1 - self.lost / self.packets)
+
+
+class MarkovLosses(AbstractLossLaw):
+    """The probability depends on what became of the last `order` packets.
+
+    counts[past] = (arrived, lost) after each past, a number whose bits are the last fates, the latest one lowest.
+
+    Shapes: counts (2^order, 2).
+    """
+
+    counts: np.ndarray
+
+    @staticmethod
+    def fit(fates: object, order: int = 1) -> "MarkovLosses":
+        """Count, over packets of which the last `order` fates are known.
+
+        Raises:
+            ValueError: what is no fates, or an order that is not from 1 to 12.
+        """
+        if check_count("order", order) > 12:
+            raise fail("order", "at most 12 packets back", order)
+        counts = np.zeros((2**order, 2))
+        for part in as_fates(fates):
+            past, length = _past(part, order)
+            full = (length == order) & ~np.isnan(part)
+            np.add.at(counts, (past[full], part[full].astype(int)), 1.0)
+        return MarkovLosses(counts)
+
+    @property
+    def order(self) -> int:
+        """Packets back that it looks."""
+        return len(self.counts).bit_length() - 1
+
+    def shares(self) -> dict[str, Share]:
+        """P(lost | arrived) and P(arrived | lost) with Wilson's intervals; of a higher order P(lost | past)."""
+        if self.order == 1:
+            (stayed, failed), (recovered, lost) = self.counts
+            return {"fail": wilson(failed, stayed + failed), "recover": wilson(recovered, recovered + lost)}
+        names = [f"loss_after_{past:0{self.order}b}" for past in range(len(self.counts))]
+        return {name: wilson(row[1], row.sum()) for name, row in zip(names, self.counts, strict=True)}
+
+    def predicted(self, fate: Packets) -> Packets:
+        """(k + 1/2) / (n + 1) after the past, as far as it is known."""
+        past, length = _past(fate, self.order)
+        result = np.zeros(len(fate))
+        for known in range(self.order + 1):
+            counts = self.counts.reshape(-1, 2**known, 2).sum(axis=0)  # over fates further back
+            p = (counts[:, 1] + 0.5) / (counts.sum(axis=1) + 1)
+            here = length == known
+            result[here] = p[past[here] & (2**known - 1)]
+        return result
+
+    def channel(self, link: AbstractRandomAffine) -> AbstractRandomAffine:
+        """The link in modes that are the last fates; one that was never seen is taken for even odds."""
+        arrives, lost = erasure(link, 1.0), erasure(link, 0.0)
+        if self.order == 1:
+            shares = self.shares()
+            return gilbert_elliott(arrives, lost, shares["fail"].estimate, shares["recover"].estimate)
+        seen = self.counts.sum(axis=1)
+        p = np.where(seen > 0, self.counts[:, 1], 0.5) / np.where(seen > 0, seen, 1.0)
+        now = np.arange(len(p))
+        transition = np.zeros((len(p), len(p)))
+        transition[now, (now << 1) & (len(p) - 1)] += 1 - p
+        transition[now, ((now << 1) | 1) & (len(p) - 1)] += p
+        return markov_fading([lost if mode & 1 else arrives for mode in now], MarkovChain(transition))
+
+
+def _past(fate: Packets, order: int) -> tuple[np.ndarray, np.ndarray]:
+    """The last fates as a number, the latest lowest, and how many of them are known without a gap, `order` at most."""
+    past, length = np.zeros(len(fate), dtype=int), np.zeros(len(fate), dtype=int)
+    for back in range(1, order + 1):
+        before = np.concatenate([np.full(back, np.nan), fate])[: len(fate)]
+        unbroken = (length == back - 1) & ~np.isnan(before)
+        past += np.where(unbroken, np.nan_to_num(before).astype(int) << (back - 1), 0)
+        length += unbroken
+    return past, length

@@ -1,0 +1,109 @@
+"""Shares of one with their 95 % intervals: by Wilson from counts, by the profile of a likelihood elsewhere."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import brentq, minimize
+from scipy.special import expit, logit
+from scipy.stats import norm
+
+from heliograph.numerics.readable import readable
+
+FALL = 1.920729  # of the log-likelihood to the ends of a 95 % interval: half the 95 % point of chi-square(1)
+FALL_AT_END = 1.352772  # where the maximum lies at 0 or 1 only one side is left: half its 90 % point
+END = 14.0  # logits beyond are 0 and 1: shares of 8e-7
+
+Slope = Callable[[np.ndarray], tuple[float, np.ndarray]]  # value and gradient of a log-likelihood of logits
+
+
+@readable
+class Share(NamedTuple):
+    """A probability, estimated, and the ends of its 95 % interval."""
+
+    estimate: float
+    low: float
+    high: float
+
+
+def wilson(hits: float, of: float) -> Share:
+    """k / n, with the shares p that |k - n p| <= 1.96 sqrt(n p (1 - p)) allows; (NaN, 0, 1) of nothing.
+
+    Source: Wilson, Probable inference (1927).
+    """
+    if not of:
+        return Share(float("nan"), 0.0, 1.0)
+    z = float(norm.ppf(0.975))
+    p = hits / of
+    middle = (p + z**2 / (2 * of)) / (1 + z**2 / of)
+    half = z / (1 + z**2 / of) * np.sqrt(p * (1 - p) / of + z**2 / (4 * of**2))
+    return Share(p, 0.0 if not hits else float(middle - half), 1.0 if hits == of else float(middle + half))
+
+
+def maximum(function: Slope, starts: list[np.ndarray], precision: float = 1e-13) -> tuple[np.ndarray, float]:
+    """The best of the maxima found from the starts (logits), and the value there; logits stay within END.
+
+    precision: the relative change of the value at which a search ends.
+    """
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = function(x)
+        return -value, -slope
+
+    bounds = [(-END, END)] * len(starts[0])
+    results = [minimize(loss, x, jac=True, bounds=bounds, options={"ftol": precision, "gtol": 1e-7}) for x in starts]
+    best = min(results, key=lambda item: float(item.fun))
+    return np.asarray(best.x), -float(best.fun)
+
+
+def shares_at(function: Slope, top: np.ndarray, value: float, intervals: bool) -> list[Share]:
+    """Shares at the maximum, each with the interval where the likelihood, maximised over the others, falls by FALL.
+
+    A share at 0 is "0, below the high end", one at 1 "1, above the low end"; then FALL_AT_END counts.
+    """
+    if not intervals:
+        return [Share(float(p), float("nan"), float("nan")) for p in expit(top)]
+    return [_profile(function, top, value, i) for i in range(len(top))]
+
+
+def _profile(function: Slope, top: np.ndarray, value: float, i: int) -> Share:
+    ends = {side: top[i] * side > END - 4 for side in (-1, 1)}
+    fall = FALL_AT_END if any(ends.values()) else FALL
+    low, high = (
+        (0.0 if side < 0 else 1.0) if ends[side] else _end(function, top, value - fall, i, side) for side in (-1, 1)
+    )
+    estimate = next((0.0 if side < 0 else 1.0 for side in (-1, 1) if ends[side]), float(expit(top[i])))
+    return Share(estimate, low, high)
+
+
+def _end(function: Slope, top: np.ndarray, level: float, i: int, side: int) -> float:
+    """Where the profile of logit i crosses the level on one side; 0 or 1 where it does not."""
+    others, near = np.delete(np.arange(len(top)), i), top.copy()
+
+    @cache  # an end of a bracket keeps its value: from another start a search may end elsewhere
+    def above(x: float) -> float:
+        def held(free: np.ndarray) -> tuple[float, np.ndarray]:
+            whole = np.zeros(len(top))
+            whole[i], whole[others] = x, free
+            value, slope = function(whole)
+            return value, slope[others]
+
+        free, best = maximum(held, [near[others]], 1e-9)
+        if best > level:
+            near[others] = free
+        return best - level
+
+    inside, step = float(top[i]), 0.25
+    if above(inside) <= 0:
+        return float(expit(inside))
+    if above(side * END) >= 0:
+        return 0.0 if side < 0 else 1.0
+    while above(outside := float(np.clip(inside + side * step, -END, END))) > 0:
+        inside, step = outside, 2 * step
+    return float(expit(brentq(above, inside, outside, xtol=1e-3)))
+
+
+def logits(*shares: float) -> np.ndarray:
+    """Of shares inside (0, 1)."""
+    return np.asarray(logit(np.array(shares)))

@@ -1,0 +1,145 @@
+"""What became of packets: 0 arrived, 1 lost, NaN nobody knows, in stretches between which nothing is known."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import numpy as np
+
+from heliograph.numerics.check import array, check_count, fail, items, rank, table
+from heliograph.numerics.types import ArrayLike, Float
+
+Fates = list[Float[np.ndarray, " packets"]]
+
+JUMP = 200  # sequence numbers that leap so far ahead tell of a restart, not of as many losses
+COPY = 50  # a number heard again within so many is a copy
+
+
+def fates_of_sequence(sequence: ArrayLike, sent: ArrayLike | None = None, jump: int = JUMP) -> Fates:
+    """Fates of the packets of one sender from the sequence numbers that were heard: what is missing was lost.
+
+    A number that leaps ahead by `jump` or falls back starts a new stretch (the sender restarted); a copy is dropped.
+    Packets that overtake each other look like restarts: with their times of sending they are put in order first, and a
+    copy is what has number and time of another.
+
+    Shapes: sequence, sent (packets,).
+
+    Raises:
+        ValueError: no packet, numbers that are not whole, times of another length.
+    """
+    check_count("jump", jump, 2)
+    numbers = array("sequence numbers", sequence, (None,))
+    if not len(numbers) or np.any(numbers != np.round(numbers)):
+        raise fail("sequence numbers", "whole numbers, at least one", "none" if not len(numbers) else "fractions")
+    received = numbers.astype(np.int64)
+    if sent is not None:
+        when = array("times of sending", sent, received.shape)
+        received = np.unique(np.stack([when, numbers]), axis=1)[1].astype(np.int64)  # by time, then by number
+    parts: list[list[int]] = [[]]
+    for number in received.tolist():
+        local = parts[-1]
+        if sent is None and number in local[-COPY:]:
+            continue
+        if local and (number <= local[-1] or number - local[-1] >= jump):
+            parts.append([])
+        parts[-1].append(number)
+    return [_gaps(np.array(part)) for part in parts]
+
+
+def _gaps(received: np.ndarray) -> Float[np.ndarray, " packets"]:
+    lost = np.ones(received[-1] - received[0] + 1)
+    lost[received - received[0]] = 0.0
+    return lost
+
+
+def fates_by_node(
+    node: Sequence[object] | np.ndarray, sequence: ArrayLike, sent: ArrayLike | None = None
+) -> dict[str, Fates]:
+    """The same for each sender of a log, by the sender's name.
+
+    Shapes: node, sequence, sent (packets,).
+
+    Raises:
+        ValueError: as `fates_of_sequence`; not one node for each number.
+    """
+    items("names of nodes", node, "names")
+    names = np.asarray([str(name) for name in node])
+    numbers = array("sequence numbers", sequence, (len(names),))
+    when = None if sent is None else array("times of sending", sent, (len(names),))
+    return {
+        str(name): fates_of_sequence(numbers[names == name], None if when is None else when[names == name])
+        for name in dict.fromkeys(names.tolist())
+    }
+
+
+def fates_by_hop(arrived: Mapping[str, ArrayLike]) -> dict[str, Fates]:
+    """Fates at each hop of a route, from which packets were heard behind each, in the order of the route.
+
+    A packet that was lost says nothing of the hops that it did not reach.
+
+    Shapes: each of `arrived` (packets,), true or 1 where the packet was heard behind this hop.
+
+    Raises:
+        ValueError: no hops, other values, a packet heard behind a hop but not before it.
+    """
+    if not table("arrivals by hop", arrived, "arrays"):
+        raise fail("arrivals by hop", "at least one hop", "none")
+    result: dict[str, Fates] = {}
+    before: np.ndarray | None = None
+    for name, value in arrived.items():
+        received = array(f"arrivals behind {name!r}", value, (None if before is None else len(before),))
+        if np.any((received != 0) & (received != 1)):
+            raise fail(f"arrivals behind {name!r}", "0 and 1, or truth values", "other numbers")
+        before = np.ones(len(received)) if before is None else before
+        if np.any(received > before):
+            packet = int(np.argmax(received > before))
+            raise fail(
+                f"arrivals behind {name!r}", "packets that passed the hop before", f"packet {packet}, which did not"
+            )
+        result[name] = [np.where(before == 1, 1.0 - received, np.nan)]
+        before = received
+    return result
+
+
+def fates_of_measurements(measurements: Mapping[str, ArrayLike]) -> dict[str, Fates]:
+    """Fates of what each node of a recording should have heard at each step: NaN was lost, and the node was told.
+
+    Components of a node that come and go together are one packet, under the node's name; else each has its own,
+    NODE.0, NODE.1, ... A component that never arrived was not sent.
+
+    Shapes: measurements[node] (steps, received).
+
+    Raises:
+        ValueError: no table of numbers.
+    """
+    result: dict[str, Fates] = {}
+    for node, value in table("measurements", measurements, "arrays").items():
+        name = f"measurements of {node!r}"
+        values = array(name, value, (None,) if rank(name, value) == 1 else (None, None), missing=True)
+        gone = np.isnan(
+            array(f"measurements of {node!r}", values[:, None] if values.ndim == 1 else values, (None, None), True)
+        )
+        if np.all(gone == gone[:, :1]):
+            result[node] = [gone[:, 0].astype(float)]
+        else:
+            result |= {f"{node}.{i}": [lost.astype(float)] for i, lost in enumerate(gone.T) if not np.all(lost)}
+    return result
+
+
+def as_fates(value: object) -> Fates:
+    """One stretch of fates, or several.
+
+    Raises:
+        ValueError: anything but 0, 1 and NaN, or nothing that is known.
+    """
+    listed = isinstance(value, Sequence) or np.ndim(cast(ArrayLike, value)) > 0
+    items: list[Any] = list(cast(Sequence[Any], value)) if listed else [value]
+    several = len(items) > 0 and all(rank("fates", item) == 1 for item in items)
+    parts = [array("fates", part, (None,), missing=True) for part in (items if several else [cast(ArrayLike, value)])]
+    for part in parts:
+        if np.any((part != 0) & (part != 1) & ~np.isnan(part)):
+            raise fail(
+                "fates", "0 for a packet that arrived, 1 for a lost one, NaN for an unknown one", "other numbers"
+            )
+    if not any(np.any(~np.isnan(part)) for part in parts):
+        raise fail("fates", "at least one packet of which the fate is known", "none")
+    return [part for part in parts if len(part)]

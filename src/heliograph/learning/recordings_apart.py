@@ -1,0 +1,116 @@
+"""Many recordings of one network, each fitted by itself, side by side: how good estimates and intervals would be."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from heliograph.learning.description import describe
+from heliograph.learning.free_marks import Build
+from heliograph.learning.intervals import Method, long_run, quantile, sandwich
+from heliograph.learning.likelihood.maximise import Evaluated, maximise
+from heliograph.learning.likelihood.objective import Evaluation, Form, Objective, objectives, one_recording
+from heliograph.learning.likelihood.surface import DIFFERENCE
+from heliograph.learning.likelihood.transforms import unlink
+from heliograph.learning.parameters import Parameters
+from heliograph.numerics.check import array, fail, shown
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, Bool, Float
+
+SEEN = 0.05  # information of a coordinate below which the number has run to a limit
+
+
+@readable
+@dataclass(frozen=True)
+class FitEach:
+    """Estimates from each of many recordings, on the line on which steps are taken.
+
+    Of each: x; the Hessian of the negative log-likelihood; the scores of each step; whether the climb converged to a
+    point at which no number has run to a limit (`inside`).
+
+    Shapes: x (runs, p), hessian (runs, p, p), scores (runs, steps, p), inside (runs,).
+    """
+
+    parameters: Parameters
+    x: Float[np.ndarray, "runs p"]
+    hessian: Float[np.ndarray, "runs p p"]
+    scores: Float[np.ndarray, "runs steps p"]
+    inside: Bool[np.ndarray, " runs"]
+
+    @property
+    def estimates(self) -> Float[np.ndarray, "runs p"]:
+        """The numbers themselves."""
+        return self._back(self.x)
+
+    def intervals(self, method: Method) -> tuple[Float[np.ndarray, "runs p"], Float[np.ndarray, "runs p"]]:
+        """Lower and upper ends of 95 % intervals, as `Fit.rows` makes them; NaN where a number has run to a limit."""
+        reach = np.full(self.x.shape, np.nan)
+        for i in np.flatnonzero(self.inside):
+            result = long_run(method, [self.scores[i]], self.hessian[i])
+            spread = np.diag(sandwich(self.hessian[i], result.covariance))
+            reach[i] = quantile(result.freedom) * np.sqrt(np.maximum(spread, 0.0))
+        return self._back(self.x - reach), self._back(self.x + reach)
+
+    def _back(self, x: np.ndarray) -> np.ndarray:
+        columns = [unlink(e.domain, x[:, i]) for i, e in enumerate(self.parameters.entries)]
+        return np.stack(columns, axis=1)
+
+
+def fit_each(
+    network: Build, measurements: ArrayLike, inputs: ArrayLike | None = None, form: Form | None = None
+) -> FitEach:
+    """Fit each of many recordings of one length by itself, from the network's start, in one compiled program.
+
+    For studies: what `fit` finds of each, without its other starts and sentences, for free numbers that are single.
+
+    Shapes: measurements (runs, steps, received) of all nodes in their order, inputs (steps, inputs) common to all.
+
+    Raises:
+        ValueError: as `fit`; a form that the network has not, free numbers that are no single ones.
+    """
+    description = describe(network)
+    parameters = description.parameters
+    if any(item.start.ndim for item in parameters.every):
+        raise fail("free numbers", "single ones", [item.name for item in parameters.every if item.start.ndim])
+    known: Sequence[Objective] = objectives(description)
+    chosen = [item for item in known if form in (None, item.form)]
+    if not chosen:
+        raise fail("form", f"one of {', '.join(item.form for item in known)}", shown(form))
+    z = array("measurements", measurements, (None, None, None), missing=True)
+    count = len(description.start.inputs)
+    u = np.zeros((z.shape[1], 0)) if inputs is None else array("inputs", inputs, (z.shape[1], count))
+    objective = chosen[-1]
+
+    def outcome(x: np.ndarray) -> Evaluation:
+        with jax.enable_x64(True):
+            result: Evaluation = to_numpy(_evaluate_each(objective, x, z, u))
+        return result
+
+    def evaluate(x: np.ndarray) -> Evaluated:
+        at = outcome(x)
+        return np.asarray(at.density.sum(axis=1)), np.asarray(at.score.sum(axis=1)), np.asarray(at.halves.sum(axis=1))
+
+    best = maximise(evaluate, np.repeat(parameters.start[None], len(z), axis=0))
+    top = outcome(best.x)
+    local = np.diagonal(np.asarray(top.halves).sum(axis=1), axis1=1, axis2=2)
+    inside = best.converged & np.all(local > SEEN, axis=1)
+    hessian = np.asarray(top.halves).sum(axis=1)
+    width = DIFFERENCE / np.sqrt(np.maximum(local, SEEN))
+    slopes = np.empty(hessian.shape)
+    for i in range(best.x.shape[1]):
+        shift = np.zeros(best.x.shape)
+        shift[:, i] = width[:, i]
+        slopes[:, i] = (evaluate(best.x - shift)[1] - evaluate(best.x + shift)[1]) / (2 * width[:, i, None])
+    slopes = (slopes + slopes.swapaxes(1, 2)) / 2
+    concave = inside & (np.linalg.eigvalsh(np.nan_to_num(slopes))[:, 0] > 0)
+    hessian = np.where(concave[:, None, None], slopes, hessian)
+    return FitEach(parameters, best.x, hessian, np.asarray(top.score), inside)
+
+
+@quickly_compiled
+def _evaluate_each(objective: Objective, x: Array, z: Array, u: Array) -> Evaluation:
+    evaluation: Evaluation = jax.vmap(lambda point, item: one_recording(objective, point, item, u))(x, z)
+    return evaluation

@@ -1,0 +1,215 @@
+"""A linear plant heard over links whose losses are told: gains, certificates of a bounded mean error, and its limits.
+
+P is the error covariance before a measurement is used, U_i the part of E P in which mode i of the links comes next.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from heliograph.linear.recursion import solve_innovation
+from heliograph.numerics.check import fail
+from heliograph.numerics.types import Float, Int
+
+BELOW_ONE = 1 - 1e-9  # below this a spectral radius is below 1, whatever rounding did to it
+CONVERGED = 1e-13  # relative change of the gains from step to step
+ITERATIONS, POLISHING = 100, 50  # of the covariance recursion in search of gains, and of what follows it
+NEGLIGIBLE = 1e12  # how far covariances outgrow the noises before these are left out
+SEEN = 1e-6  # share that a mode counts with in the search for gains, if it is left for good sooner or later
+SIZE_LIMIT = 1024  # rows of the operator that acts on all entries of all covariances
+
+KindGains = tuple[Float[np.ndarray, "n _"], ...]
+Parts = Float[np.ndarray, "modes n n"]
+
+
+class KnownLossSystem(NamedTuple):
+    """x+ = A x + w, Cov(w) = Q; in mode i the receiver is told its kind s = told[i] and reads C_s x + v, Cov(v) = R_i.
+
+    `chain[i, j]` = P(next mode j | now i), `law` the modes' law after long. Modes of one kind cannot be told apart, so
+    a gain belongs to a kind. A kind without rows is a loss.
+    """
+
+    transition: Float[np.ndarray, "n n"]
+    process: Float[np.ndarray, "n n"]
+    chain: Float[np.ndarray, "modes modes"]
+    law: Float[np.ndarray, "modes"]
+    known: Int[np.ndarray, "modes"]
+    outputs: tuple[Float[np.ndarray, "_ n"], ...]
+    noises: tuple[Float[np.ndarray, "_ _"], ...]
+
+    @property
+    def forgets(self) -> bool:
+        """Whether the modes are independent over time."""
+        return bool(np.all(self.chain == self.chain[0]))
+
+    def loops(self, gains: KindGains) -> Parts:
+        """F_i = A - K C of each mode."""
+        return np.array([self.transition - gains[s] @ self.outputs[s] for s in self.known])
+
+    def moved(self, gains: KindGains, parts: Parts, source: Parts) -> Parts:
+        """U_j+ = sum_i chain[i, j] (F_i U_i F_i' + source_i): Joseph's form, true of any gains."""
+        loops = self.loops(gains)
+        return np.asarray(np.einsum("ij,iab->jab", self.chain, loops @ parts @ loops.swapaxes(1, 2) + source))
+
+    def source(self, gains: KindGains) -> Parts:
+        """What noise adds to F_i U_i F_i': law_i (K R_i K' + Q)."""
+        modes = zip(self.law, self.known, self.noises, strict=True)
+        return np.array([p * (gains[s] @ r @ gains[s].T + self.process) for p, s, r in modes])
+
+
+def long_run_law(initial: Float[np.ndarray, "modes"], chain: Float[np.ndarray, "modes modes"]) -> np.ndarray:
+    """The law of a chain's modes on average over a long time: that of one which waits half of the time."""
+    lazy = (chain + np.eye(len(chain))) / 2
+    for _ in range(60):
+        lazy = lazy @ lazy
+        lazy /= lazy.sum(axis=1, keepdims=True)
+    return np.asarray(initial @ lazy)
+
+
+def operator(system: KnownLossSystem, gains: KindGains) -> Float[np.ndarray, "N N"]:
+    """U -> sum_i chain[i, j] F_i U_i F_i' on all entries; where modes are independent, that of the sum of all U.
+
+    Raises:
+        ValueError: more than SIZE_LIMIT rows.
+    """
+    n, modes = len(system.transition), len(system.chain)
+    size = n * n * (1 if system.forgets else modes)
+    if size > SIZE_LIMIT:
+        raise fail("boundedness", f"at most {SIZE_LIMIT} entries of covariances over all modes", size)
+    squares = np.array([np.kron(f, f) for f in system.loops(gains)])
+    if system.forgets:
+        return np.asarray(np.tensordot(system.chain[0], squares, axes=1))
+    return np.block([[system.chain[i, j] * squares[i] for i in range(modes)] for j in range(modes)])
+
+
+def spectral_radius(matrix: Float[np.ndarray, "N N"]) -> float:
+    """The largest modulus of an eigenvalue."""
+    return float(np.max(np.abs(np.linalg.eigvals(matrix)), initial=0.0))
+
+
+def steady(system: KnownLossSystem, gains: KindGains, source: Parts) -> Parts:
+    """U = moved(U), for gains under which the operator contracts."""
+    n, matrix = len(system.transition), operator(system, gains)
+    if system.forgets:
+        right = source.sum(axis=0)
+        total = np.linalg.solve(np.eye(n * n) - matrix, right.ravel()).reshape(n, n)
+        result = system.chain[0][:, None, None] * total
+    else:
+        right = np.einsum("ij,iab->jab", system.chain, source)
+        result = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
+    return np.asarray((result + result.swapaxes(1, 2)) / 2)
+
+
+def certified_radius(system: KnownLossSystem, gains: KindGains) -> float:
+    """The spectral radius of the operator under any gains, wherever they come from; infinite without a witness.
+
+    Below 1, E P stays bounded under these gains, hence under the best. The witness is U > 0 with U - moved(U) > 0,
+    checked by multiplication: a map that keeps covariances has one exactly where its radius is below 1.
+
+    Source: Sinopoli et al., Kalman filtering with intermittent observations (2004), Theorem 5, with any gain.
+    """
+    radius = spectral_radius(operator(system, gains))
+    if radius >= BELOW_ONE:
+        return radius
+    modes, n = len(system.chain), len(system.transition)
+    share = system.chain[0] if system.forgets else np.full(modes, 1 / modes)
+    items = share[:, None, None] * np.eye(n)
+    reached = np.array([(system.chain[:, j] > 0).any() for j in range(modes)])
+    witness = steady(system, gains, items)
+    left = (witness - system.moved(gains, witness, np.zeros_like(items)))[reached]
+    positive = min(np.linalg.eigvalsh(left).min(), np.linalg.eigvalsh(witness[reached]).min()) > 0
+    return radius if positive else float("inf")
+
+
+def find_gains(system: KnownLossSystem) -> KindGains:
+    """Gains that make the steady bound on E P small: K_s = A V C' (C V C' + R)^-1, V and R summed over modes of a kind.
+
+    The covariance recursion of the best filter, with mean covariances in place of its own, runs until its gains
+    settle; what is left is done by policy iteration. Where that is not certified, gains A C+ are tried, with which an
+    output that shows all of x leaves no old error.
+
+    Source: Sinopoli et al. (2004), Theorem 3 (the modified algebraic Riccati equation); by mode for chains.
+    """
+    system = system._replace(law=np.where(system.law > 1e-9, system.law, SEEN))
+    size = float(np.trace(system.process)) or 1.0  # what starts at rest is searched as if it did not
+    parts = system.law[:, None, None] * (system.process + size * np.eye(len(system.transition)))
+    noise, gains = 1.0, _improved(system, parts, 1.0)
+    for _ in range(ITERATIONS):
+        parts = system.moved(gains, parts, noise * system.source(gains))
+        grown = np.trace(parts.sum(axis=0)) / size
+        if grown > NEGLIGIBLE:
+            parts, noise = parts / grown, noise / grown
+        before, gains = gains, _improved(system, parts, noise)
+        if _change(before, gains) < CONVERGED:
+            break
+    gains = _polished(system, gains)
+    if spectral_radius(operator(system, gains)) < BELOW_ONE:
+        return gains
+    fresh = tuple(system.transition @ np.linalg.pinv(c) for c in system.outputs)
+    return min(gains, fresh, key=lambda items: spectral_radius(operator(system, items)))
+
+
+def _polished(system: KnownLossSystem, gains: KindGains) -> KindGains:
+    """Policy iteration: gains for what remains under the last ones, their steady bound or the part that grows most."""
+    values, vectors = np.linalg.eig(operator(system, gains))
+    radius = float(np.max(np.abs(values)))
+    for _ in range(POLISHING):
+        if radius < BELOW_ONE:
+            parts, noise = steady(system, gains, system.source(gains)), 1.0
+        else:
+            parts, noise = _fastest(system, values, vectors), 1 / NEGLIGIBLE
+        better = _improved(system, parts, noise)
+        values, vectors = np.linalg.eig(operator(system, better))
+        reached = float(np.max(np.abs(values)))
+        if reached >= max(radius, BELOW_ONE) or _change(gains, better) < CONVERGED:
+            break
+        gains, radius = better, reached
+    return gains
+
+
+def _fastest(system: KnownLossSystem, values: np.ndarray, vectors: np.ndarray) -> Parts:
+    """The covariances that grow by the spectral radius: a positive map has such an eigenvector."""
+    n, result = len(system.transition), np.real(vectors[:, np.argmax(values.real)])
+    parts = result.reshape(-1, n, n)
+    parts = parts + parts.swapaxes(1, 2)
+    parts = parts * np.sign(np.trace(parts.sum(axis=0)))
+    parts = parts / np.trace(parts.sum(axis=0)) + np.eye(n) / NEGLIGIBLE
+    return np.asarray(system.chain[0][:, None, None] * parts if system.forgets else parts)
+
+
+def _improved(system: KnownLossSystem, parts: Parts, noise: float) -> KindGains:
+    results = []
+    for s, c in enumerate(system.outputs):
+        modes = np.flatnonzero(system.known == s)
+        v = parts[modes].sum(axis=0)
+        r = sum((noise * system.law[i] * system.noises[i] for i in modes), np.zeros((len(c), len(c))))
+        cross = c @ v @ system.transition.T
+        results.append(solve_innovation(c @ v @ c.T + r, cross).T if len(c) else cross.T)
+    return tuple(results)
+
+
+def _change(before: KindGains, after: KindGains) -> float:
+    size = max((np.max(np.abs(k), initial=0.0) for k in after), default=0.0)
+    gap = max((np.max(np.abs(a - b), initial=0.0) for a, b in zip(before, after, strict=True)), default=0.0)
+    return float(gap / size) if size > 0 else 0.0
+
+
+def lower_bound(system: KnownLossSystem) -> Parts | None:
+    """S_i <= U_i of any filter: what a loss adds, S_j = sum_i chain[i, j] (A S_i A' + law_i Q) over i without rows.
+
+    In the other modes law_i Q alone. None where it has no end.
+    """
+    silent = tuple(np.zeros((0, len(system.transition))) if len(c) == 0 else None for c in system.outputs)
+    lost = np.array([silent[s] is not None for s in system.known])
+    n, modes = len(system.transition), len(system.chain)
+    square = np.kron(system.transition, system.transition)
+    source = system.law[:, None, None] * system.process
+    if system.forgets:
+        matrix, right = system.chain[0][lost].sum() * square, source.sum(axis=0)
+    else:
+        blocks = [[system.chain[i, j] * lost[i] * square for i in range(modes)] for j in range(modes)]
+        matrix, right = np.block(blocks), np.einsum("ij,iab->jab", system.chain, source)
+    if spectral_radius(matrix) >= BELOW_ONE:
+        return None
+    result = np.linalg.solve(np.eye(len(matrix)) - matrix, right.ravel()).reshape(right.shape)
+    return np.asarray(system.chain[0][:, None, None] * result if system.forgets else result).reshape(modes, n, n)

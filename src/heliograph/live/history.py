@@ -1,0 +1,179 @@
+"""Rows on the device: what was heard at each, what the filters knew after it, and the one program that replays them."""
+
+from collections.abc import Callable
+from functools import lru_cache
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.live.static import Static
+from heliograph.numerics.compiler import understood
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import PyTree
+from heliograph.simulation.judging import plausible_step, step_without
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters
+
+READ = 64  # rows that are read at once
+OUTPUTS = "estimates", "fused", "judged", "judged_centrally"
+
+
+class History(NamedTuple):
+    """Rows in slots, in any order: what all nodes heard, what inputs were given (NaN where nothing was), and when.
+
+    After each row: the filters' states, the inputs held, the number of the step, and the leaves of what they tell.
+
+    Shapes: rows (slot, received + given + 1), held (slot, given), step (slot,).
+    """
+
+    rows: jax.Array
+    state: PyTree
+    held: jax.Array
+    step: jax.Array
+    outputs: list[jax.Array]
+
+    def parts(self, slot: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """What was heard at a row, what was given, and its time."""
+        given = self.held.shape[1]
+        row = self.rows[slot]
+        return row[: -given - 1], row[-given - 1 : -1], row[-1]
+
+    def known(self, slot: jax.Array) -> PyTree:
+        """The filters' states after a row."""
+        return jax.tree.map(lambda leaf: leaf[slot], self.state)
+
+
+class NetworkStep(Module):
+    """All filters of a network; `places` of each group's nodes in a row of all that is heard, (node, received)."""
+
+    filters: AllFilters
+    places: tuple[tuple[tuple[int, ...], ...], ...] = eqx.field(static=True)
+
+    def __init__(self, network: Network, filters: AllFilters):
+        rows = network.rows()
+        self.filters = filters
+        self.places = tuple(tuple(tuple(rows[name].tolist()) for name in names) for names in network.groups)
+
+    def step(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
+        """One step of all, without what is implausible; what they tell is "estimates" by kind and "fused" by name.
+
+        And "judged" and "judged_centrally" of what was heard, by kind and by name.
+        """
+        after, result = plausible_step(self.filters, state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def judged(self, state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array) -> tuple[PyTree, PyTree]:
+        """The same with all that was heard, implausible or not."""
+        after, result = self.filters.step(state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def without(
+        self, first: tuple[PyTree, PyTree], state: PyTree, received: jax.Array, u: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, PyTree]:
+        """The step again, where each filter leaves out what it finds implausible."""
+        after, result = step_without(self.filters, first, state, self.groups(received), u, k)
+        return after, {name: result[name] for name in OUTPUTS}
+
+    def groups(self, received: jax.Array) -> list[jax.Array]:
+        """What each group's nodes heard, (node, received)."""
+        return [received[np.array(place)] for place in self.places]
+
+
+Replay = Callable[..., tuple[History, list[jax.Array]]]
+
+
+@lru_cache
+def replay(static: Static, dt: int | None) -> Replay:
+    """The program (numbers, tape, row, order, (slot, start, stop)) -> (tape, what is told after the last row).
+
+    It writes the row to the slot, and steps the filters over the slots order[start:stop], from the state after
+    order[start - 1]. The tape is given away. `dt`: which input is the time since the row before; None where time counts
+    steps: then the steps between two rows are taken too, with nothing heard. Compiling never knows how many there are.
+    """
+    move = _by_steps if dt is None else _over_time(dt)
+
+    def run(
+        numbers: list[jax.Array], history: History, row: jax.Array, order: jax.Array, place: jax.Array
+    ) -> tuple[History, list[jax.Array]]:
+        item: NetworkStep = static.filled(numbers)
+        slot, start, stop = place
+
+        def single(i: jax.Array, history: History) -> History:
+            now = order[i]
+            state, held, step, outputs = move(item, history, order[i - 1], now)
+            return history._replace(
+                state=jax.tree.map(lambda all_, new: all_.at[now].set(new), history.state, state),
+                held=history.held.at[now].set(held),
+                step=history.step.at[now].set(step),
+                outputs=[all_.at[now].set(new) for all_, new in zip(history.outputs, outputs, strict=True)],
+            )
+
+        history = jax.lax.fori_loop(start, stop, single, history._replace(rows=history.rows.at[slot].set(row)))
+        return history, [leaf[order[stop - 1]] for leaf in history.outputs]
+
+    return jax.jit(run, donate_argnums=1, compiler_options=understood())
+
+
+Moved = tuple[PyTree, jax.Array, jax.Array, list[jax.Array]]  # after a row: states, inputs held, step, what is told
+
+
+def _over_time(dt: int) -> Callable[[NetworkStep, History, jax.Array, jax.Array], Moved]:
+    """One step over the time between two rows, with the inputs held in between."""
+
+    def move(item: NetworkStep, history: History, before: jax.Array, now: jax.Array) -> Moved:
+        step, u = history.step[before] + 1, interval(history, before, now, dt)
+        state, outputs = item.step(history.known(before), history.parts(now)[0], u, step)
+        return state, held_after(history, before, now), step, jax.tree.leaves(outputs)
+
+    return move
+
+
+def interval(history: History, before: jax.Array, now: jax.Array, dt: int) -> jax.Array:
+    """The inputs of a plant of continuous time from one row to another."""
+    return jnp.insert(history.held[before], dt, history.parts(now)[2] - history.parts(before)[2])
+
+
+def _by_steps(item: NetworkStep, history: History, before: jax.Array, now: jax.Array) -> Moved:
+    """The steps between two rows with nothing heard, and that of the row, to which its own inputs lead."""
+    last = history.parts(now)[2].astype(history.step.dtype)
+
+    def single(k: jax.Array, carry: tuple[PyTree, list[jax.Array]]) -> tuple[PyTree, list[jax.Array]]:
+        state, outputs = item.step(carry[0], *at_step(history, before, now, k), k)
+        return state, jax.tree.leaves(outputs)
+
+    begun = history.known(before), [leaf[now] for leaf in history.outputs]
+    state, outputs = jax.lax.fori_loop(history.step[before] + 1, last + 1, single, begun)
+    return state, held_after(history, before, now), last, outputs
+
+
+def held_after(history: History, before: jax.Array, now: jax.Array) -> jax.Array:
+    """The inputs held after a row."""
+    given = history.parts(now)[1]
+    return jnp.where(jnp.isnan(given), history.held[before], given)
+
+
+def at_step(history: History, before: jax.Array, now: jax.Array, k: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What is heard and given at step k, which is the row's or one between it and the row before."""
+    received, _, last = history.parts(now)
+    there = k == last.astype(history.step.dtype)
+    u = jnp.where(there, held_after(history, before, now), history.held[before])
+    return jnp.where(there, received, jnp.nan), u
+
+
+@jax.jit
+def read(outputs: list[jax.Array], slots: jax.Array) -> list[jax.Array]:
+    """What was told after the rows in these slots, READ of them: what is on the tape itself must not be looked at."""
+    return [leaf[slots] for leaf in outputs]
+
+
+def copied(history: History) -> list[np.ndarray]:
+    """The leaves of a tape, which goes on to be used."""
+    return [np.asarray(leaf) for leaf in _copy(jax.tree.leaves(history))]
+
+
+@jax.jit
+def _copy(leaves: list[jax.Array]) -> list[jax.Array]:
+    return [jnp.copy(leaf) for leaf in leaves]

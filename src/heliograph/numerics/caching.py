@@ -1,0 +1,52 @@
+"""What was worked out of an object that never changes, kept as long as the object lives."""
+
+from collections.abc import Callable, Hashable
+from functools import wraps
+from inspect import signature
+from typing import Any, Concatenate, ParamSpec, TypeVar, cast
+from weakref import ref
+
+import jax
+import numpy as np
+
+from heliograph.numerics.traced import is_traced
+
+S = TypeVar("S")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+def cached(function: Callable[Concatenate[S, P], T]) -> Callable[Concatenate[S, P], T]:
+    """The function, which works out but once what it finds of each object that is its first argument.
+
+    An object is known by itself, so that nothing is compared, and forgotten with it. What is found can no longer be
+    written to, since others have it too; what JAX traces is never kept.
+    """
+    results: dict[int, tuple[ref[S], dict[Hashable, T]]] = {}
+
+    first = next(iter(signature(function).parameters))
+
+    @wraps(function)
+    def known(*given: Any, **named: Any) -> T:
+        if not given and first not in named:
+            return function(*given, **named)  # which says what is missing
+        item, rest = (given[0], given[1:]) if given else (named.pop(first), ())
+        place, requested = id(item), (rest, tuple(named.items()))
+        answers = results[place][1] if place in results else {}
+        if requested in answers:
+            return answers[requested]
+        result = function(item, *rest, **named)
+        if is_traced(result):
+            return result
+        for leaf in jax.tree.leaves(result):
+            _close(leaf)
+        answers[requested] = result
+        results.setdefault(place, (ref(item, lambda _: results.pop(place, None)), answers))
+        return result
+
+    return cast(Callable[Concatenate[S, P], T], known)
+
+
+def _close(leaf: Any) -> None:
+    if isinstance(leaf, np.ndarray):
+        leaf.setflags(write=False)

@@ -1,0 +1,1 @@
+"""Joint moments of random affine maps and of noises."""

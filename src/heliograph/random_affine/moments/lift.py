@@ -1,0 +1,102 @@
+"""Maps between monomials: what a map makes of the powers of its input."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.numerics.check import check_count, fail
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import (
+    count,
+    exponents,
+    monomials,
+    position,
+    refuse_if_too_large,
+    symmetric_power,
+)
+
+
+class Lift(AbstractRandomAffine):
+    """The map between monomials: from those of y up to `degree` to those of z; degree 2 is the square.
+
+    Its order-k moments are the order-(degree k) moments of the map. A lifted input has repeated products, so a row of
+    moments is one of several with the same value at every lifted point; the one given divides by the repetitions.
+    """
+
+    base: AbstractRandomAffine
+    degree: int = eqx.field(static=True)
+
+    def __init__(self, base: AbstractRandomAffine, degree: int):
+        check_count("degree of the lift", degree)
+        (base,) = as_maps("lift", [base])
+        if base.erases:
+            raise fail("lift", "a channel without erasures", "one that erases")
+        self.base, self.degree = base, degree
+
+    @property
+    def outputs(self) -> int:
+        """Monomials of z of degree 1 to `degree`."""
+        return count(self.base.outputs + 1, self.degree) - 1
+
+    @property
+    def inputs(self) -> int:
+        """Monomials of y of degree 1 to `degree`."""
+        return count(self.base.inputs + 1, self.degree) - 1
+
+    def _init(self, key: jax.Array) -> PyTree[jax.Array]:
+        """State of the base map."""
+        return self.base.init(key)
+
+    def _draw(self, state: PyTree[jax.Array], key: jax.Array) -> tuple[PyTree[jax.Array], jax.Array]:
+        """Draw Sym^degree(H)."""
+        state, h = self.base.draw(state, key)
+        return state, jnp.asarray(symmetric_power(h, self.degree))
+
+    def moments(self, order: int) -> Moments:
+        """Rows and columns of E[Sym^(degree order)(H)], spread over the repeated products."""
+        check_forgets("moments of a map", self)
+        inner = self.base.moments(order * self.degree).matrix
+        rows = _products(self.base.outputs + 1, self.degree, order)
+        columns = _products(self.base.inputs + 1, self.degree, order)
+        refuse_if_too_large(len(rows), len(columns), f"lifted moments of order {order}")
+        repetitions = np.bincount(columns)
+        return Moments(inner[rows][:, columns] / repetitions[columns], self.outputs, self.inputs, order)
+
+    def extremes(self) -> tuple[AbstractRandomAffine, ...]:
+        """Lifts of the base map's extremes."""
+        return tuple(Lift(m, self.degree) for m in self.base.extremes())
+
+    def corner_count(self) -> int:
+        """Count of the base map."""
+        return self.base.corner_count()
+
+    def mean_gain(self) -> AbstractRandomAffine:
+        """Lift of the base map with its mean gain."""
+        return Lift(self.base.mean_gain(), self.degree)
+
+    def example_input(self, generator: np.random.Generator) -> np.ndarray:
+        """A lifted point: the monomials of an input of the base map."""
+        lifted: np.ndarray = monomials(self.base.example_input(generator), self.degree)[:-1]
+        return lifted
+
+
+def _products(variables: int, degree: int, order: int) -> np.ndarray:
+    """Position of each product of `order` monomials of `degree` among the monomials of degree * order."""
+    parts = exponents(variables, degree)
+    target = position(variables, degree * order)
+    return np.array([
+        target[tuple(sum(power * parts[i][v] for i, power in enumerate(powers) if power) for v in range(variables))]
+        for powers in exponents(len(parts), order)
+    ])  # fmt: skip
+
+
+def square(base: AbstractRandomAffine) -> Lift:
+    """The map between all monomials up to degree 2 (the quadratic lift).
+
+    Raises:
+        ValueError: when asked for moments whose matrix would need more than the stated memory.
+    """
+    return Lift(base, 2)

@@ -1,0 +1,122 @@
+"""Noises of which the moments are known, or a sample."""
+
+import warnings
+from math import ceil
+
+import jax
+import numpy as np
+from numpy.typing import ArrayLike
+
+from heliograph.numerics.check import array, check_count, fail
+from heliograph.numerics.traced import is_traced, plain
+from heliograph.random_affine.moments.monomials import Exponents, exponents
+from heliograph.random_affine.noise import AbstractNoise, FiniteSupport, Number, Square, Vector
+
+MOMENT_TOLERANCE = 1e-10  # of moments scaled to unit second moment: rounding of the numbers given
+MOMENT_ERROR = 0.1  # standard error of an estimated moment, relative to its largest possible size, that is tolerated
+
+
+class NoiseMoments(AbstractNoise):
+    """Scalar noise of which only E[n], E[n^2], ... are known, from a data sheet or from measurements.
+
+    It designs filters but cannot be sampled: many laws share these moments. Several components: `Independent`,
+    and `Shaped` for those that are mixed.
+
+    Shapes: moments (order,).
+
+    Raises:
+        ValueError: fewer than two moments; moments that no distribution has, with the inequality that fails.
+    """
+
+    moments: Vector
+    mean: Vector
+    covariance: Square
+
+    def __init__(self, moments: ArrayLike):
+        self.moments = array("noise moments", moments, (None,))
+        if len(self.moments) < 2:
+            raise fail("noise moments", "at least E[n] and E[n^2]", f"{len(self.moments)} of them")
+        if not is_traced(self.moments):
+            check_moments(np.asarray(self.moments))
+        self.mean = self.moments[:1]
+        self.covariance = (self.moments[1] - self.moments[0] ** 2).reshape(1, 1)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Refuse: the law itself is unknown."""
+        raise fail("simulating a noise known by its moments only", "a law that can be sampled", "NoiseMoments")
+
+    def moment(self, powers: Exponents) -> Number:
+        """Return the given E[n^order]."""
+        (order,) = powers
+        if order == 0:
+            return 1.0
+        if order > len(self.moments):
+            raise fail("noise moments", f"moments up to order {order}", f"{len(self.moments)} of them")
+        return plain(self.moments[order - 1])
+
+
+def check_moments(moments: np.ndarray) -> None:
+    """Raise ValueError unless some distribution on the line has E[n^k] = moments[k - 1].
+
+    Every even moment must reach what the lower ones imply: with V = (1, n, ..., n^(j-1)) and H = E[V V'],
+    E[n^2j] >= h' H^-1 h for h = E[V n^j]. For j = 2 and zero mean: m4 >= m2^2 + m3^2 / m2. Where H is singular
+    (finitely many atoms) h must lie in its range.
+    """
+    sequence = np.concatenate([[1.0], moments])
+    scale = max(float(sequence[2]) ** 0.5, np.finfo(float).tiny) if sequence[2] > 0 else 1.0
+    size = scale ** np.arange(len(sequence))
+    in_range = np.cumprod((size > np.finfo(float).tiny) & np.isfinite(size), dtype=bool)
+    m = sequence[in_range] / size[in_range]  # unit second moment, so that one tolerance serves all orders
+    for j in range(1, len(m) // 2 + 1):
+        hankel = np.array([[m[a + b] for b in range(j)] for a in range(j)])
+        known = np.array([m[a + j] for a in range(j) if a + j < len(m)])
+        if len(known) < j:
+            return
+        solution = np.linalg.lstsq(hankel, known, rcond=MOMENT_TOLERANCE)[0]
+        gap = np.max(np.abs(hankel @ solution - known))
+        if gap > np.sqrt(MOMENT_TOLERANCE) * np.max(np.abs(known), initial=1.0):
+            expected = "a law of the atoms that the lower moments imply"
+            raise fail("noise moments", expected, f"E[n^{2 * j - 1}] = {moments[2 * j - 2]:.10g}, which no law has")
+        if 2 * j < len(m) and m[2 * j] < known @ solution - MOMENT_TOLERANCE * max(abs(m[2 * j]), 1.0):
+            least = float(known @ solution) * scale ** (2 * j)
+            raise fail("noise moments", f"E[n^{2 * j}] of at least {least:.10g}, which the lower moments imply",
+                       f"{moments[2 * j - 1]:.10g}, which no distribution has")  # fmt: skip
+
+
+def recorded_noise(samples: ArrayLike, order: int) -> FiniteSupport:
+    """The law that gives each recorded sample the same probability: its moments are the sample's.
+
+    order: the highest moment that will be read (a filter of degree d reads 2 d). Warns where the sample is too small
+    for it: where the standard error of some E[n^a], |a| <= order, exceeds MOMENT_ERROR of its largest possible size
+    prod_i (E|n_i|^|a|)^(a_i / |a|) (Hölder). A sample says nothing of shocks rarer than one in its length.
+
+    Shapes: samples (samples, components) or (samples,).
+
+    Raises:
+        ValueError: fewer than two samples, an order below 1, numbers that are not finite.
+    """
+    try:
+        single = np.ndim(samples) == 1
+    except ValueError:  # rows of different lengths
+        single = False
+    values = array("noise samples", samples, (None,) if single else (None, None))
+    values = values[:, None] if single else values
+    if len(values) < 2:
+        raise fail("noise samples", "at least two", len(values))
+    check_count("order of the noise moments", order)
+    absolute = np.abs(values)
+    worst, where = 0.0, 1
+    for powers in (a for k in range(1, order + 1) for a in exponents(values.shape[1], k)):
+        degree = sum(powers)
+        error = np.std(np.prod(values ** np.array(powers), axis=1)) / np.sqrt(len(values))
+        size = np.prod(np.mean(absolute**degree, axis=0) ** (np.array(powers) / degree))
+        if size > 0 and error / size > worst:
+            worst, where = float(error / size), degree
+    if worst > MOMENT_ERROR:
+        needed = ceil(len(values) * (worst / MOMENT_ERROR) ** 2)
+        warnings.warn(
+            f"recorded noise: a moment of order {where} is known to {100 * worst:.0f} % only; about {needed:,} samples "
+            f"instead of {len(values):,} would give {100 * MOMENT_ERROR:.0f} %, or use a filter of lower degree",
+            stacklevel=2,
+        )
+    return FiniteSupport(values, np.full(len(values), 1 / len(values)))

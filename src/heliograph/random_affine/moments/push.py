@@ -1,0 +1,145 @@
+"""Moments of y carried through a map to those of z, without forming the matrix E[Sym^k(H)] of that order.
+
+A lift of degree d needs moments of order 2 d, but only as one vector: what is pushed is (E[mono_k(y)]), and the
+largest matrix that a known matrix A needs is Sym^(k/2)(A).
+"""
+
+from functools import cache, reduce, singledispatch
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heliograph.numerics.check import fail
+from heliograph.numerics.traced import is_traced, plain, stacked
+from heliograph.random_affine.atoms import GainAndNoise, gain_moments, homogeneous
+from heliograph.random_affine.base import AbstractRandomAffine, check_forgets
+from heliograph.random_affine.combine import Mixture, Series
+from heliograph.random_affine.moments.monomials import (
+    Exponents,
+    count,
+    degrees,
+    exponents,
+    position,
+    product_table,
+    sum_plan,
+    symmetric_power,
+)
+from heliograph.random_affine.noise import AbstractNoise, Number, noise_vector
+
+Array1 = Float[jax.Array | np.ndarray, " n"]
+Array2 = Float[jax.Array | np.ndarray, "n m"]
+
+
+@singledispatch
+def push(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+    """E[mono_order(z)] from E[mono_order(y)], for y independent of the map.
+
+    The same numbers as `channel.moments(order).expect(moments)`, which is what a map of no known structure does.
+
+    Shapes: moments (C(inputs + k, k),) -> (C(outputs + k, k),).
+
+    Raises:
+        ValueError: a vector that does not have one entry for each monomial, or moments of more than the stated memory.
+    """
+    return channel.moments(order).expect(_checked(channel, order, moments))
+
+
+@push.register
+def _(channel: GainAndNoise, order: int, moments: Array1) -> Array1:
+    """(A y)^b, then E[g^|b|], then sum_b C(a, b) E[n^(a-b)] (A y)^b."""
+    known = push_known(homogeneous(channel.matrix), order, _checked(channel, order, moments))
+    scaled = known * gain_moments(channel.law, order)[degrees(channel.outputs, order)]
+    row, column, noise, weight = sum_plan(channel.outputs, order)
+    terms = weight * noise_vector(channel.noise, order)[noise] * scaled[column]
+    if is_traced(terms):
+        return jnp.bincount(row, terms, length=len(scaled))
+    return np.bincount(row, np.asarray(terms), minlength=len(scaled))
+
+
+@push.register
+def _(channel: Series, order: int, moments: Array1) -> Array1:
+    return reduce(lambda m, part: push(part, order, m), channel.maps, moments)
+
+
+@push.register
+def _(channel: Mixture, order: int, moments: Array1) -> Array1:
+    parts = [push(part, order, moments) for part in channel.maps]
+    return channel.choice.probabilities @ stacked(parts)
+
+
+def push_known(homogeneous: Array2, order: int, moments: Array1) -> Array1:
+    """E[mono(z)] of z = A y + b with H = [[A, b], [0, 1]]: entries of Sym(H) E[Y Y'] Sym(H)' at half the order.
+
+    Shapes: (z + 1, y + 1), (C(y + k, k),) -> (C(z + k, k),).
+    """
+    result: Array1
+    if order % 2:
+        result = symmetric_power(homogeneous, order) @ moments
+        return result
+    outputs, inputs = homogeneous.shape
+    lifted = symmetric_power(homogeneous, order // 2)
+    second = lifted @ second_moments(moments, inputs, order // 2) @ lifted.T
+    result = second.reshape(-1)[_one_place(outputs, order // 2)]
+    return result
+
+
+class Tabulated(AbstractNoise):
+    """A noise whose moments up to an order were computed once, for models that read them at every step."""
+
+    mean: Array1
+    covariance: Array2
+    source: AbstractNoise
+    table: Array1
+    order: int = eqx.field(static=True)
+
+    def __init__(self, source: AbstractNoise, order: int):
+        self.mean, self.covariance, self.source = source.mean, source.covariance, source
+        self.table, self.order = noise_vector(source, order), order
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """Draw from the law itself."""
+        return self.source.sample(key)
+
+    def moment(self, powers: Exponents) -> Number:
+        """Look E[n^a] up."""
+        return plain(self.table[position(len(powers) + 1, self.order)[(*powers, self.order - sum(powers))]])
+
+
+@noise_vector.register
+def _(noise: Tabulated, order: int) -> Array1:
+    return noise.table[_lower(noise.dimension, order, noise.order)]
+
+
+@cache
+def _lower(dimension: int, order: int, above: int) -> np.ndarray:
+    """Where the monomials of total degree `order` in (n, 1) stand among those of degree `above`."""
+    places = position(dimension + 1, above)
+    return np.array([places[(*p[:-1], p[-1] + above - order)] for p in exponents(dimension + 1, order)])
+
+
+def second_moments(moments: Array1, variables: int, degree: int) -> Array2:
+    """E[Y Y'] of the monomials Y of `degree` in (y, 1), gathered from the moments of order 2 degree; last row E[Y'].
+
+    Shapes: (C(p + 2 k, 2 k),) -> (C(p + k, k), C(p + k, k)), with variables p + 1.
+    """
+    return moments[product_table(variables, degree, degree)]
+
+
+def _checked(channel: AbstractRandomAffine, order: int, moments: Array1) -> Array1:
+    check_forgets("channel of a lift", channel)
+    expected = count(channel.inputs + 1, order)
+    if np.shape(moments) != (expected,):
+        raise fail(f"moments of order {order}", f"shape ({expected},)", f"shape {np.shape(moments)}")
+    return moments
+
+
+@cache
+def _one_place(variables: int, degree: int) -> np.ndarray:
+    """For each monomial of degree 2 k, one place (flattened) where it stands in the table of products."""
+    table = product_table(variables, degree, degree).reshape(-1)
+    places = np.zeros(count(variables, 2 * degree), dtype=np.int64)
+    places[table] = np.arange(table.size)
+    return places

@@ -1,0 +1,283 @@
+"""What a filter needs of a channel: mean gain, and quadratic maps above spread and shift for every possible law."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from heliograph.numerics.caching import cached
+from heliograph.numerics.module import Module
+from heliograph.numerics.small_matrix import contract, diagonal, diagonal_of, summed
+from heliograph.numerics.traced import is_traced, library, stacked
+from heliograph.random_affine.atoms import GainAndNoise
+from heliograph.random_affine.base import AbstractRandomAffine, as_maps, check_forgets
+from heliograph.random_affine.combine import Series, Stack
+from heliograph.random_affine.law import Constant
+from heliograph.random_affine.moments.interval import CORNERS, moment_interval
+from heliograph.random_affine.moments.moments import Moments
+from heliograph.random_affine.moments.monomials import product_table
+
+PROPORTIONAL_TOLERANCE = 1e-12  # of each entry's own scale: two tensors from different sums are one's multiples
+
+
+Tensor = Float[jax.Array | np.ndarray, "m m p+1 p+1"]
+Matrix = Float[jax.Array | np.ndarray, "m p"]
+
+
+class QuadraticMap(Module):
+    """A map from second moments W of (y, 1) to a matrix that dominates T_v(W) for every possible law v.
+
+    Value: C:W + diag_i(sum_j R_ij:|W| d_i / d_j). The second term is zero where one law dominates all others; otherwise
+    T_v(W) - C:W has entries within R:|W|, and a matrix with these row sums on the diagonal dominates it (Gershgorin,
+    in units d of each component's own, d_i^2 = |C_ii:W| + R_ii:|W|).
+
+    Shapes: center, radius (m, m, p + 1, p + 1).
+    """
+
+    center: Tensor
+    radius: Tensor
+
+    def __call__(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """Evaluate at W of shape (p + 1, p + 1); rows and columns of components that are not present are zero."""
+        mask = present[:, None] & present[None, :]
+        center = self.middle(second_moment, present)
+        entries = jnp.where(mask, contract(self.radius, jnp.abs(second_moment)), 0.0)
+        unit = jnp.sqrt(_or_one(jnp.abs(diagonal_of(center)) + diagonal_of(entries)))
+        return center + diagonal(unit * summed(entries / unit, 1))
+
+    def middle(self, second_moment: jax.Array, present: jax.Array) -> jax.Array:
+        """C:W alone, which is all where the law is known."""
+        return jnp.where(present[:, None] & present[None, :], contract(self.center, second_moment), 0.0)
+
+
+class SecondOrder(Module):
+    """Mean and second moments of z = G y + n, nominal where the law is known, dominating where it is not.
+
+    mean_gain, offset: M = E[G] and b = E[n] under the nominal law; spread: E_v[((G - M) y + n - b)(...)'];
+    shift: ((M_v - M) y + b_v - b)(...)'; power: E_v[G y y' G'] (the last row and column of W are ignored).
+
+    nominal: the spread under the nominal law itself.
+
+    Shapes: mean_gain (m, p), offset (m,).
+    """
+
+    mean_gain: Matrix
+    offset: Float[jax.Array | np.ndarray, " m"]
+    spread: QuadraticMap
+    shift: QuadraticMap
+    power: QuadraticMap
+    nominal: QuadraticMap
+    uncertain: bool = eqx.field(static=True)
+
+
+def _or_one(value: jax.Array) -> jax.Array:
+    return jnp.where(value > 0, value, 1.0)
+
+
+def has_random_gain(channel: AbstractRandomAffine, described: SecondOrder) -> bool:
+    """Whether z depends on y through anything but a known gain; a law with traced parameters counts as random."""
+    if described.uncertain or is_traced(described.spread):
+        return described.uncertain or not has_known_gain(channel)
+    block = np.abs(described.spread.center[..., :-1, :]) + np.abs(described.spread.radius[..., :-1, :])
+    return bool(np.any(block > 0)) and not has_known_gain(channel)
+
+
+def has_known_mean(described: SecondOrder) -> bool:
+    """Whether E[G] and E[n] are the same under every possible law, to rounding; with traced parameters nobody knows."""
+    if is_traced((described.shift, described.mean_gain, described.offset)):
+        return False
+    size = np.max(np.abs(described.mean_gain), initial=0.0) ** 2 + np.max(np.abs(described.offset), initial=0.0) ** 2
+    largest = max(np.max(np.abs(part), initial=0.0) for part in (described.shift.center, described.shift.radius))
+    return bool(largest <= PROPORTIONAL_TOLERANCE**2 * size)
+
+
+def has_known_gain(channel: AbstractRandomAffine) -> bool:
+    """Whether z = G y + n with one G that never varies."""
+    match channel:
+        case GainAndNoise():
+            return isinstance(channel.law, Constant)
+        case Series() | Stack():
+            return all(has_known_gain(part) for part in channel.maps)
+    return False
+
+
+@cached
+def second_order(channel: AbstractRandomAffine) -> SecondOrder:
+    """Worst cases over the polytope of probabilities: exact for a gain common to all components, else dominating.
+
+    With one scalar gain g, the largest E_v (g - mu)^2, (mu_v - mu)^2 and E_v g^2 are taken at corner laws, where these
+    multilinear (or convex) functions of the probabilities have their maxima.
+
+    Raises:
+        ValueError: more corner laws than can be listed in a channel that is no series or stack, or one that remembers.
+    """
+    as_maps("channel of a filter", [channel])
+    check_forgets("channel of a filter", channel)
+    nominal = channel.moments(2)
+    mean = nominal.mean[:-1]
+    known = _is_known(channel)
+    if known:
+        spread, shift, power = _tensors(nominal, mean)
+        parts = [QuadraticMap(t, np.zeros(t.shape)) for t in (spread, shift, power)]
+    elif isinstance(channel, Stack):
+        parts = _from_stack(channel)
+    elif _few_corners(channel):
+        corners = (
+            Moments(corner_moment, nominal.outputs, nominal.inputs, 2) for corner_moment in channel.corner_moments(2)
+        )
+        stacks = zip(*(_tensors(corner, mean) for corner in corners), strict=True)
+        parts = [_dominate(stacked(tensors), mean) for tensors in stacks]
+    else:
+        parts = _from_intervals(channel, nominal, mean)
+    local = parts[0] if known else nominal_spread(channel)
+    return SecondOrder(mean[:, :-1], mean[:, -1], parts[0], parts[1], parts[2], local, not known)
+
+
+def nominal_spread(channel: AbstractRandomAffine) -> QuadraticMap:
+    """Cov(z | y) under the nominal law."""
+    nominal = channel.moments(2)
+    spread = _tensors(nominal, nominal.mean[:-1])[0]
+    return QuadraticMap(spread, np.zeros(spread.shape))
+
+
+def _few_corners(channel: AbstractRandomAffine) -> bool:
+    try:
+        return channel.corner_count() <= CORNERS
+    except ValueError:  # one law alone has too many corners to list
+        return False
+
+
+def _is_known(channel: AbstractRandomAffine) -> bool:
+    try:
+        return channel.corner_count() == 1
+    except ValueError:
+        return False
+
+
+def second_moment_tensor(matrix: Matrix, outputs: int, inputs: int) -> Tensor:
+    """E[z_i z_j | y] = sum_ab T[i, j, a, b] Y_a Y_b, symmetric in (i, j) and in (a, b), from E[Sym^2(H)]."""
+    rows = product_table(outputs + 1, 1, 1)[:-1, :-1]
+    columns = product_table(inputs + 1, 1, 1)
+    shares = np.where(np.eye(inputs + 1, dtype=bool), 1, 2)  # a coefficient of Y_a Y_b stands at (a, b) and at (b, a)
+    return matrix[rows[:, :, None, None], columns] / shares
+
+
+def symmetric_product(a: Matrix, b: Matrix) -> Tensor:
+    """(A y)(B y)' as a tensor, made symmetric in the two factors y."""
+    forward: Tensor = library(a, b).einsum("ia,jb->ijab", a, b)
+    return (forward + forward.swapaxes(2, 3)) / 2
+
+
+def _tensors(moments: Moments, mean: Matrix) -> tuple[Tensor, Tensor, Tensor]:
+    """Spread about the nominal mean H0, shift of the mean, and power, all of one law."""
+    raw = second_moment_tensor(moments.matrix, moments.outputs, moments.inputs)
+    local = moments.mean[:-1]
+    spread = raw - symmetric_product(mean, local) - symmetric_product(local, mean) + symmetric_product(mean, mean)
+    return spread, symmetric_product(local - mean, local - mean), _of_signal(raw)
+
+
+def _of_signal(tensor: Tensor) -> Tensor:
+    """The tensor without its last row and column, those of the constant 1."""
+    signal = np.arange(tensor.shape[-1]) < tensor.shape[-1] - 1
+    result: Tensor = library(tensor).where(signal[:, None] & signal, tensor, 0.0)
+    return result
+
+
+def _dominate(tensors: Tensor, mean: Matrix) -> QuadraticMap:
+    """One map above all of the (law, m, m, p + 1, p + 1) tensors.
+
+    Where y enters as s_v M y y' M' and the noise part has a largest matrix, that of the largest s_v and the largest
+    noise; else the middle of the range of each entry, with its half as radius.
+    """
+    xp = library(tensors)
+    low, high = tensors.min(axis=0), tensors.max(axis=0)
+    exact, holds = _common_gain(tensors, mean)
+    return QuadraticMap(xp.where(holds, exact, (low + high) / 2), xp.where(holds, 0.0, (high - low) / 2))
+
+
+def _common_gain(tensors: Tensor, mean: Matrix) -> tuple[Tensor, np.ndarray | jax.Array]:
+    """The tensor of the largest common gain and the largest noise, and whether it dominates all of them."""
+    xp = library(tensors, mean)
+    shape = symmetric_product(mean[:, :-1], mean[:, :-1])
+    gains, noises, cross = tensors[..., :-1, :-1], tensors[..., -1, -1], tensors[..., :-1, -1]
+    items: Matrix = xp.abs(mean[:, :-1])
+    local = xp.max(xp.abs(gains), axis=0, initial=0.0) + symmetric_product(items, items)
+    loud = xp.sqrt(xp.max(xp.abs(xp.diagonal(noises, axis1=1, axis2=2)), axis=0)) + xp.abs(mean[:, -1])
+    reach = xp.sqrt(xp.einsum("iiaa->ia", local))[:, None, :] * loud[:, None]
+    size = xp.sum(shape**2)
+    multiples = xp.einsum("vijab,ijab->v", gains, shape) / xp.where(size > 0, size, 1.0)
+    residual = xp.abs(gains - multiples[:, None, None, None, None] * shape)
+    largest = noises[xp.argmax(xp.trace(noises, axis1=1, axis2=2))]
+    unit = xp.sqrt(xp.diagonal(largest))
+    unit = _still(xp.where(unit > 0, unit, 1.0))
+    gaps = xp.linalg.eigvalsh(_still(largest - noises) / (unit[:, None] * unit))
+    holds = xp.all(residual <= PROPORTIONAL_TOLERANCE * local)
+    holds = holds & xp.all(xp.abs(cross) <= PROPORTIONAL_TOLERANCE * (reach + reach.swapaxes(0, 1)))
+    corner = np.zeros((mean.shape[1], mean.shape[1]))
+    corner[-1, -1] = 1.0
+    widened = xp.pad(xp.max(multiples) * shape, [(0, 0), (0, 0), (0, 1), (0, 1)])
+    exact = widened + largest[:, :, None, None] * corner
+    return exact, holds & (xp.min(gaps, initial=0.0) >= -PROPORTIONAL_TOLERANCE)
+
+
+def _still(value: Matrix) -> Matrix:
+    """What a decision is made on, which has no derivative."""
+    return jax.lax.stop_gradient(value) if is_traced(value) else value
+
+
+def _from_stack(channel: Stack) -> list[QuadraticMap]:
+    """Diagonal blocks from each part; off the diagonal, independent parts meet through their means only.
+
+    E[(H_i - M_i) Y Y' (H_j - M_j)'] = D_i Y Y' D_j' with |D| at most the reach of each mean.
+    """
+    n, mean, start = channel.outputs, channel.moments(1).mean[:-1], 0
+    blocks: list[list[QuadraticMap]] = []
+    reach = []
+    for part in channel.maps:
+        stop = start + part.outputs
+        moments = second_order(part)
+        low, high = moment_interval(part, 1)
+        xp = library(low, high, mean)
+        reach.append(xp.maximum(xp.abs(high[:-1] - mean[start:stop]), xp.abs(low[:-1] - mean[start:stop])))
+        blocks.append([_on_diagonal(q, start, n) for q in (moments.spread, moments.shift, moments.power)])
+        start = stop
+    label = np.repeat(np.arange(len(channel.maps)), [part.outputs for part in channel.maps])
+    apart = (label[:, None] != label[None, :])[:, :, None, None]
+    xp = library(mean, reach)
+    far, size = xp.concatenate(reach), xp.abs(mean)
+    cross = symmetric_product(far, far)
+    power_cross = _of_signal(symmetric_product(size, far) + symmetric_product(far, size) + cross)
+    centers = (0.0, 0.0, _of_signal(symmetric_product(mean, mean)))
+    radii = (cross, cross, power_cross)
+    return [
+        QuadraticMap(sum(q.center for q in item) + apart * center, sum(q.radius for q in item) + apart * radius)
+        for item, center, radius in zip(zip(*blocks, strict=True), centers, radii, strict=True)
+    ]
+
+
+def _on_diagonal(block: QuadraticMap, start: int, outputs: int) -> QuadraticMap:
+    """The map of outputs start, start + 1, ... among all of them, zero elsewhere."""
+    margin = (start, outputs - start - block.center.shape[0])
+    widths = [margin, margin, (0, 0), (0, 0)]
+    return QuadraticMap(*(library(a).pad(a, widths) for a in (block.center, block.radius)))
+
+
+def _from_intervals(channel: AbstractRandomAffine, nominal: Moments, mean: Matrix) -> list[QuadraticMap]:
+    """Maps from the range of each moment: raw - H0 m' - m H0' + H0 H0' with intervals for raw and m."""
+    low, high = moment_interval(channel, 2)
+    xp = library(low, high, mean)
+    middle = Moments((low + high) / 2, nominal.outputs, nominal.inputs, 2)
+    half = Moments((high - low) / 2, nominal.outputs, nominal.inputs, 2)
+    raw_radius = xp.abs(second_moment_tensor(half.matrix, half.outputs, half.inputs))
+    mean_radius = half.mean[:-1]
+    spread, _, power = _tensors(middle, mean)
+    reach = xp.abs(middle.mean[:-1] - mean) + mean_radius
+    spread_radius = (
+        raw_radius + symmetric_product(xp.abs(mean), mean_radius) + symmetric_product(mean_radius, xp.abs(mean))
+    )
+    return [
+        QuadraticMap(spread, spread_radius),
+        QuadraticMap(np.zeros(spread.shape), symmetric_product(reach, reach)),
+        QuadraticMap(power, _of_signal(raw_radius)),
+    ]

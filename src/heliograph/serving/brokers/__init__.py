@@ -1,0 +1,1 @@
+"""Transports: pipes, MQTT, NATS, and what each must do."""

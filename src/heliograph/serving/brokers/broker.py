@@ -1,0 +1,16 @@
+"""The transport of a broker."""
+
+from heliograph.serving.brokers.partition import WHOLE, Part
+from heliograph.serving.brokers.transport import Transport
+from heliograph.serving.brokers.url import Address
+
+
+def connected(address: Address, part: Part = WHOLE) -> Transport:
+    """Messages of a part of the plants, through the broker at this address."""
+    if address.kind == "mqtt":
+        from heliograph.serving.brokers.mqtt import Mqtt
+
+        return Mqtt(address, part)
+    from heliograph.serving.brokers.nats import Nats
+
+    return Nats(address, part)

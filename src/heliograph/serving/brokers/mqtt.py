@@ -1,0 +1,167 @@
+"""Messages through MQTT: each is acknowledged after the commit; the broker keeps a session while nobody reads."""
+
+import asyncio
+import threading
+from collections import deque
+from collections.abc import Sequence
+
+from paho.mqtt.client import Client, ConnectFlags, DisconnectFlags, MQTTMessage, MQTTv311
+from paho.mqtt.enums import CallbackAPIVersion
+from paho.mqtt.reasoncodes import ReasonCode
+
+from heliograph.serving.brokers.partition import WHOLE, Part, word
+from heliograph.serving.brokers.retry import LOG, LONGEST
+from heliograph.serving.brokers.transport import Batch
+from heliograph.serving.brokers.url import Address
+from heliograph.serving.output import Output
+
+MOST = 1000  # messages of a batch
+HELD = 4 * MOST  # messages that wait here; the broker waits with what comes then
+AT_LEAST_ONCE = 1
+
+
+class Mqtt:
+    """The messages under TOPIC/in, or under TOPIC/in/PART of those shared; outputs go to TOPIC/out/KIND/PLANT.
+
+    The session is the part's, not the process's: who reads a part next takes over its session, and with it what was
+    not acknowledged. A broker closes the connection of the one before. Version 3.1.1, which every broker speaks.
+    Reading and writing have a connection each: reading may have to wait while something is written.
+    """
+
+    def __init__(self, address: Address, part: Part = WHOLE):
+        self.address = address
+        self._reader, self._writer = _Reader(address, part), _Writer(address)
+
+    async def receive(self) -> Batch | None:
+        return await self._reader.receive()
+
+    async def publish(self, outputs: Sequence[Output]) -> None:
+        for begin in range(0, len(outputs), MOST):
+            await asyncio.to_thread(self._writer.tell, outputs[begin : begin + MOST])
+
+    async def close(self) -> None:
+        await asyncio.gather(asyncio.to_thread(self._reader.close), asyncio.to_thread(self._writer.close))
+
+
+class _Connection:
+    """A connection that is made anew whenever it ends, after a wait that doubles; callbacks come in its own thread."""
+
+    def __init__(self, address: Address, identity: str):
+        self.address, self.open = address, True
+        self.room = threading.Condition()
+        session = bool(identity)
+        client = Client(
+            CallbackAPIVersion.VERSION2, identity, clean_session=not session, protocol=MQTTv311, manual_ack=session
+        )
+        client.on_connect, client.on_disconnect = self.connected, self.disconnected
+        client.on_connect_fail = self.failed
+        client.max_inflight_messages_set(MOST)
+        client.reconnect_delay_set(1, int(LONGEST))
+        if address.user is not None:
+            client.username_pw_set(address.user, address.password)
+        if context := address.tls():
+            client.tls_set_context(context)
+        self.client = client
+
+    def start(self) -> None:
+        self.client.connect_async(self.address.host, self.address.port)
+        self.client.loop_start()
+
+    def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
+        if code.is_failure:
+            LOG.warning("%s: refused, %s; trying again", self.address, code)
+
+    def disconnected(
+        self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
+    ) -> None:
+        if self.open:
+            LOG.warning("%s: the connection ended, %s; trying again", self.address, code)
+
+    def failed(self, client: Client, data: object) -> None:
+        """Nobody answers there, or nobody who is trusted."""
+        if self.open:
+            LOG.warning("%s: no connection; trying again", self.address)
+
+    def close(self) -> None:
+        with self.room:
+            self.open = False
+            self.room.notify_all()
+        self.client.disconnect()
+        self.client.loop_stop()
+
+
+class _Reader(_Connection):
+    """What comes, until it is taken."""
+
+    def __init__(self, address: Address, part: Part):
+        super().__init__(address, f"{address.topic.replace('/', '-')}-part-{part.number}-of-{part.of}")
+        self._below = f"{part.number}/#" if part.of > 1 else "#"
+        self._loop, self._came = asyncio.get_running_loop(), asyncio.Event()
+        self._held: deque[tuple[int, MQTTMessage]] = deque()
+        self._connection = 0
+        self.client.on_message = self._on_message
+        self.start()
+
+    async def receive(self) -> Batch:
+        batch = list[tuple[int, MQTTMessage]]()
+        while not batch:  # the word that one came may come after the batch that took it
+            await self._came.wait()
+            with self.room:
+                batch = [self._held.popleft() for _ in range(min(MOST, len(self._held)))]
+                if not self._held:
+                    self._came.clear()
+                self.room.notify_all()
+
+        async def acknowledge() -> None:
+            for connection, message in batch:
+                if connection == self._connection:  # else the number may by now be another message's; it comes again
+                    self.client.ack(message.mid, message.qos)
+
+        return Batch([bytes(message.payload) for _, message in batch], acknowledge)
+
+    def _on_message(self, client: Client, data: object, message: MQTTMessage) -> None:
+        """Nothing more is read while too much waits here."""
+        with self.room:
+            self.room.wait_for(lambda: len(self._held) < HELD or not self.open)
+            self._held.append((self._connection, message))
+            if self.open:
+                self._loop.call_soon_threadsafe(self._came.set)
+
+    def connected(self, client: Client, data: object, flags: ConnectFlags, code: ReasonCode, more: object) -> None:
+        super().connected(client, data, flags, code, more)
+        self._connection += 1
+        if not code.is_failure:
+            client.subscribe(f"{self.address.topic}/in/{self._below}", AT_LEAST_ONCE)
+
+    def disconnected(
+        self, client: Client, data: object, flags: DisconnectFlags, code: ReasonCode, more: object
+    ) -> None:
+        super().disconnected(client, data, flags, code, more)
+        self._connection += 1
+
+
+class _Writer(_Connection):
+    """What goes out."""
+
+    def __init__(self, address: Address):
+        super().__init__(address, "")
+        self._arrived: set[int] = set()  # numbers of what the broker has
+        self.client.on_publish = self._has
+        self.start()
+
+    def tell(self, outputs: Sequence[Output]) -> None:
+        """Return when the broker has all that has a number; a provisional estimate, which the next replaces, may go."""
+        sent = set()
+        for output in outputs:
+            topic = f"{self.address.topic}/out/{output.kind}/{word(output.plant)}"
+            item = self.client.publish(topic, output.body, 0 if output.number is None else AT_LEAST_ONCE)
+            if output.number is not None:
+                sent.add(item.mid)
+        with self.room:
+            self.room.wait_for(lambda: sent <= self._arrived or not self.open)
+            self._arrived.clear()
+
+    def _has(self, client: Client, data: object, number: int, code: ReasonCode, more: object) -> None:
+        with self.room:
+            self._arrived.add(number)
+            self.room.notify_all()

@@ -1,0 +1,40 @@
+"""Estimates and refusals as lines of JSON."""
+
+from pydantic_core import to_json
+
+from heliograph.filters.plausibility import in_words
+from heliograph.serving.lanes import Lanes, Place
+
+
+class Teller:
+    """Writes what a network's filters tell as lines; what is no finite number is null."""
+
+    def __init__(self, lanes: Lanes):
+        self._n = len(lanes.network.states)
+        self._nodes: dict[str, list[Place]] = {}
+        for place in lanes.places:
+            self._nodes.setdefault(place.node, []).append(place)
+
+    def estimates(self, kind: str, plant: str, time: float | str, outputs: list[float]) -> bytes:
+        """The filters' estimates after a row, from the numbers that they told there."""
+        results = {
+            node: {place.filter: self._filter(place, outputs) for place in places}
+            for node, places in self._nodes.items()
+        }
+        return line({"kind": kind, "plant": plant, "time": time, "estimates": results})
+
+    def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
+        n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
+        covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
+        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": place.claim}
+        if judged is None:
+            return results
+        if outputs[judged.reason] > 0:
+            why = in_words(outputs[judged.reason], outputs[judged.distance])
+            return results | {"nis": None, "heard": 0, "implausible": why}
+        return results | {"nis": outputs[judged.distance], "heard": int(outputs[judged.arrived])}
+
+
+def line(parts: dict[str, object]) -> bytes:
+    """One line of JSON, without its end."""
+    return to_json(parts, inf_nan_mode="null")

@@ -1,0 +1,59 @@
+"""Whether a filter's claim and what it did not expect agree, as far as its last rows tell."""
+
+from dataclasses import dataclass
+
+from scipy.special import gammaincinv
+
+from heliograph.model.estimate import Claim
+
+MEMORY = 200  # rows, of which an old one counts 1/e: long enough to judge, short enough to see a change
+FEWEST = 20  # numbers heard before anything is said
+DOUBT = 0.001  # how often an honest filter is outside its band
+
+
+@dataclass
+class RunningNis:
+    """Normalised innovations squared, e' S^-1 e, of a filter at a node, weighted by w^age, w = 1 - 1/MEMORY.
+
+    If S is the truth each is chi-squared with as many degrees as numbers were heard: the weighted sum has mean
+    sum w m and variance sum w^2 2m. Divided by its mean it should be 1; its band is that of a gamma law with these
+    two moments (the chi-squared itself where all weights are 1).
+    """
+
+    claim: Claim
+    total: float = 0.0
+    mean: float = 0.0
+    variance: float = 0.0
+    numbers: int = 0
+
+    def add(self, squared: float, received: int) -> None:
+        """Count a row."""
+        stored = 1 - 1 / MEMORY
+        self.total = stored * self.total + squared
+        self.mean = stored * self.mean + received
+        self.variance = stored * stored * self.variance + 2 * received
+        self.numbers += received
+
+    @property
+    def ratio(self) -> float:
+        """What was found over what is expected: honestly about 1."""
+        return self.total / self.mean if self.mean else float("nan")
+
+    def band(self) -> tuple[float, float]:
+        """Where the ratio of an honest filter is, but for DOUBT of the time."""
+        if not self.mean:
+            return 0.0, float("inf")
+        shape = self.mean**2 / self.variance
+        low, high = gammaincinv(shape, [DOUBT / 2, 1 - DOUBT / 2]) / shape
+        return float(low), float(high)
+
+    def doubt(self) -> str | None:
+        """Why the claim is not to be believed, if it is not."""
+        low, high = self.band()
+        if self.numbers < FEWEST:
+            return None
+        if self.ratio > high:
+            return f"its squared innovations are {self.ratio:.1f} times what its covariance says (at most {high:.1f})"
+        if self.ratio < low and self.claim != "upper":  # an upper bound may be larger than what happens
+            return f"its squared innovations are {self.ratio:.2g} times what its covariance says (at least {low:.1f})"
+        return None

@@ -1,0 +1,1 @@
+"""Stores of what a service knows."""

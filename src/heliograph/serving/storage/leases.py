@@ -1,0 +1,75 @@
+"""Which process reads which part of the plants: leases in the database that keeps the plants."""
+
+from sqlalchemy import Column, Connection, Float, Integer, MetaData, String, Table, delete, select, text
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import Engine
+
+TABLES = MetaData()
+PROCESSES = Table("processes", TABLES, Column("name", String(200), primary_key=True), Column("until", Float))
+PARTS = Table(
+    "parts",
+    TABLES,
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("process", String(200)),
+    Column("until", Float),
+)
+NOW = {  # one clock for all: the database's
+    "sqlite": text("SELECT (julianday('now') - 2440587.5) * 86400.0"),
+    "postgresql": text("SELECT extract(epoch FROM clock_timestamp())::float8"),
+}
+TERM = 5.0  # seconds that a lease lasts: so long after a process died its parts are idle
+
+
+class Leases:
+    """A process's share of `parts`: all that live have as many, or one more.
+
+    A lease makes it likely that one process reads a part at a time, which keeps messages in order; that no message is
+    used twice does not rest on it, nor on clocks: a plant's commit fails if another was made since it was read.
+    """
+
+    def __init__(self, engine: Engine, process: str, parts: int, term: float = TERM):
+        self.engine, self.process, self.parts, self.term = engine, process, parts, term
+        insert = postgresql.insert if engine.dialect.name == "postgresql" else sqlite.insert
+        self._insert = insert
+        TABLES.create_all(engine)
+
+    def renew(self) -> set[int]:
+        """Say that this process lives, and lease its parts anew: those that it keeps and those that nobody has."""
+        with self.engine.begin() as connection:
+            now = float(connection.execute(NOW[self.engine.dialect.name]).scalar_one())
+            fair = self._fair(connection, now)
+            leased = select(PARTS.c.number, PARTS.c.process).where(PARTS.c.until >= now)
+            held = [(row.number, row.process) for row in connection.execute(leased)]
+            mine = [number for number, process in sorted(held) if process == self.process]
+            taken = {number for number, _ in held}
+            free = [number for number in range(self.parts) if number not in taken]
+            expected = (mine + free)[:fair]
+            return {number for number in expected if self._lease(connection, number, now)}
+
+    def release(self, number: int) -> None:
+        """Leave a part to others."""
+        with self.engine.begin() as connection:
+            connection.execute(delete(PARTS).where((PARTS.c.number == number) & (PARTS.c.process == self.process)))
+
+    def leave(self) -> None:
+        """Leave everything to others."""
+        with self.engine.begin() as connection:
+            connection.execute(delete(PARTS).where(PARTS.c.process == self.process))
+            connection.execute(delete(PROCESSES).where(PROCESSES.c.name == self.process))
+
+    def _fair(self, connection: Connection, now: float) -> int:
+        """How many parts are this process's, which lives; those left over are the first ones' by name."""
+        connection.execute(delete(PROCESSES).where(PROCESSES.c.until < now))
+        new = self._insert(PROCESSES).values(name=self.process, until=now + self.term)
+        connection.execute(new.on_conflict_do_update(index_elements=["name"], set_={"until": now + self.term}))
+        alive = sorted(row.name for row in connection.execute(select(PROCESSES.c.name)))
+        items, over = divmod(self.parts, len(alive))
+        return items + (alive.index(self.process) < over)
+
+    def _lease(self, connection: Connection, number: int, now: float) -> bool:
+        """Whether the part is ours: it was, or its lease was over."""
+        mine = {"process": self.process, "until": now + self.term}
+        new = self._insert(PARTS).values(number=number, **mine)
+        free = (PARTS.c.until < now) | (PARTS.c.process == self.process)
+        done = new.on_conflict_do_update(index_elements=["number"], set_=mine, where=free).returning(PARTS.c.number)
+        return connection.execute(done).first() is not None

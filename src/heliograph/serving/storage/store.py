@@ -1,0 +1,290 @@
+"""Where the state is kept: plants, what was told of them, and how far, in one transaction for each batch."""
+
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from shlex import quote
+from typing import Any
+
+from sqlalchemy import Column, Connection, Table, delete, func, inspect, select, update
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import SQLAlchemyError
+
+from heliograph.live.identity import Identity, check_same
+from heliograph.numerics.check import InputError, fail, table
+from heliograph.serving.output import Output
+from heliograph.serving.storage.database import engine_at
+from heliograph.serving.storage.store_protocol import ConflictError, Damage, Entry, StoredPlant
+from heliograph.serving.storage.tables import (
+    IDENTITY_TABLE,
+    JOURNAL,
+    LAYOUT,
+    NUMBERS,
+    PLANTS,
+    TABLES,
+    checksum,
+    is_named,
+    is_whole,
+)
+
+PUBLISHED, NEWEST, MALFORMED = "told to the reader of {}", "journal", "malformed"
+IDENTITY = "identity"
+AT_ONCE = 500  # names in one question
+MEND = "its plants go on in a new store with --store NEW --from-snapshot"
+
+
+class Store:
+    """Plants and the journal in SQLite (a path) or PostgreSQL (a URL), for one process or several with names.
+
+    The journal keeps the last `journal` entries and some more. Where a plant was committed by another process since it
+    was read, nothing is committed.
+
+    Every row has a checksum. `damaged` are the plants whose rows are not what was written; a new name may be that of
+    one of them where its name is damaged too. `opened`: a store open on the same place, which has looked for them.
+
+    Raises:
+        ValueError: a place that cannot be opened; a database that is damaged as a whole; the state of another network,
+            version or precision.
+    """
+
+    keeps = True
+
+    def __init__(
+        self, place: str, mine: Identity, process: str = "", journal: int = 100_000, opened: "Store | None" = None
+    ):
+        self.process, self.journal = process, journal
+        self._engine = engine_at(place)
+        self._insert: Any = postgresql.insert if self._engine.dialect.name == "postgresql" else sqlite.insert
+        mine = table("identity of a store", mine, "texts") | {"layout of the store": LAYOUT}
+        try:
+            with self._saying("a database that can be written"):
+                check_same(f"store {self.name}", mine, self._stored_identity(mine))
+                self.damaged: dict[str, Damage] = self._damaged() if opened is None else opened.damaged
+        except InputError as error:
+            self.close()
+            raise InputError(f"{error}; to begin anew, name another") from None
+
+    @contextmanager
+    def _saying(self, expected: str) -> Iterator[None]:
+        """Have what the database says in the one line of an error that names the store."""
+        try:
+            yield
+        except UnicodeError:  # of a damaged one: the database's own complaint cites it
+            raise self._broken("bytes that are no text") from None
+        except SQLAlchemyError as error:
+            said = getattr(error, "orig", None) or type(error).__name__
+            raise fail(f"store {self.name}", expected, str(said)) from None
+
+    def _stored_identity(self, mine: Identity) -> Identity:
+        """What the store is of: of this network, if it is new."""
+        there = set(inspect(self._engine).get_table_names()) & set(TABLES.tables)
+        if there and there != set(TABLES.tables):
+            raise self._broken(f"no table {', '.join(sorted(set(TABLES.tables) - there))}")
+        TABLES.create_all(self._engine)
+        with self._engine.begin() as connection:
+            stored = connection.execute(
+                select(IDENTITY_TABLE.c.value).where(IDENTITY_TABLE.c.name == IDENTITY)
+            ).scalar()
+            if stored is None:
+                if connection.execute(select(func.count()).select_from(NUMBERS)).scalar():
+                    raise self._broken("no network that it is of")
+                connection.execute(self._insert(IDENTITY_TABLE), [{"name": IDENTITY, "value": json.dumps(mine)}])
+                return mine
+        try:
+            result = dict(json.loads(stored))
+        except (ValueError, TypeError):
+            raise self._broken("no network that it is of") from None
+        return {"layout of the store": "1"} | result
+
+    def _damaged(self) -> dict[str, Damage]:
+        """Plants whose rows are damaged, by name."""
+        results: dict[str, Damage] = {}
+        with self._engine.connect() as connection:
+            if self._engine.dialect.name == "sqlite":
+                said = connection.exec_driver_sql("PRAGMA integrity_check(1)").scalar()
+                if said != "ok":
+                    raise self._broken(f"{said}")
+            for rows in connection.execution_options(yield_per=AT_ONCE).execute(select(PLANTS)).partitions():
+                for name, version, body, written in rows:
+                    if not is_whole(written, name, version, body):
+                        results[str(name)] = Damage(is_named(written, name), written)
+        return results
+
+    def _broken(self, what: str) -> InputError:
+        return fail(f"store {self.name}", "a database as it was written", f"one that is damaged: {what}")
+
+    @property
+    def name(self) -> str:
+        """What to call it where others read: a file, or a URL without its password."""
+        url = self._engine.url
+        return url.database or "" if url.get_backend_name() == "sqlite" else url.render_as_string(hide_password=True)
+
+    def load(self, names: Iterable[str]) -> dict[str, StoredPlant]:
+        """The plants of these names that are kept, and those of which only damage is left."""
+        names = list(names)
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            rows = _of(connection, list(PLANTS.c), names)
+        results = {}
+        for name, version, body, written in rows:
+            whole = is_whole(written, name, version, body)
+            results[name] = (
+                StoredPlant(version, body) if whole else StoredPlant(0, b"", self._damage(name, "a damaged one"))
+            )
+        nameless = [name for name, damage in self.damaged.items() if not damage.named]
+        for name in names if nameless else ():
+            got = f"none of that name, and damaged ones that may have had it: {', '.join(map(repr, nameless))}"
+            results.setdefault(name, StoredPlant(0, b"", self._damage(name, got)))
+        return results
+
+    def _damage(self, name: str, got: str) -> str:
+        anew = f"--anew {quote(name)} begins it anew"
+        return f"{fail(f'store {self.name}, plant {name!r}', 'the state that was written', got)}; {anew}"
+
+    def begin_anew(self, names: Iterable[str]) -> None:
+        """Forget the plants of these names: each begins anew with its next message.
+
+        Raises:
+            ValueError: a name that no plant here has.
+        """
+        with self._saying("a database that takes a commit"), self._engine.begin() as connection:
+            for name in names:
+                damage = self.damaged.pop(name, None)
+                nameless = damage is not None and not damage.named  # it may be no text that a name could equal
+                this = PLANTS.c.checksum == damage.checksum if damage and nameless else PLANTS.c.name == name
+                if not connection.execute(delete(PLANTS).where(this)).rowcount:
+                    raise fail(f"store {self.name}, --anew", "the name of a plant that it has", repr(name))
+
+    def commit(
+        self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
+    ) -> list[Output]:
+        """Keep plants, of the versions they had before, and what is to be told; `told`: up to where it was.
+
+        Raises:
+            ConflictError: a plant has another version.
+        """
+        with self._saying("a database that takes a commit"):
+            return self._committed(plants, entries, malformed, published)
+
+    def _committed(
+        self, plants: Mapping[str, StoredPlant], entries: Sequence[Entry], malformed: int, published: int | None
+    ) -> list[Output]:
+        with self._engine.begin() as connection:
+            newest = self._count(connection, NEWEST, len(entries))
+            result = dict(_of(connection, (PLANTS.c.name, PLANTS.c.version), list(plants)))
+            if any(result.get(name, 0) != plant.version for name, plant in plants.items()):
+                raise ConflictError
+            outputs = [entry.numbered(newest - len(entries) + i) for i, entry in enumerate(entries, 1)]
+            if plants:
+                after = ((name, plant.version + 1, plant.body) for name, plant in plants.items())
+                self._put(connection, PLANTS, [_row(PLANTS, *row) for row in after])
+            if outputs:
+                lines = b"\n".join([output.body for output in outputs]).decode()
+                connection.execute(JOURNAL.insert(), [_row(JOURNAL, newest, self.process, lines)])
+                connection.execute(delete(JOURNAL).where(JOURNAL.c.last <= newest - self.journal))
+            if malformed:
+                self._count(connection, MALFORMED, malformed)
+            if published is not None:
+                self._put(connection, NUMBERS, [_row(NUMBERS, PUBLISHED.format(self.process), published)])
+        return outputs
+
+    def unpublished(self) -> list[Output]:
+        """What this process committed and may not have told."""
+        published = self.number(PUBLISHED.format(self.process))
+        return [
+            entry
+            for entry in self.entries(published, self.process)
+            if entry.number is not None and entry.number > published
+        ]
+
+    def entries(self, after: int = 0, process: str | None = None) -> list[Output]:
+        """What the journal keeps from the batch on that has number `after` + 1; of one process, or of all.
+
+        Raises:
+            ValueError: an entry that is damaged.
+        """
+        expected = select(JOURNAL).where(JOURNAL.c.last > after).order_by(JOURNAL.c.last)
+        result = list[Output]()
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            for last, by, lines, written in connection.execute(expected):
+                if not is_whole(written, last, by, lines):
+                    got = f"damage in those up to number {last}; {MEND} {self.name}"
+                    raise fail(f"store {self.name}, journal", "entries as they were written", got)
+                if process in (None, by):
+                    result += [_output(line) for line in lines.split("\n")]
+        return result
+
+    def number(self, name: str) -> int:
+        """A count that is kept.
+
+        Raises:
+            ValueError: one that is damaged.
+        """
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            row = connection.execute(select(NUMBERS).where(NUMBERS.c.name == name)).first()
+        return 0 if row is None else self._counted(*row)
+
+    def _counted(self, name: str, value: int, written: int) -> int:
+        if not is_whole(written, name, value):
+            raise fail(f"store {self.name}, count {name!r}", "what was written", f"damage; {MEND} {self.name}")
+        return value
+
+    def begin_from(self, place: str, mine: Identity) -> None:
+        """Take the plants of another store, which stays as it is.
+
+        Raises:
+            ValueError: plants here already; the state of another network, version or precision there.
+        """
+        other = Store(place, mine)
+        saying = self._saying(f"a database that takes the plants of {other.name}")
+        with saying, self._engine.begin() as here, other._engine.connect() as there:
+            if here.execute(select(func.count()).select_from(PLANTS)).scalar():
+                raise fail(f"store {self.name}", f"no plants yet, to begin from {other.name}", "some")
+            for part in there.execute(select(PLANTS)).mappings().partitions(AT_ONCE):
+                here.execute(PLANTS.insert(), [dict(row) for row in part])
+        self.damaged = other.damaged
+        other.close()
+
+    def count(self) -> int:
+        """How many plants are kept."""
+        with self._saying("a database that can be read"), self._engine.connect() as connection:
+            return int(connection.execute(select(func.count()).select_from(PLANTS)).scalar_one())
+
+    def close(self) -> None:
+        """Let go of the database."""
+        self._engine.dispose()
+
+    def _count(self, connection: Connection, name: str, more: int) -> int:
+        """Add to a number, which locks it until the commit; what it is then."""
+        new = self._insert(NUMBERS).values(_row(NUMBERS, name, more))
+        locked = new.on_conflict_do_update(index_elements=["name"], set_={"value": NUMBERS.c.value + more})
+        value, written = connection.execute(locked.returning(NUMBERS.c.value, NUMBERS.c.checksum)).one()
+        if written != checksum(name, value):  # it was there, with the checksum of what it was
+            value = self._counted(name, value - more, written) + more
+            this = NUMBERS.c.name == name
+            connection.execute(update(NUMBERS).where(this).values(checksum=checksum(name, value)))
+        return int(value)
+
+    def _put(self, connection: Connection, table: Table, rows: list[dict[str, object]]) -> None:
+        """Insert rows, or replace those of the same name."""
+        new = self._insert(table)
+        others = {column.name: new.excluded[column.name] for column in table.c if not column.primary_key}
+        connection.execute(new.on_conflict_do_update(index_elements=["name"], set_=others), rows)
+
+
+def _of(connection: Connection, columns: Sequence[Column[object]], names: list[str]) -> list[Any]:
+    """Columns of the plants of these names."""
+    results: list[Any] = []
+    for i in range(0, len(names), AT_ONCE):
+        results += connection.execute(select(*columns).where(PLANTS.c.name.in_(names[i : i + AT_ONCE]))).all()
+    return results
+
+
+def _row(table: Table, *values: Any) -> dict[str, object]:
+    """A row with its checksum."""
+    columns = [column.name for column in table.c]
+    return dict(zip(columns, (*values, checksum(*values)), strict=True))
+
+
+def _output(line: str) -> Output:
+    parts = json.loads(line)
+    return Output(parts["id"], parts["plant"] or "", parts["kind"], line.encode())

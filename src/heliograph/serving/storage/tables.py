@@ -1,0 +1,44 @@
+"""The tables of a store, and the checksums of their rows: a row is what was written, or it is damaged."""
+
+from collections.abc import Sequence
+from zlib import crc32
+
+from sqlalchemy import BigInteger, Column, LargeBinary, MetaData, String, Table, Text
+
+LAYOUT = "2"  # of these tables; those of layout 1 had no checksums
+TABLES = MetaData()
+PLANTS = Table("plants", TABLES, Column("name", String(200), primary_key=True), Column("version", BigInteger),
+               Column("body", LargeBinary), Column("checksum", BigInteger))  # fmt: skip
+JOURNAL = Table("journal", TABLES, Column("last", BigInteger, primary_key=True, autoincrement=False),
+                Column("process", String(200)), Column("lines", Text), Column("checksum", BigInteger))  # fmt: skip
+NUMBERS = Table("numbers", TABLES, Column("name", String(220), primary_key=True), Column("value", BigInteger),
+                Column("checksum", BigInteger))  # fmt: skip
+IDENTITY_TABLE = Table("whose", TABLES, Column("name", String(20), primary_key=True), Column("value", Text))
+
+
+def checksum(name: str | int, *values: str | int | bytes) -> int:
+    """CRC-32 of what a row is called, in the upper 31 of 63 bits, and of its name and other columns, in the lower 32.
+
+    So damage of the values leaves the name to be trusted.
+    """
+    return (crc32(f"{name}".encode()) >> 1) << 32 | _sum(name, values)
+
+
+def is_whole(written: object, name: object, *values: object) -> bool:
+    """Whether a row is as it was written; anything may stand where it was damaged."""
+    if not isinstance(name, str | int) or not all(isinstance(value, str | int | bytes) for value in values):
+        return False
+    return written == checksum(name, *values)  # type: ignore[arg-type]  # as was just seen
+
+
+def is_named(written: object, name: object) -> bool:
+    """Whether a row's name is as it was written, whatever became of its values."""
+    return isinstance(name, str) and isinstance(written, int) and written >> 32 == crc32(name.encode()) >> 1
+
+
+def _sum(name: str | int, values: Sequence[str | int | bytes]) -> int:
+    result = crc32(f"{name}".encode())
+    for value in values:
+        data = value if isinstance(value, bytes) else f"{value}".encode()
+        result = crc32(data, crc32(f"\0{len(data)}\0".encode(), result))
+    return result

@@ -1,0 +1,1 @@
+"""Fusion centres that carry joint moments of local errors, and uplinks to them."""

@@ -1,0 +1,201 @@
+"""What is known of a network of linear filters before any data: how their errors are correlated, what fusion gives."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.fusion.weights import factored_weights, matrix_weights
+from heliograph.numerics.check import array, check_horizon, fail, instance
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import ArrayLike, Float, PyTree
+from heliograph.simulation.centres.centre import Together
+from heliograph.simulation.network import Network
+from heliograph.simulation.stepping import AllFilters, plan
+
+REGULAR = 1e-6  # least eigenvalue of a node's own share of its error, relative to the error: then U has an inverse
+
+
+@readable
+@dataclass(frozen=True)
+class CrossCovariances:
+    """Joint moments of the plant's state x and of the errors e_i = x - xhat_i of filters at `nodes`, after some steps.
+
+    x = mean + state s and e_i = bias_i + shared_i s + a_i, with s white of covariance I (the start of the plant and its
+    noise at each step) and a_i, node i's own, of covariance own_i. Biases are zero where filters believe in the world.
+
+    Shapes: mean (n,), state (n, sources), bias (node, n), shared (node, n, sources), own (node, n, n).
+    """
+
+    nodes: tuple[str, ...]
+    states: tuple[str, ...]
+    mean: Float[np.ndarray, " n"]
+    state: Float[np.ndarray, "n sources"]
+    bias: Float[np.ndarray, "node n"]
+    shared: Float[np.ndarray, "node n sources"]
+    local: Float[np.ndarray, "node n n"]
+
+    @property
+    def joint(self) -> Float[np.ndarray, "node n node n"]:
+        """Cov(e_i, e_j) of all pairs."""
+        return _joint(self.shared, self.local)
+
+    @property
+    def of_state(self) -> Float[np.ndarray, "node n n"]:
+        """Cov(e_i, x)."""
+        return np.asarray(self.shared @ self.state.T)
+
+    @property
+    def state_covariance(self) -> Float[np.ndarray, "n n"]:
+        """Cov x."""
+        return np.asarray(self.state @ self.state.T)
+
+    def matrix_weights(self) -> tuple[Float[np.ndarray, "n node n"], Float[np.ndarray, "n n"]]:
+        """The best unbiased weights W and their error's covariance W P W'; linear in nodes where P allows it."""
+        weights = _weights(self.shared, self.local)
+        shared, local = _weighted(weights, self.shared, self.local)
+        return weights, shared @ shared.T + local
+
+    def fused(self, relays: Mapping[str, Sequence[str]]) -> "CrossCovariances":
+        """Relays that forward the matrix-weighted estimate of the nodes each hears, as the nodes of the next level.
+
+        An error W e is a linear map of the nodes' errors, so what it shares with others is W shared, and W own W' is
+        its own as long as no two relays hear the same node. Known means of the errors are taken off. A tree of any
+        depth is this again and again; its root is `matrix_weights` of the last level.
+
+        Raises:
+            ValueError: no relays, a relay that hears nobody, unknown nodes, a node that two relays hear.
+        """
+        received = [name for names in relays.values() for name in names]
+        unknown = sorted(set(received) - set(self.nodes))
+        if not relays or unknown or not all(relays.values()):
+            raise fail("relays", "each with some of the nodes", f"unknown ones {unknown}" if unknown else "none")
+        if len(set(received)) < len(received):
+            raise fail(
+                "nodes", "one relay for each", f"several for {sorted({n for n in received if received.count(n) > 1})}"
+            )
+        place = {name: i for i, name in enumerate(self.nodes)}
+        parts = []
+        for names in relays.values():
+            mine = [place[name] for name in names]
+            shared, local = self.shared[mine], self.local[mine]
+            parts.append(_weighted(_weights(shared, local), shared, local))
+        shared, local = (np.stack(leaves) for leaves in zip(*parts, strict=True))
+        bias = np.zeros((len(relays), len(self.mean)))
+        return CrossCovariances(tuple(relays), self.states, self.mean, self.state, bias, shared, local)
+
+
+def _weights(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "n node n"]:
+    scale = np.sqrt(np.einsum("iaa->ia", local) + np.einsum("ias,ias->ia", shared, shared))
+    scale = np.where(scale > 0, scale, 1.0)
+    least = np.linalg.eigvalsh(local / (scale[:, :, None] * scale[:, None]))[:, 0].min()
+    return np.asarray(factored_weights(shared, local) if least > REGULAR else matrix_weights(_joint(shared, local)))
+
+
+def _weighted(
+    weights: np.ndarray, shared: np.ndarray, local: np.ndarray
+) -> tuple[Float[np.ndarray, "n sources"], Float[np.ndarray, "n n"]]:
+    """What a weighted sum of the errors shares with others, and the covariance of its own part."""
+    return np.tensordot(weights, shared, axes=2), np.einsum("aib,ibc,dic->ad", weights, local, weights)
+
+
+def _joint(shared: np.ndarray, local: np.ndarray) -> Float[np.ndarray, "node n node n"]:
+    count, n, _ = shared.shape
+    flat, items = shared.reshape(count * n, -1), np.arange(count)
+    result: np.ndarray = (flat @ flat.T).reshape(count, n, count, n)
+    result[items, :, items, :] += local
+    return result
+
+
+def cross_covariances(network: Network, filter: str, horizon: int, inputs: ArrayLike | None = None) -> CrossCovariances:
+    """How the errors of the filters of this name are correlated after `horizon` steps of complete data.
+
+    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i H_i, for all pairs at once and whatever the gains;
+    what a filter wrongly believes of the world enters too.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network that is not linear, filters whose gains depend on data, channels that remember.
+    Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
+    """
+    instance("network", network, Network, "a Network")
+    fusion = Fusion(filter, MatrixWeights())
+    alone = Network(network.plant, network.nodes, {"all": fusion}, network.relays, network.common)
+    filters, u = _prepared(alone, horizon, inputs)
+    with jax.enable_x64(True):
+        result: Factors = to_numpy(_factors(filters, u))
+    parts = result.mean, result.state, result.bias, result.shared, result.local
+    return CrossCovariances(tuple(network.nodes_with(filter)), network.states, *map(np.asarray, parts))
+
+
+def fused_covariances(
+    network: Network, horizon: int, inputs: ArrayLike | None = None
+) -> dict[str, Float[np.ndarray, "time n n"]]:
+    """The covariances of the network's informed fusions, by name, for complete data.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: a network without an informed fusion.
+    """
+    instance("network", network, Network, "a Network")
+    filters, u = _prepared(network, horizon, inputs)
+    with jax.enable_x64(True):
+        results: dict[str, np.ndarray] = to_numpy(_fused(filters, u))
+    return results
+
+
+def _prepared(network: Network, horizon: int, inputs: ArrayLike | None) -> tuple[AllFilters, np.ndarray]:
+    """Filters planned for the inputs."""
+    network.check_horizon(check_horizon(horizon))
+    u = array("inputs", np.zeros((horizon, 0)) if inputs is None else inputs, (horizon, len(network.inputs)))
+    filters = AllFilters(network)
+    if not filters.centres:
+        raise fail("fused covariances", "a fusion that knows the errors' joint covariance", "none in the network")
+    if len(filters.informed) < len(filters.centres):
+        raise fail("covariances before data", "filters whose gains depend on no data", "some whose gains do")
+    return plan(filters, u), u
+
+
+@quickly_compiled
+def _factors(filters: AllFilters, u: np.ndarray) -> Factors:
+    (centre,) = filters.informed
+
+    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, None]:
+        (separate, factors), (k, u_k) = carry, row
+        local = centre.gathered(filters.matrices(centre, separate, u_k, k))
+        spread = factors.state @ factors.state.T
+        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
+        return (filters.followed(separate, u_k, k), advance_factors(factors, step, motion, noise, k)), None
+
+    separate, _, _, known, _ = filters.init()
+    nodes, n = known[0].errors.bias.shape
+    items = n + (nodes * centre.size if isinstance(centre.listening, Together) else 0)  # sources of a step
+    start = separate, initial_factors(known[0].errors, items * len(u))
+    result: Factors = jax.lax.scan(body, start, (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    return result
+
+
+@quickly_compiled
+def _fused(filters: AllFilters, u: np.ndarray) -> PyTree:
+    def body(carry: tuple[PyTree, PyTree], row: tuple[jax.Array, jax.Array]) -> tuple[PyTree, PyTree]:
+        (local, known), (k, u_k) = carry, row
+        published: dict[str, jax.Array] = {}
+        following = []
+        for centre, state in zip(filters.informed, known, strict=True):
+            means = [jnp.zeros((filters.alike[i].nodes, filters.n)) for i, _ in centre.sources]
+            after, result = centre.step(state, filters.matrices(centre, local, u_k, k), means, u_k, k)
+            following.append(after)
+            published |= {name: jnp.asarray(estimate.covariance) for name, estimate in result.items()}
+        return (filters.followed(local, u_k, k), tuple(following)), published
+
+    local, _, _, known, _ = filters.init()
+    return jax.lax.scan(body, (local, known), (jnp.arange(len(u)), jnp.asarray(u)))[1]

@@ -1,0 +1,273 @@
+"""A fusion centre that knows the network: it carries the joint moments of the local errors along, before any data."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.filters.gaussian.correction import homogeneous
+from heliograph.filters.gaussian.gaussian import GaussianFilter
+from heliograph.filters.linear.plan import Plan, is_linear_filter, linear_step
+from heliograph.fusion.cross_covariance import (
+    Errors,
+    ErrorStep,
+    Motion,
+    Observation,
+    advance,
+    error_step,
+    initial_errors,
+    moved_state,
+)
+from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.fusion.rules import Fusion
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Claim, Estimate, weakest
+from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure, unstack
+from heliograph.model.plant import AnyPlant, LinearPlant
+from heliograph.model.sensor import AnySensor, LinearSensor, refuse_angles
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, PyTree
+from heliograph.random_affine.arrived import arrived
+from heliograph.random_affine.base import AbstractRandomAffine
+from heliograph.random_affine.moments.second_moments import SecondOrder, second_order
+
+
+class Listening(Module):
+    """Sensors and channels of nodes of one structure, stacked; each node has its own, and they share nothing."""
+
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array, size: int) -> Observation:
+        """What a plant with these moments lets the nodes hear at step k, with rows of zeros up to `size`."""
+
+        def single(sensor: AnySensor, channel: SecondOrder | OverTime) -> Observation:
+            return _linear_observation(at(sensor, k), at(channel, k), mean, covariance)
+
+        gain, offset, noise = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), eqx.if_array(0)))(
+            self.sensor, self.channel
+        )
+        more = (0, size - offset.shape[-1])
+        return Observation(
+            jnp.pad(gain, ((0, 0), more, (0, 0))),
+            jnp.pad(offset, ((0, 0), more)),
+            jnp.pad(noise, ((0, 0), more, more)),
+        )
+
+
+def _linear_observation(
+    sensor: LinearSensor, channel: SecondOrder, mean: jax.Array, covariance: jax.Array
+) -> Observation:
+    """M = E[G] C, o = E[G] E v + E n, and Cov(z - M x): the noise through the mean gain, and what the gain adds."""
+    c, noise = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.covariance)
+    signal = c @ mean + sensor.noise.mean
+    second = homogeneous(c @ covariance @ c.T + noise + jnp.outer(signal, signal), signal, 1.0)
+    gain = jnp.asarray(channel.mean_gain)
+    spread = channel.nominal.middle(second, jnp.ones(len(gain), dtype=bool))
+    return Observation(gain @ c, gain @ sensor.noise.mean + channel.offset, gain @ noise @ gain.T + spread)
+
+
+class AbstractObservation(Module):
+    """What the nodes hear of the plant, in the nodes' order, with rows of zeros up to the longest measurement."""
+
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
+        """At step k, when the plant has these moments."""
+        raise NotImplementedError
+
+
+class Apart(AbstractObservation):
+    """Nodes that share nothing, by groups; `order` brings them into the order of the nodes."""
+
+    groups: tuple[Listening, ...]
+    order: np.ndarray
+    size: int = eqx.field(static=True)
+
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
+        """Group after group."""
+        parts = [item.observe(mean, covariance, k, self.size) for item in self.groups]
+        return Observation(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*parts, strict=True)))
+
+
+class Together(AbstractObservation):
+    """One sensor and one channel, of which each node hears some `rows`; -1 stands for none."""
+
+    sensor: AnySensor
+    channel: SecondOrder | OverTime
+    rows: np.ndarray
+
+    def observe(self, mean: jax.Array, covariance: jax.Array, k: jax.Array) -> Observation:
+        """The rows of each node, and how their noises are correlated."""
+        gain, offset, noise = _linear_observation(at(self.sensor, k), at(self.channel, k), mean, covariance)
+        gain, offset = jnp.pad(gain, ((0, 1), (0, 0))), jnp.pad(offset, (0, 1))
+        noise = jnp.pad(noise, (0, 1))
+        return Observation(gain[self.rows], offset[self.rows], noise[self.rows[:, :, None, None], self.rows])
+
+
+class CentreState(NamedTuple):
+    """Moments of the errors, and the states of the rules, by name."""
+
+    errors: Errors
+    rules: dict[str, PyTree]
+
+
+class Centre(Module):
+    """All informed fusions of one filter's estimates, at the nodes that have it.
+
+    `sources`: kind and place of that filter, one group after another; `order` brings what is gathered from them into
+    the order of the nodes. `size`: the longest measurement.
+    """
+
+    plant: AnyPlant
+    listening: AbstractObservation
+    rules: dict[str, AbstractInformedFusion]
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    read = staticmethod(linear_step)
+
+    def init(self, starts: Sequence[jax.Array]) -> CentreState:
+        """Before the first step, from the means at which each source's filters start."""
+        plant = at(self.plant, 0)
+        errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        return CentreState(errors, {name: rule.start(errors) for name, rule in self.rules.items()})
+
+    def moved(self, errors: Errors, local: Plan, u: jax.Array, k: jax.Array) -> Happened:
+        """What happens at step k to errors of filters with these matrices, in the order of the nodes."""
+        motion, step, noise = self.moves(errors.mean, errors.covariance, local, u, k)
+        return Happened(motion, step, noise, advance(errors, step, motion, noise))
+
+    def moves(
+        self, mean: jax.Array, covariance: jax.Array, local: Plan, u: jax.Array, k: jax.Array
+    ) -> tuple[Motion, ErrorStep, Array]:
+        """How plant and errors move at step k, and the noise of what is heard, for a plant with these moments."""
+        plant: LinearPlant = at(self.plant, k)
+        shift = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean()
+        motion = Motion(jnp.asarray(plant.matrix), shift, plant.noise_covariance(u))
+        observation = self.listening.observe(*moved_state(mean, covariance, motion), k)
+        return motion, error_step(local, motion, observation), observation.noise
+
+    def gathered(self, parts: Sequence[Plan]) -> Plan:
+        """Matrices of the sources' filters in the order of the nodes, with rows of zeros for what is not heard."""
+
+        def padded(plan: Plan) -> Plan:
+            more = (0, self.size - plan.offset.shape[-1])
+            return Plan(
+                plan.transition,
+                plan.drift,
+                jnp.pad(plan.gain, ((0, 0), (0, 0), more)),
+                jnp.pad(plan.output, ((0, 0), more, (0, 0))),
+                jnp.pad(plan.offset, ((0, 0), more)),
+                jnp.pad(plan.innovation, ((0, 0), more, more)),
+            )
+
+        return Plan(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
+
+    def step(
+        self, state: CentreState, parts: Sequence[Plan], means: Sequence[jax.Array], u: jax.Array, k: jax.Array
+    ) -> tuple[CentreState, dict[str, Estimate]]:
+        """Next state, and estimates by the fusions' names, from the sources' matrices and means after the step."""
+        happened = self.moved(state.errors, self.gathered(parts), u, k)
+        reports = jnp.concatenate(means)[self.order]
+        after, results = {}, {}
+        for name, rule in self.rules.items():
+            after[name], (mean, covariance) = rule.use(state.rules[name], happened, reports)
+            results[name] = Estimate(mean, covariance, self.claim)
+        return CentreState(happened.errors, after), results
+
+
+def listening(sensors: Sequence[AnySensor], channels: Sequence[Channel]) -> Listening:
+    """Nodes of one structure."""
+    return Listening(stack(list(sensors)), stack([described(channel) for channel in channels]))
+
+
+def described(channel: Channel) -> SecondOrder | OverTime:
+    """The channel's second moments where all of it arrives, for each step where it varies."""
+    if isinstance(channel, OverTime):
+        return over_time([second_order(arrived(item)) for item in unstack(channel)])
+    return second_order(arrived(channel))
+
+
+Parts = Mapping[str, tuple[AnySensor, Channel, AbstractFilter]]  # of each node
+
+
+def informed_claim(rule: str, plant: AnyPlant, nodes: Parts, shared: bool) -> Claim:
+    """What fusion by an informed rule claims: "exact", "nominal" where a law is not known or filters are not linear.
+
+    `shared`: whether the nodes hear parts of one channel.
+
+    Raises:
+        ValueError: naming the knowledge that is missing.
+    """
+    for name, (_, channel, _) in nodes.items():
+        if first(channel).remembers:
+            expected = f"fusion by {rule}: node {name!r}"
+            raise fail(expected, "a channel that forgets", f"{type(first(channel)).__name__}, which remembers")
+    refuse_angles(f"fusion by {rule}", plant, *(sensor for sensor, _, _ in nodes.values()))
+    if along_estimates(nodes):
+        _check_along_estimates(rule, nodes, shared)
+        return "nominal"
+    _check_linear(rule, plant, nodes)
+    return "nominal" if any(_uncertain(channel) for _, channel, _ in nodes.values()) else "exact"
+
+
+def along_estimates(nodes: Parts) -> bool:
+    """Whether errors can only be followed along the estimates: some filter's gains depend on data."""
+    return any(isinstance(item, GaussianFilter) and not item.linear for _, _, item in nodes.values())
+
+
+def _check_along_estimates(rule: str, nodes: Parts, shared: bool) -> None:
+    for name, (_, _, item) in nodes.items():
+        if not isinstance(item, GaussianFilter) or item.linear:
+            raise fail(f"fusion by {rule}: node {name!r}", "a cubature or extended filter, as other nodes have", item)
+    if shared:
+        raise fail(f"fusion by {rule}", "nodes that share nothing but the plant, or filters whose gains depend on no "
+                   "data", "nodes that share a channel")  # fmt: skip
+
+
+def _check_linear(rule: str, plant: AnyPlant, nodes: Parts) -> None:
+    if not isinstance(first(plant), LinearPlant):
+        raise fail(f"fusion by {rule}", "a LinearPlant", type(first(plant)).__name__)
+    seen = set()
+    for name, (sensor, _, item) in nodes.items():
+        where = f"fusion by {rule}: node {name!r}"
+        if not isinstance(first(sensor), LinearSensor):
+            raise fail(where, "a LinearSensor", type(first(sensor)).__name__)
+        if structure(item) not in seen and not is_linear_filter(item):
+            raise fail(where, "a filter of the plant's state whose gains depend on no data", type(item).__name__)
+        seen.add(structure(item))
+
+
+def reported_claim(rule: str, claim: Claim, fusion: Fusion, complete: Mapping[str, bool]) -> Claim:
+    """What is left of a claim where the nodes' reports travel over uplinks; `complete`: nodes that lose nothing.
+
+    Raises:
+        ValueError: nodes that lose measurements, of which a report that does not come cannot tell.
+    """
+    lossy = [name for name, receives_all in complete.items() if not receives_all]
+    if lossy:
+        raise fail(f"fusion by {rule} over uplinks", "nodes that lose no measurements, of which the centre would have "
+                   "to know", f"losses at {lossy}")  # fmt: skip
+    names = list(complete)
+    channels = [link.channel for link in fusion.links(names) if link.channel is not None]
+    for quantizer in fusion.quantizers(names):
+        claim = quantizer.claim(claim)
+    return weakest([claim, "nominal"]) if any(map(_uncertain, channels)) else claim
+
+
+def _uncertain(channel: Channel) -> bool:
+    """Whether probabilities of the channel's laws are known up to a radius only."""
+    try:
+        return any(arrived(item).corner_count() > 1 for item in _each(channel))
+    except ValueError:  # too many corners to list
+        return True
+
+
+def _each(channel: Channel) -> list[AbstractRandomAffine]:
+    return unstack(channel) if isinstance(channel, OverTime) else [channel]

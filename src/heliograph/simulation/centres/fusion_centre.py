@@ -1,0 +1,78 @@
+"""The fusion centre as a filter: it hears the nodes' reports, and knows before any data how their errors move."""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.innovation import gaussian_innovation
+from heliograph.filters.linear.plan import Plan
+from heliograph.fusion.all_reports import Knowledge, begin, fused_estimate, moved, receive_reports
+from heliograph.fusion.cross_covariance import Errors
+from heliograph.fusion.report_link import Links
+from heliograph.model.estimate import Claim, Estimate, Innovation
+from heliograph.model.over_time import OverTime, at
+from heliograph.numerics.float64 import in_float64
+from heliograph.numerics.types import ArrayLike, PyTree
+
+if TYPE_CHECKING:
+    from heliograph.simulation.stepping import AllFilters
+
+
+class CentreState(NamedTuple):
+    """The nodes' filters, of which only covariances count; moments of their errors; what the reports told."""
+
+    nodes: PyTree
+    errors: Errors
+    known: Knowledge
+
+
+class CentreFilter(AbstractFilter):
+    """`AllReports` as a filter that hears the reports, for whatever reaches the centre: streams, recordings, runs.
+
+    It hears, of each age in steps and each node in turn, what arrived of the report: NaN for what did not.
+    `rows`: their places among (age, node, m). Local filters are followed without data: their gains depend on none.
+    """
+
+    filters: "AllFilters"
+    links: Links | OverTime
+    rows: np.ndarray
+    ages: int = eqx.field(static=True)
+    widest: int = eqx.field(static=True)
+    quantized: bool = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    received: int = eqx.field(static=True)
+
+    @in_float64
+    def init(self) -> CentreState:
+        """Nothing is heard yet."""
+        local, _, _, known, _ = self.filters.init()
+        errors = known[0].errors
+        return CentreState(local, errors, begin(errors, self.ages - 1, self.widest, self.quantized))
+
+    @predicts
+    def predict(self, state: CentreState, u: ArrayLike = (), k: Step = 0) -> CentreState:
+        """The plant and all errors move; the nodes send."""
+        (centre,), u, step = self.filters.informed, jnp.asarray(u), jnp.asarray(k)
+        local: Plan = centre.gathered(self.filters.matrices(centre, state.nodes, u, step))
+        happened = centre.moved(state.errors, local, u, step)
+        following = self.filters.followed(state.nodes, u, step)
+        return CentreState(following, happened.errors, moved(state.known, happened, at(self.links, k)))
+
+    @corrects
+    def correct(self, state: CentreState, z: ArrayLike, k: Step = 0) -> tuple[CentreState, Innovation]:
+        """Use the reports that arrived."""
+        nodes = state.known.past.gain.shape[1]
+        everything = jnp.full(self.ages * nodes * self.widest, jnp.nan).at[self.rows].set(jnp.asarray(z))
+        known, expected = receive_reports(state.known, everything.reshape(self.ages, nodes, self.widest))
+        mean, covariance = expected.mean[self.rows], expected.covariance[self.rows][:, self.rows]
+        return state._replace(known=known), gaussian_innovation(jnp.asarray(z), mean, covariance)
+
+    @in_float64
+    def estimate(self, state: CentreState) -> Estimate:
+        """The best linear estimate of the plant's state."""
+        return Estimate(*fused_estimate(state.known, len(self.states)), self.claim)

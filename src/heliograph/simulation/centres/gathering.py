@@ -1,0 +1,195 @@
+"""What is made of the nodes' estimates: fusions side by side, reports, and what centres know of the nodes."""
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.fusion.informed import AbstractInformedFusion
+from heliograph.fusion.quantizer import widen
+from heliograph.fusion.rules import AbstractFusion, Fusion
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at, first, stack, structure
+from heliograph.numerics.angle import Angles, nearest, wrapped
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array
+from heliograph.simulation.centres.centre import (
+    AbstractObservation,
+    Apart,
+    Centre,
+    Together,
+    along_estimates,
+    described,
+    listening,
+)
+from heliograph.simulation.centres.fusion_centre import CentreFilter
+from heliograph.simulation.centres.linearised import LinearisedCentre
+from heliograph.simulation.centres.uplinks import Drawn, Flying, Uplinks
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.side_by_side import over_all, started
+
+
+class Fused(Module):
+    """Fusions that differ in numbers alone, stacked: rules, and the quantizers on the estimates' way (fusion, node).
+
+    `sources` of each fusion: kind and filter whose nodes' estimates it takes, one group after another; `order` of each
+    (fusion, node) brings them into the order of the nodes.
+    """
+
+    rules: AbstractFusion
+    quantizers: PyTree
+    order: np.ndarray
+    names: tuple[str, ...] = eqx.field(static=True)
+    sources: tuple[tuple[tuple[int, int], ...], ...] = eqx.field(static=True)
+    claims: tuple[Claim, ...] = eqx.field(static=True)
+    angles: Angles = eqx.field(static=True)
+
+    def init(self, n: int) -> PyTree:
+        """States of the quantizers."""
+        if self.quantizers is None:
+            return ()
+        fusions, nodes = self.order.shape
+        return over_all(over_all(lambda item: at(item, 0).init(n), nodes), fusions)(self.quantizers)
+
+    def step(
+        self, states: PyTree, estimates: Sequence[Estimate], k: jax.Array
+    ) -> tuple[PyTree, dict[str, Estimate], dict[str, PyTree]]:
+        """Fuse what the filters told, (filter, node, ...) of each kind: estimates and uplinks by the fusions' names."""
+        means = self._gathered([e.mean for e in estimates])
+        covariances = self._gathered([e.covariance for e in estimates])
+        uplinks: dict[str, PyTree] = {}
+        if self.quantizers is not None:
+            send = eqx.filter_vmap(lambda q, s, mean: at(q, k).step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
+            states, sent = eqx.filter_vmap(send, in_axes=(eqx.if_array(0), 0, 0))(self.quantizers, states, means)
+            means, covariances = sent.value, jax.vmap(jax.vmap(widen))(covariances, sent.error)
+            for i, name in enumerate(self.names):
+                uplinks[name] = {"saturated": sent.saturated[i], "symbols": sent.symbols[i]}
+        means = nearest(means, means[:, :1], self.angles)
+        combine = eqx.filter_vmap(lambda rule, *parts: rule.combine(*parts), in_axes=(eqx.if_array(0), 0, 0))
+        mean, covariance = combine(self.rules, means, covariances)
+        mean = wrapped(mean, self.angles)
+        items = enumerate(zip(self.names, self.claims, strict=True))
+        return states, {name: Estimate(mean[i], covariance[i], claim) for i, (name, claim) in items}, uplinks
+
+    def _gathered(self, parts: Sequence[jax.Array | np.ndarray]) -> jax.Array:
+        """(fusion, node, ...)."""
+        joined = [jnp.concatenate([parts[k][f] for k, f in source]) for source in self.sources]
+        if all(np.array_equal(order, np.arange(len(order))) for order in self.order):
+            return jnp.stack(joined)
+        return jnp.stack([part[order] for part, order in zip(joined, self.order, strict=True)])
+
+
+class Reporting(Module):
+    """A fusion that hears reports: what happens to them on their way, and the filter at the centre.
+
+    `sources` and `order` as in `Centre`.
+    """
+
+    uplinks: Uplinks
+    centre: CentreFilter
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    nodes: tuple[str, ...] = eqx.field(static=True)
+
+    def init(self) -> tuple[Flying, PyTree]:
+        """Nothing is on its way, nothing heard."""
+        return self.uplinks.init(), started(self.centre)
+
+    def step(
+        self, state: tuple[Flying, PyTree], estimates: Sequence[Estimate], drawn: Drawn, u: jax.Array, k: jax.Array
+    ) -> tuple[tuple[Flying, PyTree], Estimate, dict[str, jax.Array], tuple[jax.Array, Array]]:
+        """Send the nodes' means, and hear what arrives: state, estimate, traffic, what becomes of what is sent when."""
+        flying, known = state
+        means = jnp.concatenate([estimates[i].mean[f] for i, f in self.sources])[self.order]
+        flying, sent, traffic = self.uplinks.send(flying, means, drawn, k)
+        flying, reports = self.uplinks.arrive(flying, sent, drawn.delay)
+        known, estimate = self.centre.step(known, jnp.ravel(reports)[self.centre.rows], u, k)
+        return (flying, known), estimate, traffic, (sent, drawn.delay)
+
+
+def fusions_of(network: Network) -> tuple[Fused, ...]:
+    """The network's fusions, those of one structure together."""
+    alike: dict[object, list[str]] = {}
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion) and not isinstance(item.rule, AbstractInformedFusion):
+            nodes = network.nodes_with(item.filter)
+            alike.setdefault(structure((item.rule, item.uplinks(nodes), (None,) * len(nodes))), []).append(name)
+    places, claims = network.places(), network.claims().get(FUSED, {})
+    return tuple(_fused(network, names, places, [claims[name] for name in names]) for names in alike.values())
+
+
+def _fused(
+    network: Network, names: Sequence[str], places: Mapping[tuple[str, str], tuple[int, int, int]], claims: list[Claim]
+) -> Fused:
+    """Where the estimates of fusions stand."""
+    items = [item for item in (network.fused[name] for name in names) if isinstance(item, Fusion)]
+    nodes = [network.nodes_with(item.filter) for item in items]
+    sources, order = [], []
+    for item, mine in zip(items, nodes, strict=True):
+        source = tuple({places[node, item.filter][:2]: None for node in mine})
+        results = {
+            node: i for i, node in enumerate(n for k, _ in source for n in network.groups[network.kinds[k].group])
+        }
+        sources.append(source)
+        order.append([results[node] for node in mine])
+    quantizers = stack([item.uplinks(mine) for item, mine in zip(items, nodes, strict=True)])
+    rules = stack([item.rule for item in items])
+    angles = first(network.plant).angles
+    return Fused(rules, quantizers, np.array(order), tuple(names), tuple(sources), tuple(claims), angles)
+
+
+def centres_of(network: Network) -> tuple[Centre | LinearisedCentre, ...]:
+    """One for the informed fusions of each filter."""
+    rules: dict[str, dict[str, AbstractInformedFusion]] = {}
+    for name, item in network.fused.items():
+        if isinstance(item, Fusion) and isinstance(item.rule, AbstractInformedFusion) and not item.by_report:
+            rules.setdefault(item.filter, {})[name] = item.rule
+    return tuple(_centre(network, name, mine) for name, mine in rules.items())
+
+
+def _centre(network: Network, name: str, rules: dict[str, AbstractInformedFusion]) -> Centre | LinearisedCentre:
+    """What the centre knows of the nodes that have the filter `name`."""
+    places, claims = network.places(), network.claims()[FUSED]
+    mine = network.nodes_with(name)
+    sources, order = gathering(network, places, mine, name)
+    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    size = max(network.nodes[node].received for node in mine)
+    claim = claims[next(iter(rules))]
+    if along_estimates(network.parts_of(name)):
+        return LinearisedCentre(network.plant, rules, order, sources, size, claim)
+    return Centre(
+        plant=network.plant,
+        listening=_observe(network, mine, groups, order, size),
+        rules=rules,
+        order=order,
+        sources=sources,
+        size=size,
+        claim=claim,
+    )
+
+
+def gathering(
+    network: Network, places: Mapping[tuple[str, str], tuple[int, int, int]], nodes: Sequence[str], name: str
+) -> tuple[tuple[tuple[int, int], ...], np.ndarray]:
+    """Kinds and filters that hold the nodes' estimates, and what brings these into the order of the nodes."""
+    sources = tuple({places[node, name][:2]: None for node in nodes})
+    groups = [network.groups[network.kinds[kind].group] for kind, _ in sources]
+    results = {node: i for i, node in enumerate(node for names in groups for node in names)}
+    return sources, np.array([results[node] for node in nodes])
+
+
+def _observe(
+    network: Network, mine: Sequence[str], groups: Sequence[Sequence[str]], order: np.ndarray, size: int
+) -> AbstractObservation:
+    """What a centre knows of how these nodes hear."""
+    if network.common is not None:
+        rows = network.rows()
+        padded = [np.pad(rows[name], (0, size - len(rows[name])), constant_values=-1) for name in mine]
+        return Together(network.common.sensor, described(network.common.channel), np.array(padded))
+    parts = [[node for node in map(network.nodes.__getitem__, names) if isinstance(node, Node)] for names in groups]
+    items = tuple(listening([n.sensor for n in nodes], [n.channel for n in nodes]) for nodes in parts)
+    return Apart(items, order, size)

@@ -1,0 +1,115 @@
+"""A fusion centre of filters that are not linear: their errors' covariances along what the centre knows."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.filters.linear.plan import Linearised, linearised_step
+from heliograph.fusion.all_reports import AllReports, Knowledge
+from heliograph.fusion.cross_covariance import Errors, ErrorStep, Motion, initial_errors, observation_noise
+from heliograph.fusion.informed import AbstractInformedFusion, Happened
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.over_time import at
+from heliograph.model.plant import AnyPlant
+from heliograph.numerics.module import Module
+from heliograph.numerics.types import Array, PyTree
+
+
+class Followed(NamedTuple):
+    """Of one fusion: moments of the errors, what it told last, and its rule's state."""
+
+    errors: Errors
+    known: jax.Array
+    rule: PyTree
+
+
+class LinearisedCentre(Module):
+    """As `Centre`, of filters whose gains depend on data: nominal, as they are.
+
+    P_ij+ = F_i (A P_ij A' + Q) F_j' + K_i S_ij K_j', F_i = I - K_i C_i: K_i and C_i are derivatives of each filter's
+    own step, S_ij = 0, and S_ii is what its innovation's covariance has beyond C_i P_i C_i'. A is one for all, the
+    plant's derivative at what the fusion told last: with each filter's own, nodes that share an error would seem to
+    differ by what only their linearisations do, and weights of such differences claim what is not there.
+    """
+
+    plant: AnyPlant
+    rules: dict[str, AbstractInformedFusion]
+    order: np.ndarray
+    sources: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    size: int = eqx.field(static=True)
+    claim: Claim = eqx.field(static=True)
+
+    read = staticmethod(linearised_step)
+
+    def init(self, starts: Sequence[jax.Array]) -> dict[str, Followed]:
+        """Before the first step, from the means at which each source's filters start."""
+        plant = at(self.plant, 0)
+        errors = initial_errors(plant.initial_mean, plant.initial_covariance, jnp.concatenate(starts)[self.order])
+        mean = jnp.asarray(plant.initial_mean)
+        return {name: Followed(errors, mean, rule.start(errors)) for name, rule in self.rules.items()}
+
+    def step(
+        self,
+        state: dict[str, Followed],
+        parts: Sequence[Linearised],
+        means: Sequence[jax.Array],
+        u: jax.Array,
+        k: jax.Array,
+    ) -> tuple[dict[str, Followed], dict[str, Estimate]]:
+        """Next state, and estimates by the fusions' names, from the sources' matrices and means after the step."""
+        local, reports = self._gathered(parts), jnp.concatenate(means)[self.order]
+        plant = at(self.plant, k)
+        keep = jnp.eye(reports.shape[-1]) - local.gain @ local.output
+        following, results = {}, {}
+        for name, rule in self.rules.items():
+            before = state[name]
+            matrix = jax.jacfwd(lambda x: plant.transition(x, u))(before.known)
+            moved = plant.transition(before.known, u) + plant.noise_mean()
+            motion = Motion(matrix, moved - matrix @ before.known, plant.noise_covariance(u))
+            step = _shared_step(matrix, keep, local.gain)
+            errors = _advanced(before.errors, step, motion.noise, local.noise)
+            if isinstance(rule, AllReports):
+                step = step._replace(drift=_nis(before.rule, matrix, moved, keep, local))
+            after, (mean, covariance) = rule.use(before.rule, Happened(motion, step, local.noise, errors), reports)
+            following[name], results[name] = Followed(errors, mean, after), Estimate(mean, covariance, self.claim)
+        return following, results
+
+    def _gathered(self, parts: Sequence[Linearised]) -> Linearised:
+        """In the order of the nodes, with rows of zeros for what is not heard."""
+
+        def padded(item: Linearised) -> Linearised:
+            more = (0, self.size - item.gain.shape[-1])
+            return Linearised(
+                item.predicted,
+                jnp.pad(item.gain, ((0, 0), (0, 0), more)),
+                jnp.pad(item.output, ((0, 0), more, (0, 0))),
+                jnp.pad(item.noise, ((0, 0), more, more)),
+            )
+
+        return Linearised(*(jnp.concatenate(leaves)[self.order] for leaves in zip(*map(padded, parts), strict=True)))
+
+
+def _shared_step(matrix: jax.Array, keep: jax.Array, gain: jax.Array) -> ErrorStep:
+    """e+ = F_i (A e + w) - K_i nu: errors without a mean of their own stay so."""
+    nothing = jnp.zeros_like(keep)
+    return ErrorStep(keep @ matrix, nothing, nothing[..., 0], keep, gain)
+
+
+def _nis(state: Knowledge, matrix: jax.Array, moved: jax.Array, keep: jax.Array, local: Linearised) -> jax.Array:
+    """F_i (E e_i- - A E e_i): what each filter predicts is known, so that E e_i- = E x- - m_i-."""
+    nodes, n, _ = keep.shape
+    before = state.mean[n:].reshape(nodes, n)
+    return jnp.einsum("iab,ib->ia", keep, moved - local.predicted - before @ matrix.T)
+
+
+def _advanced(errors: Errors, step: ErrorStep, noise: Array, received: Array) -> Errors:
+    """All pairs at once; moments of the plant itself are not known."""
+    once = jnp.einsum("iab,ibjc->iajc", step.transition, errors.joint)
+    both = jnp.einsum("iajb,jcb->iajc", once, step.transition)
+    shared = jnp.einsum("iab,bc,jdc->iajd", step.of_noise, noise, step.of_noise)
+    bias = jnp.einsum("iab,ib->ia", step.transition, errors.bias)
+    return errors._replace(bias=bias, joint=both + shared + observation_noise(step.gain, received))

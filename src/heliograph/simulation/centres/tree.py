@@ -1,0 +1,203 @@
+"""Trees of relays over very many nodes alike but for their numbers, at a cost linear in nodes."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.cross_covariance import Factors, advance_factors, initial_factors
+from heliograph.fusion.informed import MatrixWeights
+from heliograph.fusion.rules import Fusion
+from heliograph.fusion.weights import matrix_weights
+from heliograph.model.estimate import Claim
+from heliograph.model.over_time import first
+from heliograph.model.plant import AnyPlant
+from heliograph.numerics.check import array, check_count, fail, instance
+from heliograph.numerics.compiler import quickly_compiled
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.simulation.centres.centre import Apart, Centre, Listening, described
+from heliograph.simulation.network import FUSED, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.side_by_side import Alike
+
+BLOCK = 1000  # nodes that are followed together
+
+
+@readable
+@dataclass(frozen=True)
+class RelayTree:
+    """A tree whose leaves are filters, whose relays forward the matrix-weighted estimate of those below, to a root.
+
+    covariances: of the errors at each level, from the leaves (nodes, n, n) to the root (1, n, n); weights: of each
+    level above the leaves, (relay, n, child, n), zero for children that the last relay has not. Relay r hears the
+    children r d, ..., r d + d - 1 of the level below, d the degree.
+    """
+
+    degree: int
+    claim: Claim
+    covariances: tuple[Float[np.ndarray, "node n n"], ...]
+    weights: tuple[Float[np.ndarray, "relay n child n"], ...]
+
+    @property
+    def root(self) -> Float[np.ndarray, "n n"]:
+        """Covariance of the root's error."""
+        return np.asarray(self.covariances[-1][0])
+
+    def fused(self, estimates: ArrayLike) -> Float[np.ndarray, "... n"]:
+        """The root's estimate from those of the leaves, (..., node, n): for filters that believe in the world.
+
+        Raises:
+            ValueError: as many estimates as there are leaves are wanted, with leading axes as you like.
+        """
+        nodes, n, _ = self.covariances[0].shape
+        values = np.asarray(estimates, dtype=float)
+        if values.shape[-2:] != (nodes, n):
+            raise fail("estimates of the leaves", f"shape (..., {nodes}, {n})", f"shape {values.shape}")
+        for weights in self.weights:
+            lacking = len(weights) * self.degree - values.shape[-2]
+            filled = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, lacking), (0, 0)])
+            apart = filled.reshape(*filled.shape[:-2], len(weights), self.degree, n)
+            values = np.einsum("raib,...rib->...ra", weights, apart)
+        return np.asarray(values[..., 0, :])
+
+
+def relay_tree(
+    plant: AnyPlant,
+    node: Callable[[PyTree], Node],
+    numbers: PyTree,
+    degree: int,
+    horizon: int,
+    inputs: ArrayLike | None = None,
+) -> RelayTree:
+    """What each place of a tree of relays knows after `horizon` steps of complete data, before any data.
+
+    `node(one)` makes a leaf, a `Node` with one linear filter of the plant, of its numbers; it is traced by JAX.
+    `numbers` holds those of all leaves, with a leading axis. Every relay hears `degree` neighbours of the level below
+    (the last one may hear fewer) and forwards their matrix-weighted estimate. Time and memory are linear in leaves.
+
+    Claim: "exact"; "nominal" where probabilities are uncertain.
+
+    Shapes: inputs (horizon, inputs).
+
+    Raises:
+        ValueError: numbers without a common leading axis, a degree below two, leaves that fusion refuses.
+    Source: Bar-Shalom, On the track-to-track correlation problem (1981), with the second moments of random gains.
+    """
+    check_count("degree of a tree", degree, 2)
+    count, steps = _count(numbers), check_count("horizon", horizon)
+    with jax.enable_x64(True):
+        leaf = instance("leaf", node(_slice(numbers, 0)), Node, "a Node")
+        if len(leaf.filters) != 1:
+            raise fail("leaf", "a Node with one filter", f"{len(leaf.filters)} filters")
+        (name,) = leaf.filters
+        alone = Network(plant, {"leaf": leaf}, {"all": Fusion(name, MatrixWeights())})
+        alone.check_horizon(steps)
+        u = array("inputs", np.zeros((steps, 0)) if inputs is None else inputs, (steps, len(alone.inputs)))
+        width = degree * max(BLOCK // degree, 1)
+        blocks = [_slice(numbers, slice(i, i + width)) for i in range(0, count, width)]
+        parts = [to_numpy(_followed((plant, name, node, degree), block, u)) for block in blocks]
+        covariances, weights, level = (list(leaves) for leaves in zip(*parts, strict=True))
+        known, used, shared = [np.concatenate(covariances)], [np.concatenate(weights)], _joined(level)
+        while True:
+            known.append(np.asarray(_spread(shared)))
+            if len(known[-1]) == 1:
+                return RelayTree(degree, alone.claims()[FUSED]["all"], tuple(known), tuple(used))
+            groups = [_slice(shared, slice(i, i + degree)) for i in range(0, len(known[-1]), degree)]
+            outputs = [to_numpy(_relay(group)) for group in groups]
+            used.append(np.stack([_padded(item, degree) for item, _ in outputs]))
+            shared = jax.tree.map(lambda *leaves: np.stack(leaves), *(part for _, part in outputs))
+
+
+class Level(NamedTuple):
+    """Errors of one level by their sources, e_i = shared_i s + a_i, s white, Cov a_i = own_i."""
+
+    shared: Float[Array, "node n sources"]
+    local: Float[Array, "node n n"]
+
+
+@quickly_compiled
+def _followed(
+    leaf: tuple[AnyPlant, str, Callable[[object], Node], int], numbers: PyTree, u: np.ndarray
+) -> tuple[Array, Array, Level]:
+    """Leaves of one block: covariances of their errors, the weights of the relays above, and these as nodes."""
+    plant, name, node, degree = leaf
+    nodes = eqx.filter_vmap(node)(numbers)
+    count = len(jax.tree.leaves(numbers)[0])
+    channels = eqx.filter_vmap(lambda item: described(node(item).channel))(numbers)
+    alike = Alike(nodes.filters[name], 0, 1, count)
+    size = nodes.filters[name].received
+    observe = Apart((Listening(nodes.sensor, channels),), np.arange(count), size)
+    centre = Centre(plant, observe, {}, np.arange(count), ((0, 0),), size, "exact")
+    quiet = jnp.zeros((count, size))
+
+    def body(carry: tuple[PyTree, Factors], row: tuple[jax.Array, jax.Array]) -> tuple[tuple[PyTree, Factors], None]:
+        (separate, factors), (k, u_k) = carry, row
+        local = alike.matrices(centre.read, separate, 0, quiet, u_k, k)
+        spread = factors.state @ factors.state.T
+        motion, step, noise = centre.moves(factors.mean, spread, local, u_k, k)
+        return (alike.step(separate, quiet, u_k, k)[0], advance_factors(factors, step, motion, noise, k)), None
+
+    state = alike.init()
+    n = len(first(plant).states)
+    begin = initial_factors(centre.init([state.mean]).errors, n * len(u))
+    result: Factors = jax.lax.scan(body, (state, begin), (jnp.arange(len(u)), jnp.asarray(u)))[0][1]
+    level = Level(result.shared, result.local)
+    full = count - count % degree
+    weights, above = jax.vmap(_fuse)(jax.tree.map(lambda a: a[:full].reshape(-1, degree, *a.shape[1:]), level))
+    if count > full:
+        last, rest = _fuse(jax.tree.map(lambda a: a[full:], level))
+        last = jnp.pad(last, ((0, 0), (0, degree - last.shape[1]), (0, 0)))
+        weights = jnp.concatenate([weights, last[None]])
+        above = jax.tree.map(lambda a, b: jnp.concatenate([a, b[None]]), above, rest)
+    return _spread(level), weights, above
+
+
+@quickly_compiled
+def _relay(children: Level) -> tuple[jax.Array, Level]:
+    """Weights of a relay for its children, and its own error."""
+    return _fuse(children)
+
+
+def _fuse(children: Level) -> tuple[jax.Array, Level]:
+    shared, local = jnp.asarray(children.shared), jnp.asarray(children.local)
+    weights = matrix_weights(joint_of(shared, local))
+    return weights, Level(
+        jnp.tensordot(weights, shared, axes=2), jnp.einsum("aib,ibc,dic->ad", weights, local, weights)
+    )
+
+
+def joint_of(shared: Array, local: Array) -> Float[jax.Array, "node n node n"]:
+    """Cov(e_i, e_j) of all pairs."""
+    count, n, _ = shared.shape
+    flat, items = jnp.asarray(shared).reshape(count * n, -1), np.arange(count)
+    return (flat @ flat.T).reshape(count, n, count, n).at[items, :, items, :].add(local)
+
+
+def _spread(level: Level) -> Array:
+    """Covariance of each error."""
+    return level.shared @ level.shared.swapaxes(-1, -2) + level.local
+
+
+def _joined(levels: list[Level]) -> Level:
+    return Level(*(np.concatenate(leaves) for leaves in zip(*levels, strict=True)))
+
+
+def _padded(weights: np.ndarray, degree: int) -> np.ndarray:
+    return np.pad(weights, ((0, 0), (0, degree - weights.shape[1]), (0, 0)))
+
+
+def _slice(numbers: PyTree, which: int | slice) -> PyTree:
+    return jax.tree.map(lambda leaf: leaf[which], numbers)
+
+
+def _count(numbers: PyTree) -> int:
+    lengths = {np.shape(leaf)[0] if np.ndim(leaf) else None for leaf in jax.tree.leaves(numbers)}
+    if len(lengths) != 1 or None in lengths:
+        raise fail("numbers of the leaves", "arrays with one leading axis of nodes", sorted(map(str, lengths)))
+    return len(jax.tree.leaves(numbers)[0])

@@ -1,0 +1,244 @@
+"""The uplinks of a fusion that hears reports: what a node sends is quantized, drawn into the air, and may be late."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from heliograph.fusion.quantizer import AbstractQuantizer
+from heliograph.fusion.report_link import Links
+from heliograph.fusion.rules import Fusion
+from heliograph.model.channel import Channel, perfect
+from heliograph.model.over_time import OverTime, at, over_time, stack, structure
+from heliograph.numerics.check import array, fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.numerics.types import Array, ArrayLike, PyTree
+from heliograph.random_affine.moments.second_moments import SecondOrder
+from heliograph.simulation.centres.centre import described
+from heliograph.simulation.draws import CHANNEL, checksum, draw_key
+
+
+class Drawn(NamedTuple):
+    """What happens to the reports of a step: z = G m + n, NaN where lost, heard `delay` steps later.
+
+    Shapes: gain (node, m, n), offset (node, m), NaN in rows that a node has not, delay (node,).
+    """
+
+    gain: Array
+    offset: Array
+    delay: Array
+
+
+@readable
+class SentReports(NamedTuple):
+    """What became of a node's reports, by the step at which they were sent, and how many steps later they arrived.
+
+    Shapes: values (..., time, m), NaN where a report never arrived, delay (..., time).
+    """
+
+    values: ArrayLike
+    delay: ArrayLike
+
+
+class Flying(NamedTuple):
+    """Reports on their way, by the steps since they were sent, from one; and the delay of each. Quantizers' states."""
+
+    values: jax.Array
+    delays: jax.Array
+    quantizers: PyTree
+
+
+class Group(Module):
+    """Nodes with channels of one structure: the channels stacked, the nodes' checksums and places."""
+
+    channel: Channel
+    checksums: np.ndarray
+    places: np.ndarray
+
+
+class Uplinks(Module):
+    """All uplinks of one fusion: quantizers stacked, channels by structure, delays and intervals by node.
+
+    Shapes: delay (node, ages), every (node,). `links`: what a centre knows of them.
+    """
+
+    groups: tuple[Group, ...]
+    quantizers: AbstractQuantizer | None
+    links: Links | OverTime
+    delay: np.ndarray
+    every: np.ndarray
+    received: tuple[int, ...] = eqx.field(static=True)  # numbers that arrive of each node's report
+    n: int = eqx.field(static=True)
+
+    @property
+    def rows(self) -> np.ndarray:
+        """Places of what may arrive among (age, node, m) in a row."""
+        there = np.arange(max(self.received)) < np.array(self.received)[:, None]
+        return np.flatnonzero(np.broadcast_to(there, (self.delay.shape[1], *there.shape)))
+
+    def init(self) -> Flying:
+        """Nothing is on its way."""
+        nodes, ages = self.delay.shape
+        values = jnp.full((ages - 1, nodes, max(self.received)), jnp.nan)
+        begin = eqx.filter_vmap(lambda q: q.init(self.n), in_axes=(eqx.if_array(0),), axis_size=nodes)
+        start = () if self.quantizers is None else begin(self.quantizers)
+        return Flying(values, jnp.zeros((ages - 1, nodes), dtype=int), start)
+
+    def draw(self, key: jax.Array, k: jax.Array) -> Drawn:
+        """What happens to the reports of step k in the run with this key; alike for all fusions of the same nodes."""
+        nodes, m, n = len(self.received), max(self.received), self.n
+        gain = jnp.zeros((nodes, m, n)) if self.groups else jnp.tile(jnp.eye(n), (nodes, 1, 1))
+        offset = jnp.where(np.arange(m) < np.array(self.received)[:, None], 0.0, jnp.nan)
+        delay = self.fixed_delay
+        for group in self.groups:
+            places = jnp.asarray(group.places)
+
+            def single(channel: Channel, place: jax.Array, law: jax.Array) -> tuple[jax.Array, jax.Array]:
+                drawn, late = jax.random.split(draw_key(key, k, place, CHANNEL))
+                return at(channel, k).sample(drawn), jax.random.choice(late, len(law), p=law)
+
+            both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0, 0))
+            h, late = both(group.channel, group.checksums, jnp.asarray(self.delay)[places])
+            size = h.shape[1] - 1
+            gain = gain.at[places, :size].set(h[:, :-1, :-1])
+            offset = offset.at[places, :size].set(h[:, :-1, -1])
+            delay = delay.at[places].set(late)
+        return Drawn(gain, offset, delay)
+
+    def undrawn(self) -> Drawn:
+        """What happens where nothing is left to chance."""
+        nodes = len(self.received)
+        return Drawn(np.tile(np.eye(self.n), (nodes, 1, 1)), np.zeros((nodes, self.n)), self.fixed_delay)
+
+    def recorded(
+        self, name: str, nodes: Sequence[str], reports: Mapping[str, SentReports | ArrayLike] | None, steps: int
+    ) -> Drawn:
+        """What happened to the reports of each step, from a recording; (time, node, ...).
+
+        Raises:
+            ValueError: nodes without reports or the reverse, shapes that do not fit, delays that the links have not.
+        """
+        count, m = len(self.received), max(self.received)
+        if reports is None and not self.groups:
+            return Drawn(*(np.broadcast_to(part, (steps, *np.shape(part))) for part in self.undrawn()))
+        if reports is None or set(reports) != set(nodes):
+            result = "none" if reports is None else list(reports)
+            raise fail(f"reports of fusion {name!r}", f"those of {list(nodes)}", result)
+        values, delay = np.full((steps, count, m), np.nan), np.tile(self.fixed_delay, (steps, 1))
+        for i, node in enumerate(nodes):
+            sent, local = reports[node], self.received[i]
+            if isinstance(sent, SentReports):
+                delay[:, i] = self._checked_delay(f"delays of node {node!r}", sent.delay, steps, i)
+                sent = sent.values
+            values[:, i, :local] = array(f"reports of node {node!r}", sent, (steps, local), missing=True)
+        return Drawn(np.zeros((steps, count, m, self.n)), values, delay)
+
+    def _checked_delay(self, name: str, value: ArrayLike, steps: int, node: int) -> np.ndarray:
+        result: np.ndarray = array(name, value, (steps,))
+        possible = np.flatnonzero(self.delay[node] > 0)
+        if not np.all(np.isin(result, possible)):
+            raise fail(name, f"each one of {possible.tolist()} steps", sorted(set(result.tolist())))
+        return result.astype(int)
+
+    @property
+    def fixed_delay(self) -> jax.Array:
+        """The likeliest number of steps of each node, which is the only one where it is fixed."""
+        return jnp.argmax(jnp.asarray(self.delay), axis=1)
+
+    def send(
+        self, state: Flying, means: jax.Array, drawn: Drawn, k: jax.Array
+    ) -> tuple[Flying, jax.Array, dict[str, jax.Array]]:
+        """Next state, what became of the reports of step k (node, m), whenever they arrive, and their traffic.
+
+        What a quantizer cannot reach becomes an infinite number: nothing is known of it, and the estimate says so.
+        """
+        sending = jnp.asarray((k + 1) % self.every == 0)[:, None]
+        values, traffic = jnp.where(sending, means, jnp.nan), {}
+        beyond = jnp.zeros(len(means), dtype=bool)
+        if self.quantizers is not None:
+            item = eqx.filter_vmap(lambda q, s, mean: q.step(s, mean), in_axes=(eqx.if_array(0), 0, 0))
+            quantizers, sent = item(self.quantizers, state.quantizers, values)
+            state, values = state._replace(quantizers=quantizers), sent.value
+            beyond = jnp.any(sent.saturated, axis=1)
+            traffic = {"saturated": sent.saturated, "symbols": jnp.where(sending, sent.symbols, 0)}
+        z = jnp.einsum("imn,in->im", drawn.gain, values) + drawn.offset
+        return state, jnp.where(beyond[:, None], jnp.inf, z), traffic
+
+    def arrive(self, state: Flying, sent: jax.Array, delay: Array) -> tuple[Flying, jax.Array]:
+        """Next state, and what arrives now of this step's reports and earlier ones, (age, node, m)."""
+        values = jnp.concatenate([sent[None], state.values])
+        delays = jnp.concatenate([jnp.asarray(delay, dtype=state.delays.dtype)[None], state.delays])
+        due = delays == np.arange(len(values))[:, None]
+        return state._replace(values=values[:-1], delays=delays[:-1]), jnp.where(due[..., None], values, jnp.nan)
+
+
+def uplinks_of(fusion: Fusion, nodes: Sequence[str], n: int) -> Uplinks:
+    """The uplinks of these nodes to a centre that hears reports of n numbers."""
+    mine, quantizers = fusion.links(nodes), fusion.quantizers(nodes)
+    ages = max(len(link.delay) for link in mine)
+    channels = [perfect(n) if link.channel is None else link.channel for link in mine]
+    groups: dict[object, list[int]] = {}
+    if any(link.channel is not None or np.max(link.delay) < 1 for link in mine):
+        for i, channel in enumerate(channels):
+            groups.setdefault(structure(channel), []).append(i)
+    received = tuple(link.received(n) for link in mine)
+    error = np.stack([q.error(n) for q in quantizers]) if quantizers else np.zeros((len(nodes), n))
+    return Uplinks(
+        groups=tuple(
+            _group([channels[i] for i in group], [nodes[i] for i in group], group) for group in groups.values()
+        ),
+        quantizers=stack(quantizers) if quantizers else None,
+        links=_known([described(channel) for channel in channels], received, error),
+        delay=np.stack([np.pad(link.delay, (0, ages - len(link.delay))) for link in mine]),
+        every=np.array([link.every for link in mine]),
+        received=received,
+        n=n,
+    )
+
+
+def _group(channels: Sequence[Channel], names: Sequence[str], places: Sequence[int]) -> Group:
+    checksums = np.array([checksum(f"{name} to the fusion centre") for name in names], dtype=np.uint32)
+    return Group(stack(list(channels)), checksums, np.array(places))
+
+
+def _known(known: Sequence[SecondOrder | OverTime], received: Sequence[int], error: np.ndarray) -> Links | OverTime:
+    """What a centre knows of the uplinks, at each step if any varies."""
+    varying = [item.steps for item in known if isinstance(item, OverTime)]
+    if not varying:
+        return _links(known, received, error)
+    return over_time([_links([at(item, k) for item in known], received, error) for k in range(min(varying))])
+
+
+def _links(known: Sequence[PyTree], received: Sequence[int], error: np.ndarray) -> Links:
+    more = [(0, max(received) - item) for item in received]
+    gain = np.stack([np.pad(item.mean_gain, (a, (0, 0))) for item, a in zip(known, more, strict=True)])
+    offset = np.stack([np.pad(item.offset, a) for item, a in zip(known, more, strict=True)])
+    spread = [np.pad(item.nominal.center, (a, a, (0, 0), (0, 0))) for item, a in zip(known, more, strict=True)]
+    return Links(gain, offset, np.stack(spread), error)
+
+
+@readable
+@dataclass(frozen=True)
+class Uplink:
+    """What a fusion's quantizers did to the estimates of `nodes`, by component.
+
+    saturated, whether a component was out of reach, and symbols, how many were sent for it: (run, time, node, n) in a
+    record; in statistics their means over the runs, (time, node, n).
+    """
+
+    nodes: tuple[str, ...]
+    saturated: np.ndarray
+    symbols: np.ndarray
+
+    def saturated_share(self) -> dict[str, float]:
+        """Share of the samples (runs, steps and components) that were out of reach, by node."""
+        return {node: float(self.saturated[..., i, :].mean()) for i, node in enumerate(self.nodes)}
+
+    def symbols_per_value(self) -> float:
+        """Mean number of symbols that one component of one estimate took."""
+        return float(self.symbols.mean())

@@ -1,0 +1,267 @@
+"""What is between the plant and the filters: each node's own sensor and channel, or relays that talk in slots."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.filters.wrappers.fed_back import FedBackFilter
+from heliograph.model.channel import Channel
+from heliograph.model.estimate import Estimate
+from heliograph.model.over_time import OverTime, at, first, over_time, stack, structure
+from heliograph.model.relays import SENSOR as SENDER
+from heliograph.model.relays import RelayNetwork
+from heliograph.model.sensor import AbstractSensor, AnySensor
+from heliograph.numerics.angle import wrapped
+from heliograph.numerics.module import Module
+from heliograph.random_affine.base import anonymous
+from heliograph.simulation.draws import SENSOR, checksum, draw_key
+from heliograph.simulation.network import LOCAL, Network
+from heliograph.simulation.node import Node
+from heliograph.simulation.shared_fading import deliver, memory_places, start
+
+ObservationModel = tuple[jax.Array, ...]  # (node, received) of each group
+
+
+class AbstractMedium(Module):
+    """How signals reach the nodes: it holds the states of all channels of a run."""
+
+    def init(self, key: jax.Array) -> PyTree:
+        """Before the first step; `key` is the run's."""
+        raise NotImplementedError
+
+    def receive(
+        self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, ObservationModel]:
+        """What reaches the nodes of each group at step k, x the state to which u led; NaN where nothing does."""
+        raise NotImplementedError
+
+    def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
+        """After the filters' step, with their estimates by kind, (filter, node, ...)."""
+        return state
+
+
+class NodeGroup(Module):
+    """The sensors and channels of a group of nodes, stacked; checksums of the names tell their draws.
+
+    `teller`: the filters that sensors hear back, whose estimates stand at `place` (kind, filter) among all.
+
+    Shapes: checksums (node,), memories (node, memories of a channel): checksums of what the channels remember.
+    """
+
+    sensor: AnySensor
+    channel: Channel
+    checksums: jax.Array | np.ndarray
+    memories: jax.Array | np.ndarray
+    teller: FedBackFilter | None
+    place: tuple[int, int] | None = eqx.field(static=True)
+
+
+class LinkState(NamedTuple):
+    """A channel's state, and the estimate that its sensor heard back last, (n,); None where it hears none."""
+
+    memory: PyTree
+    feed_back: jax.Array | None
+
+
+class SeparateChannels(AbstractMedium):
+    """Each node has its own sensor and its own channel."""
+
+    groups: tuple[NodeGroup, ...]
+
+    def init(self, key: jax.Array) -> PyTree:
+        """States of the channels and what was heard back, by group, with a leading node axis."""
+
+        def single(group: NodeGroup) -> LinkState:
+            feed_back = None if group.teller is None else jnp.asarray(group.teller.init().mean)
+            return LinkState(start(group.channel, key, group.checksums, group.memories), feed_back)
+
+        return tuple(eqx.filter_vmap(single, in_axes=(eqx.if_array(0),))(group) for group in self.groups)
+
+    def receive(
+        self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, ObservationModel]:
+        """The sensor measures x and takes off what is expected of it, the channel delivers."""
+
+        def single(group: NodeGroup, reach: LinkState) -> tuple[LinkState, jax.Array]:
+            sensor = at(group.sensor, k)
+            y = sensed(sensor, x, draw_key(key, k, group.checksums, SENSOR))
+            if group.teller is not None and reach.feed_back is not None:
+                y = y - group.teller.reference(reach.feed_back, u, k)
+            memory, z = deliver(group.channel, reach.memory, y, key, k, group.checksums, group.memories)
+            return LinkState(memory, reach.feed_back), z
+
+        both = eqx.filter_vmap(single, in_axes=(eqx.if_array(0), 0))
+        results = [both(group, reach) for group, reach in zip(self.groups, state, strict=True)]
+        return tuple(after for after, _ in results), tuple(z for _, z in results)
+
+    def feed_back(self, state: PyTree, estimates: Sequence[Estimate]) -> PyTree:
+        """Every sensor hears what its filter estimates now."""
+        return tuple(
+            reach if group.place is None else LinkState(reach.memory, estimates[group.place[0]].mean[group.place[1]])
+            for group, reach in zip(self.groups, state, strict=True)
+        )
+
+
+def sensed(sensor: AbstractSensor, x: jax.Array, key: jax.Array) -> jax.Array:
+    """y = h(x) + v, angles between -pi and pi."""
+    return wrapped(sensor.measure(x) + sensor.noise.sample(key), sensor.angles)
+
+
+class CommonChannel(AbstractMedium):
+    """One sensor and one channel, drawn once a step; each node hears its rows of what arrives."""
+
+    sensor: AnySensor
+    channel: Channel
+    rows: tuple[np.ndarray, ...]  # (node, received) of each group
+
+    def init(self, key: jax.Array) -> PyTree:
+        """What a late channel holds of the past; the channel forgets all else."""
+        return start(self.channel, key, checksum(SENDER), ())
+
+    def receive(
+        self, state: PyTree, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[PyTree, ObservationModel]:
+        """The sensor measures x, the channel delivers."""
+        sensor, place = at(self.sensor, k), checksum(SENDER)
+        y = sensed(sensor, x, draw_key(key, k, place, SENSOR))
+        state, z = deliver(self.channel, state, y, key, k, place, ())
+        return state, tuple(z[rows] for rows in self.rows)
+
+
+class Relayed(NamedTuple):
+    """What the relays will send, (relay, n), and the states of the hops that remember."""
+
+    estimates: jax.Array
+    hops: dict[str, PyTree]
+
+
+class Slots(AbstractMedium):
+    """Relays in turn: each sends C s with its estimate s of the step before; slots of one structure share a branch.
+
+    A hop that remembers moves on at every step, used or not; the same pair in another slot is another hop.
+    """
+
+    relays: RelayNetwork
+    local: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
+    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
+    memories: dict[str, np.ndarray]  # places of what each remembering hop's links hold
+
+    def init(self, key: jax.Array) -> Relayed:
+        """Every relay knows the initial mean."""
+        mean = jnp.asarray(at(self.relays.plant, 0).initial_mean)
+        hops = {
+            name: start(hop, key, checksum(f"{sender} to {listener}"), self.memories[name])
+            for name, (_, listener, sender, hop) in _remembering(self.relays).items()
+        }
+        return Relayed(jnp.tile(mean, (len(self.local), 1)), hops)
+
+    def receive(
+        self, state: Relayed, x: jax.Array, u: jax.Array, key: jax.Array, k: jax.Array
+    ) -> tuple[Relayed, ObservationModel]:
+        """The sum of the hops of this step's slot, at each listener."""
+        sensor = at(self.relays.sensor, k)
+        y = sensor.measure(x) + sensor.noise.sample(draw_key(key, k, checksum(SENDER), SENSOR))
+        signals = [jnp.asarray(sensor.matrix) @ s for s in state.estimates]
+        sent = dict(zip((SENDER, *self.relays.relays), [y, *signals], strict=True))
+        received = self._forgetful(k, sent, key)
+        hops, slot = {}, k % len(self.relays.slots)
+        for name, (number, listener, sender, hop) in _remembering(self.relays).items():
+            place = checksum(f"{sender} to {listener}")
+            hops[name], z = deliver(hop, state.hops[name], sent[sender], key, k, place, self.memories[name])
+            received[listener] = received[listener] + jnp.where(slot == number, z, 0.0)
+        order = [received[name] for name in self.relays.filters]
+        return Relayed(state.estimates, hops), tuple(jnp.stack([order[i] for i in group]) for group in self.groups)
+
+    def feed_back(self, state: Relayed, estimates: Sequence[Estimate]) -> Relayed:
+        """The relays' estimates, to be sent at the next step."""
+        means = [estimates[kind].mean[f, i] for kind, f, i in self.local]
+        return Relayed(jnp.stack(means) if means else state.estimates, state.hops)
+
+    def _forgetful(self, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array) -> dict[str, jax.Array]:
+        """What each listener hears through hops that forget; NaN where nobody transmits to it."""
+        kinds: dict[object, list[int]] = {}
+        for number, slot in enumerate(self.relays.slots):
+            kinds.setdefault(structure(slot), []).append(number)
+        kind, position = np.zeros((2, len(self.relays.slots)), dtype=int)  # of each slot: its branch, and where in it
+        for i, numbers in enumerate(kinds.values()):
+            kind[numbers], position[numbers] = i, np.arange(len(numbers))
+        branches = [self._branch([self.relays.slots[i] for i in numbers]) for numbers in kinds.values()]
+        now = k % len(kind)
+        received: dict[str, jax.Array] = jax.lax.switch(
+            jnp.asarray(kind)[now], branches, jnp.asarray(position)[now], k, sent, key
+        )
+        return received
+
+    def _branch(self, slots: Sequence[Mapping[str, Mapping[str, Channel]]]) -> Callable[..., dict[str, jax.Array]]:
+        # a hop that is an OverTime is read at the step; stacking slots would read it at the slot
+        single: PyTree = slots[0] if len(slots) == 1 else over_time(slots)
+
+        def branch(
+            position: jax.Array, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+        ) -> dict[str, jax.Array]:
+            slot: PyTree = at(single, position) if isinstance(single, OverTime) else single
+            listeners = zip(self.relays.filters, self.relays.received, strict=True)
+            return {name: _receive(slot.get(name, {}), name, size, k, sent, key) for name, size in listeners}
+
+        return branch
+
+
+def _remembering(relays: RelayNetwork) -> dict[str, tuple[int, str, str, Channel]]:
+    """Slot, listener, sender and hop of those that remember, by name."""
+    return {
+        f"{number} {listener} {sender}": (number, listener, sender, hop)
+        for number, slot in enumerate(relays.slots)
+        for listener, hops in slot.items()
+        for sender, hop in hops.items()
+        if first(hop).remembers
+    }
+
+
+def _receive(
+    hops: Mapping[str, Channel], listener: str, size: int, k: jax.Array, sent: dict[str, jax.Array], key: jax.Array
+) -> jax.Array:
+    parts = [
+        deliver(hop, (), sent[sender], key, k, checksum(f"{sender} to {listener}"), ())[1]
+        for sender, hop in hops.items()
+        if not first(hop).remembers
+    ]
+    nobody = jnp.zeros(size) if hops else jnp.full(size, jnp.nan)
+    return jnp.sum(jnp.stack(parts), axis=0) if parts else nobody
+
+
+def medium_of(network: Network) -> AbstractMedium:
+    """What is between the plant and the nodes of a network."""
+    if network.relays is not None:
+        places = network.places()
+        listeners = {name: i for i, name in enumerate(network.relays.filters)}
+        return Slots(
+            network.relays,
+            tuple(places[name, LOCAL] for name in network.relays.relays),
+            tuple(tuple(listeners[name] for name in names) for names in network.groups),
+            memory_places({name: hop for name, (_, _, _, hop) in _remembering(network.relays).items()}),
+        )
+    if network.common is not None:
+        rows = network.rows()
+        received = tuple(np.stack([rows[name] for name in names]) for names in network.groups)
+        return CommonChannel(network.common.sensor, network.common.channel, received)
+    groups, places = [], network.places()
+    local = {name: node for name, node in network.nodes.items() if isinstance(node, Node)}
+    memories = memory_places({name: node.channel for name, node in local.items()})
+    for names in network.groups:
+        parts = stack([(local[name].sensor, _unnamed(local[name].channel, memories[name])) for name in names])
+        checksums = np.array([checksum(name) for name in names], dtype=np.uint32)
+        held = np.stack([memories[name] for name in names])
+        informed_by = local[names[0]].informed_by
+        teller: PyTree = None if informed_by is None else stack([local[name].filters[informed_by] for name in names])
+        place = None if informed_by is None else places[names[0], informed_by][:2]
+        groups.append(NodeGroup(*parts, checksums, held, teller, place))
+    return SeparateChannels(tuple(groups))
+
+
+def _unnamed(channel: Channel, places: np.ndarray) -> Channel:
+    return anonymous(channel) if len(places) else channel

@@ -1,0 +1,1 @@
+"""Results: records, statistics, tables, files and figures."""

@@ -1,0 +1,64 @@
+"""From the axes of groups and kinds, as a network is computed, to the names of its nodes and filters."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.fusion.rules import Fusion
+from heliograph.simulation.centres.uplinks import SentReports, Uplink
+from heliograph.simulation.network import FUSED, Network
+
+
+def reports_by_name(
+    network: Network, outcome: dict[str, tuple[np.ndarray, np.ndarray]]
+) -> dict[str, dict[str, SentReports]]:
+    """Reports by fusion and node, without the rows that a node has not, from (..., node, m) and (..., node)."""
+    result: dict[str, dict[str, SentReports]] = {}
+    for name, (values, delay) in outcome.items():
+        fusion = network.fused[name]
+        assert isinstance(fusion, Fusion)  # nothing else hears reports
+        nodes, n = network.nodes_with(fusion.filter), len(network.states)
+        sizes = [link.received(n) for link in fusion.links(nodes)]
+        result[name] = {
+            node: SentReports(np.asarray(values)[..., i, : sizes[i]], np.asarray(delay)[..., i])
+            for i, node in enumerate(nodes)
+        }
+    return result
+
+
+def measurements_of(network: Network, groups: Sequence[np.ndarray]) -> dict[str, np.ndarray]:
+    """Measurements by node, in the given order, from those of the groups (..., node, received)."""
+    received = {
+        name: np.asarray(z)[..., i, :]
+        for names, z in zip(network.groups, groups, strict=True)
+        for i, name in enumerate(names)
+    }
+    return {name: received[name] for name in network.names}
+
+
+def by_name(
+    network: Network, batch: PyTree, read: Callable[[PyTree], np.ndarray], axis: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """What `read` gives of each kind's part, by node and filter: split at its axes (filter, node), the first `axis`.
+
+    `batch` holds "estimates" by kind and "fused" by name, which is read without these axes.
+    """
+    result: dict[str, dict[str, np.ndarray]] = {name: {} for name in network.names}
+    for (group, filters), part in zip(network.kinds, batch["estimates"], strict=True):
+        values = np.moveaxis(read(part), (axis, axis + 1), (0, 1))
+        for name, rows in zip(filters, values, strict=True):
+            for node, row in zip(network.groups[group], rows, strict=True):
+                result[node][name] = row
+    if network.fused:
+        result[FUSED] = {name: read(part) for name, part in batch["fused"].items()}
+    return result
+
+
+def uplinks_by_name(network: Network, outcome: dict[str, dict[str, np.ndarray]]) -> dict[str, Uplink]:
+    """Uplinks by the fusion's name, from arrays whose last axes are (node, n)."""
+    result = {}
+    for name, fusion in network.fused.items() if outcome else ():
+        if isinstance(fusion, Fusion) and name in outcome:
+            result[name] = Uplink(tuple(network.nodes_with(fusion.filter)), **outcome[name])
+    return result

@@ -1,0 +1,142 @@
+"""Results as tables: a record as a wide one and back, statistics as a summary."""
+
+import warnings
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliograph.model.estimate import STRENGTH, Claim, Estimate
+from heliograph.numerics.check import fail
+
+if TYPE_CHECKING:  # an extra
+    import pandas as pd
+
+    from heliograph.simulation.results.record import Record
+    from heliograph.simulation.results.statistics import ErrorStatistics
+    from heliograph.simulation.results.statistics_by_name import StatisticsByName
+
+LEVELS = ["node", "filter", "quantity", "component", "other"]
+Column = tuple[str, str, str, str, str]
+COVARIANCE: dict[str, Claim] = {f"covariance ({claim})": claim for claim in STRENGTH}
+SENT = ("saturated", "symbols")
+
+
+def record_frame(record: "Record") -> "pd.DataFrame":
+    """A row for each time, or run and time; columns (node, filter, quantity, component, other)."""
+    import pandas as pd
+
+    columns: dict[Column, np.ndarray] = {}
+    if record.truth is not None:
+        columns |= {("", "", "truth", s, ""): record.truth[..., i] for i, s in enumerate(record.states)}
+    for node, z in record.measurements.items():
+        columns |= {(node, "", "measurement", f"z{i}", ""): z[..., i] for i in range(z.shape[-1])}
+    for node, filters in record.estimates.items():
+        for name, estimate in filters.items():
+            columns |= _of_estimate(node, name, estimate, record.states)
+    for name, uplink in record.uplinks.items():
+        for i, node in enumerate(uplink.nodes):
+            for quantity in SENT:
+                values = getattr(uplink, quantity)
+                columns |= {(node, name, quantity, s, ""): values[..., i, j] for j, s in enumerate(record.states)}
+    index = pd.Index(record.time, name="time")
+    if record.runs is not None:
+        index = pd.MultiIndex.from_product([range(record.runs), index], names=["run", "time"])
+    frame = pd.DataFrame({i: values.reshape(-1) for i, values in enumerate(columns.values())}, index=index)
+    frame.columns = _labels(list(columns))
+    return frame
+
+
+def record_of_frame(frame: "pd.DataFrame") -> "Record":
+    """The record in such a table.
+
+    Raises:
+        ValueError: no such table.
+    """
+    from heliograph.simulation.centres.uplinks import Uplink
+    from heliograph.simulation.results.record import Record
+
+    if list(getattr(getattr(frame, "columns", None), "names", ())) != LEVELS:
+        raise fail("table", f"columns {LEVELS}, as Record.to_pandas makes them", type(frame).__name__)
+    runs = len(frame.index.unique("run")) if "run" in frame.index.names else None
+    steps = len(frame) // (runs or 1)
+    lead = (steps,) if runs is None else (runs, steps)
+    parts: dict[tuple[str, str, str], dict[tuple[str, str], np.ndarray]] = {}
+    for i, (node, name, quantity, component, other) in enumerate(frame.columns):
+        values = frame.iloc[:, i].to_numpy().reshape(lead)
+        parts.setdefault((node, name, quantity), {})[component, other] = values
+    joined = {key: np.stack(list(part.values()), axis=-1) for key, part in parts.items()}
+    states: tuple[str, ...] = ()
+    measurements: dict[str, np.ndarray] = {}
+    estimates: dict[str, dict[str, Estimate]] = {}
+    sent: dict[str, dict[str, list[np.ndarray]]] = {}
+    for (node, name, quantity), values in joined.items():
+        if quantity in ("truth", "mean"):
+            states = tuple(component for component, _ in parts[node, name, quantity])
+        elif quantity == "measurement":
+            measurements[node] = values
+            estimates.setdefault(node, {})
+        elif quantity in SENT:
+            sent.setdefault(name, {}).setdefault(node, []).append(values)
+        else:
+            n, mean = len(states), joined[node, name, "mean"]
+            covariance = values.reshape(*lead, n, n)
+            estimates.setdefault(node, {})[name] = Estimate(mean, covariance, COVARIANCE[quantity])
+    uplinks = {
+        name: Uplink(tuple(item), *(np.stack(item, axis=-2) for item in zip(*item.values(), strict=True)))
+        for name, item in sent.items()
+    }
+    time = np.asarray(frame.index.get_level_values("time"))[:steps]
+    return Record(time, states, joined.get(("", "", "truth")), measurements, estimates, uplinks)
+
+
+def statistics_frame(result: "StatisticsByName") -> "pd.DataFrame":
+    """A row for each node and filter: claim, runs, RMSE and NEES with errors, then each state's RMSE and claim."""
+    import pandas as pd
+
+    rows, index = [], []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the row says in how many runs it failed
+        for node, filters in result.items():
+            for name, filter_ in filters.items():
+                index.append((node, name))
+                rows.append(_summary(filter_, result.states))
+    names = pd.MultiIndex.from_tuples(index, names=["node", "filter"])
+    return pd.DataFrame(rows, index=names)
+
+
+def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, object]:
+    nees, low, high = item.nees_per_dimension()
+    rmse, error = item.rmse()
+    by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
+    total = {
+        "claim": item.claim,
+        "runs": item.runs,
+        "failed runs": item.failed_runs,
+        "rmse": rmse,
+        "rmse error": error,
+        "nees": nees,
+        "nees low": low,
+        "nees high": high,
+    }
+    for state, single, spread, claimed in by_state:
+        total |= {f"rmse of {state}": single, f"rmse error of {state}": spread, f"claimed of {state}": claimed}
+    return total
+
+
+def _labels(columns: Sequence[Column]) -> Any:
+    """Labels as they are: none is taken for a number or for nothing."""
+    import pandas as pd
+
+    levels = [list(dict.fromkeys(column[i] for column in columns)) for i in range(len(LEVELS))]
+    codes = [[level.index(column[i]) for column in columns] for i, level in enumerate(levels)]
+    return pd.MultiIndex([pd.Index(level, dtype=object) for level in levels], codes, names=LEVELS)
+
+
+def _of_estimate(node: str, name: str, estimate: Estimate, states: Sequence[str]) -> dict[Column, np.ndarray]:
+    mean, covariance = np.asarray(estimate.mean), np.asarray(estimate.covariance)
+    results: dict[Column, np.ndarray] = {(node, name, "mean", s, ""): mean[..., i] for i, s in enumerate(states)}
+    for i, state in enumerate(states):
+        for j, other in enumerate(states):
+            results[node, name, f"covariance ({estimate.claim})", state, other] = covariance[..., i, j]
+    return results

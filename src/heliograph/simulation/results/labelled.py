@@ -1,0 +1,186 @@
+"""Labelled arrays: what datasets of records and of statistics have in common."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+import heliograph
+from heliograph.disk.quoting import visible
+from heliograph.model.estimate import Claim
+from heliograph.numerics.check import fail, instance, table
+
+if TYPE_CHECKING:  # an extra
+    import xarray as xr
+
+    from heliograph.simulation.centres.uplinks import Uplink
+
+TIME = "time"
+Variables = dict[str, tuple[list[str], np.ndarray]]  # by name: dimensions and values
+Part = tuple[tuple[int, ...], np.ndarray]  # where an array belongs, and the array
+MEANING = {
+    "truth": "true state",
+    "measurement": "what reached the node, NaN where nothing arrived and beyond its length",
+    "length": "how many numbers the node hears; -1: it is no place that hears",
+    "mean": "estimate of the state",
+    "covariance": "covariance of the error as the filter claims it",
+    "claim": "what the claimed covariance is: exact, upper, nominal or none; empty where there is no such filter",
+    "estimated": "whether estimates are kept for the node",
+    "saturated": "whether a component was out of the quantizer's reach; in statistics, in which share of the runs",
+    "symbols": "how many symbols were sent for a component; in statistics their mean over the runs",
+    "place": "place of the sender among those of the fusion; -1: it sends nothing to it",
+    "runs": "number of runs in the batch",
+    "errors": "sum over the batch's runs of e_i e_j, e = truth - mean",
+    "claimed": "mean over the batch's runs of the claimed covariance",
+    "nees": "sum over the batch's runs of e' B^-1 e",
+    "failed": "runs without a valid estimate at this step",
+    "failed_runs": "runs without a valid estimate at some step",
+    "rmse": "root mean square error",
+    "deviation": "root of the mean claimed variance",
+    "nees_per_dimension": "mean of e' B^-1 e / n, 1 if the claim is exact",
+}
+
+
+def checked_units(units: Mapping[str, str], states: Sequence[str]) -> dict[str, str]:
+    """Units by the state's name, and of `time`; those that say nothing are left out.
+
+    Raises:
+        ValueError: a name that is no state, a unit that is no text.
+    """
+    known = table("units", units, "texts")
+    for name, unit in known.items():
+        if name not in (*states, TIME):
+            raise fail("units", f"names of states {list(states)}, or {TIME!r}", repr(name))
+        instance(f"unit of {name!r}", unit, str, "a text")
+    return {name: unit for name, unit in known.items() if unit}
+
+
+def filled(lead: tuple[int, ...], places: tuple[int, ...], tail: tuple[int, ...], parts: Sequence[Part]) -> np.ndarray:
+    """Arrays (*lead, *up to tail) at their places along axes between; NaN elsewhere."""
+    result = np.full((*lead, *places, *tail), np.nan)
+    ahead: tuple[slice, ...] = (slice(None),) * len(lead)
+    for place, values in parts:
+        where: Any = (*ahead, *place, *map(slice, values.shape[len(lead) :]))
+        result[where] = values
+    return result
+
+
+def claims_of(sizes: tuple[int, ...], outcome: Iterable[tuple[tuple[int, ...], Any]]) -> np.ndarray:
+    """What each filter claims, at its place; empty elsewhere."""
+    result = np.full(sizes, "", dtype="U7")
+    for place, item in outcome:
+        claim: Claim = item.claim
+        result[place] = claim
+    return result
+
+
+def uplink_variables(
+    uplinks: "Mapping[str, Uplink]", lead: list[str], n: int
+) -> dict[str, tuple[list[str], np.ndarray]]:
+    """What quantizers did, by fusion and sender; each keeps its kind of number."""
+    if not uplinks:
+        return {}
+    senders = list(dict.fromkeys(node for uplink in uplinks.values() for node in uplink.nodes))
+    fusions, first = list(uplinks), next(iter(uplinks.values()))
+    place = np.full((len(fusions), len(senders)), -1, dtype=np.int64)
+    parts = {name: np.zeros((*getattr(first, name).shape[: len(lead)], *place.shape, n), getattr(first, name).dtype)
+             for name in ("saturated", "symbols")}  # fmt: skip
+    for i, uplink in enumerate(uplinks.values()):
+        for j, node in enumerate(uplink.nodes):
+            place[i, senders.index(node)] = j
+            for name, values in parts.items():
+                values[..., i, senders.index(node), :] = getattr(uplink, name)[..., j, :]
+    axes = [*lead, "fusion", "sender", "state"]
+    named = {"fusion": (["fusion"], text(fusions)), "sender": (["sender"], text(senders))}
+    return {"place": (["fusion", "sender"], place), **{name: (axes, v) for name, v in parts.items()}, **named}
+
+
+def uplinks_from(dataset: "xr.Dataset", lead: list[str]) -> "dict[str, Uplink]":
+    """The uplinks in a dataset, by the fusion's name."""
+    from heliograph.simulation.centres.uplinks import Uplink
+
+    if "place" not in dataset:
+        return {}
+    senders, place = names_of(dataset, "sender"), values_of(dataset, "place", ["fusion", "sender"])
+    saturated, symbols = (
+        values_of(dataset, name, [*lead, "fusion", "sender", "state"]) for name in ("saturated", "symbols")
+    )
+    result = {}
+    for i, name in enumerate(names_of(dataset, "fusion")):
+        order = np.array([j for j in np.argsort(place[i], kind="stable") if place[i, j] >= 0], dtype=int)
+        nodes = tuple(senders[j] for j in order)
+        result[name] = Uplink(nodes, saturated[..., i, order, :], symbols[..., i, order, :])
+    return result
+
+
+def dataset_of(
+    title: str,
+    variables: Mapping[str, tuple[list[str], object]],
+    labels: Mapping[str, Sequence[str]],
+    time: np.ndarray,
+    units: Mapping[str, str],
+    claims: str,
+) -> "xr.Dataset":
+    """A dataset that says what it holds, with names, times and units for coordinates."""
+    import xarray as xr
+
+    data = {name: (axes, values, {"long_name": MEANING[name]} if name in MEANING else {})
+            for name, (axes, values) in variables.items()}  # fmt: skip
+    coordinates: dict[str, object] = {axis: ([axis], text(names)) for axis, names in labels.items()}
+    coordinates[TIME] = ([TIME], time, {"units": units[TIME]} if TIME in units and time.dtype.kind == "f" else {})
+    states = labels["state"]
+    if any(state in units for state in states):
+        coordinates["unit"] = (["state"], text([units.get(state, "") for state in states]))
+    attributes = {
+        "title": title,
+        "heliograph": heliograph.__version__,
+        "states": visible(", ".join(states)),
+        "claims": claims,
+    }
+    return xr.Dataset(data, coordinates, attributes)
+
+
+def claims_text(result: Any) -> str:
+    """Claims for people: `node/filter: claim`."""
+    every = result.estimates if hasattr(result, "estimates") else result
+    return visible(
+        ", ".join(f"{node}/{name}: {single.claim}" for node, item in every.items() for name, single in item.items())
+    )
+
+
+def text(names: Sequence[str]) -> np.ndarray:
+    """Names as they are, whatever characters they have."""
+    result = np.empty(len(names), dtype=object)
+    result[:] = names
+    return result
+
+
+def check_title(dataset: "xr.Dataset", title: str) -> None:
+    """Raise ValueError unless the dataset says that it holds this."""
+    came = getattr(dataset, "attrs", {}).get("title", type(dataset).__name__)
+    if came != title:
+        raise fail("dataset", f"one whose title is {title!r}", repr(came))
+
+
+def names_of(dataset: "xr.Dataset", axis: str) -> list[str]:
+    """Labels of a dimension."""
+    if axis not in dataset.dims:
+        raise fail("dataset", f"the dimension {axis!r}, also where it has one label", f"{list(dataset.dims)}")
+    return [str(name) for name in dataset[axis].values]
+
+
+def values_of(dataset: "xr.Dataset", name: str, axes: Sequence[str]) -> np.ndarray:
+    """A variable with its dimensions in this order."""
+    if name not in dataset or set(dataset[name].dims) != set(axes):
+        came = list(dataset[name].dims) if name in dataset else "no such variable"
+        raise fail(f"dataset, variable {name!r}", f"the dimensions {list(axes)}", came)
+    return np.asarray(dataset[name].transpose(*axes).values)
+
+
+def units_of(dataset: "xr.Dataset") -> dict[str, str]:
+    """The units that were given."""
+    time = {TIME: str(dataset[TIME].attrs["units"])} if "units" in dataset[TIME].attrs else {}
+    if "unit" not in dataset.coords:
+        return time
+    items = zip(names_of(dataset, "state"), dataset["unit"].values, strict=True)
+    return {state: str(unit) for state, unit in items if unit} | time

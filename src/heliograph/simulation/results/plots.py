@@ -1,0 +1,122 @@
+"""Results on axes of matplotlib, the user's or new ones: one for each state."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from heliograph.disk.quoting import in_figure
+from heliograph.numerics.check import check_count, fail
+
+if TYPE_CHECKING:  # an extra
+    from matplotlib.axes import Axes
+
+    from heliograph.simulation.results.record import Record
+    from heliograph.simulation.results.statistics_by_name import StatisticsByName
+
+
+def plot_record(
+    record: "Record",
+    node: str | None,
+    filters: Sequence[str] | None,
+    states: Sequence[str] | None,
+    axes: "Axes | Sequence[Axes] | None",
+    run: int,
+    sigmas: float,
+) -> "list[Axes]":
+    """Draw estimates within their claimed bands, and the truth."""
+    node, filters = _chosen(record.estimates, node, filters)
+    places = _places(states, record.states)
+    if record.runs is not None and check_count("run", run, 0) >= record.runs:
+        raise fail("run", f"one of {record.runs}, counted from 0", run)
+    which: Any = ... if record.runs is None else run
+    drawn = _axes(axes, len(places), record.time, record.units)
+    for item, i in zip(drawn, places, strict=True):
+        for number, name in enumerate(filters):
+            estimate, colour = record.estimates[node][name], _colour(number)
+            mean = np.asarray(estimate.mean)[which][..., i]
+            variance = np.asarray(estimate.covariance)[which][..., i, i]
+            item.plot(record.time, mean, color=colour, label=in_figure(name))
+            if estimate.claim != "none":
+                band = sigmas * np.sqrt(np.where(variance >= 0, variance, np.nan))
+                item.fill_between(record.time, mean - band, mean + band, color=colour, alpha=0.2, linewidth=0)
+        if record.truth is not None:
+            item.plot(record.time, record.truth[which][..., i], color="0.25", linestyle=":", label="truth")
+        item.set_ylabel(_with_unit(record.states[i], record.units))
+    drawn[0].legend(frameon=False)
+    return drawn
+
+
+def plot_statistics(
+    result: "StatisticsByName",
+    node: str | None,
+    filters: Sequence[str] | None,
+    states: Sequence[str] | None,
+    axes: "Axes | Sequence[Axes] | None",
+) -> "list[Axes]":
+    """Draw RMSE over time, and dashed the root of the mean claimed variance."""
+    node, filters = _chosen(result, node, filters)
+    places = _places(states, result.states)
+    time = np.arange(1.0, result[node][filters[0]].nees.shape[1] + 1)
+    drawn = _axes(axes, len(places), time, result.units)
+    for single, i in zip(drawn, places, strict=True):
+        for number, name in enumerate(filters):
+            item, colour = result[node][name], _colour(number)
+            claimed = item.claimed()[:, i, i]
+            single.plot(time, np.sqrt(item.actual()[:, i, i]), color=colour, label=in_figure(name))
+            single.plot(time, np.sqrt(np.where(claimed >= 0, claimed, np.nan)), color=colour, linestyle="--")
+        single.set_ylabel(f"RMSE of {_with_unit(result.states[i], result.units)}")
+    drawn[0].legend(frameon=False, title="dashed: claimed")
+    return drawn
+
+
+def _chosen(
+    known: Mapping[str, Mapping[str, object]], node: str | None, filters: Sequence[str] | None
+) -> tuple[str, list[str]]:
+    """The node and its filters that are drawn: the first with any, and all."""
+    there = [name for name, mine in known.items() if mine]
+    if not there or node not in (None, *there):
+        raise fail("node", f"one with filters: {', '.join(there) or 'there is none'}", repr(node))
+    chosen = there[0] if node is None else node
+    mine = list(known[chosen]) if filters is None else list(filters)
+    strange = [name for name in mine if name not in known[chosen]]
+    if strange or not mine:
+        raise fail(
+            f"filters of {chosen}", f"some of {', '.join(known[chosen])}", repr(strange[0]) if strange else "none"
+        )
+    return chosen, mine
+
+
+def _places(states: Sequence[str] | None, known: Sequence[str]) -> list[int]:
+    chosen = list(known) if states is None else [states] if isinstance(states, str) else list(states)
+    for name in chosen:
+        if name not in known:
+            raise fail("states", f"some of {', '.join(known)}", repr(name))
+    return [list(known).index(name) for name in chosen]
+
+
+def _axes(axes: object, count: int, time: np.ndarray, units: Mapping[str, str]) -> "list[Axes]":
+    """The given axes, or those of a new figure, one below the other."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        _, grid = plt.subplots(
+            count, 1, squeeze=False, sharex=True, layout="constrained", figsize=(6.4, 1 + 1.8 * count)
+        )
+        grid[-1, 0].set_xlabel("time" if time.dtype.kind == "M" else _with_unit("time", units))
+        return list(grid[:, 0])
+    result = list(np.ravel(np.asarray(axes, dtype=object)))
+    if len(result) != count:
+        raise fail("axes", f"{count}, one for each state", len(result))
+    return result
+
+
+def _colour(number: int) -> str:
+    """The next of the user's colours, as they are now."""
+    from matplotlib.colors import to_hex
+
+    return to_hex(f"C{number % 10}")
+
+
+def _with_unit(name: str, units: Mapping[str, str]) -> str:
+    return in_figure(f"{name} ({units[name]})" if name in units else name)

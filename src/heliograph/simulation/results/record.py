@@ -1,0 +1,188 @@
+"""What a run leaves behind: trajectories of the truth, of what was measured, and of estimates with their claims."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from heliograph.model.estimate import Estimate
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
+from heliograph.numerics.readable import readable
+from heliograph.simulation.centres.uplinks import SentReports, Uplink
+from heliograph.simulation.network import FUSED
+from heliograph.simulation.results.frames import record_frame, record_of_frame
+from heliograph.simulation.results.labelled import checked_units
+from heliograph.simulation.results.labelled_record import record_dataset, record_from
+from heliograph.simulation.results.plots import plot_record
+from heliograph.simulation.results.saved import Saved
+
+if TYPE_CHECKING:  # extras
+    import pandas as pd
+    import xarray as xr
+    from matplotlib.axes import Axes
+
+
+@readable
+@dataclass(frozen=True)
+class Record(Saved):
+    """Trajectories of one recording (no run axis) or of Monte Carlo runs (a leading run axis).
+
+    truth (run, time, n) or None; measurements[node] (run, time, received); estimates[node][filter] with mean
+    (run, time, n), covariance (run, time, n, n) and the claim; uplinks[name] of each fusion that has quantizers;
+    reports[name][node] of each fusion that hears reports.
+    time is in numbers, or dates (datetime64, UTC); units by the state's name, and of "time", where they were given.
+    smoothed: the same of estimates given later data too, where these were asked for: a record of its own to save.
+    """
+
+    time: np.ndarray
+    states: tuple[str, ...]
+    truth: np.ndarray | None
+    measurements: dict[str, np.ndarray]
+    estimates: dict[str, dict[str, Estimate]]
+    uplinks: dict[str, Uplink] = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    smoothed: "Record | None" = None
+    reports: dict[str, dict[str, SentReports]] = field(default_factory=dict)
+
+    @property
+    def runs(self) -> int | None:
+        """Number of Monte Carlo runs; None of one recording."""
+        means = [np.asarray(e.mean) for filters in self.estimates.values() for e in filters.values()]
+        every = [*means, *self.measurements.values(), *([] if self.truth is None else [self.truth])]
+        return len(every[0]) if every and every[0].ndim == 3 else None
+
+    def with_units(self, units: Mapping[str, str]) -> "Record":
+        """The same record with units, by the state's name and of "time", for files, tables and figures.
+
+        Raises:
+            ValueError: a name that is no state.
+        """
+        smoothed = None if self.smoothed is None else self.smoothed.with_units(units)
+        return replace(self, units=checked_units(units, self.states), smoothed=smoothed)
+
+    def errors(self, node: str, name: str) -> np.ndarray:
+        """x - xhat of one filter of one node.
+
+        Raises:
+            ValueError: a recording has no truth, or there is no such filter.
+        """
+        self.check_filter(node, name)
+        if self.truth is None:
+            raise fail("errors", "a record with the true state", "a recording without it")
+        result: np.ndarray = self.truth - np.asarray(self.estimates[node][name].mean)
+        return result
+
+    def check_filter(self, node: str, name: str) -> None:
+        """Raise ValueError unless the node has a filter of this name."""
+        if name not in self.estimates.get(node, {}):
+            known = [f"{element}/{of}" for element, filters in self.estimates.items() for of in filters]
+            raise fail("node and filter", f"one of {', '.join(known)}", f"{node}/{name}")
+
+    def rmse(self, node: str, name: str) -> dict[str, float]:
+        """Root mean square error of each state over runs and steps, in that state's unit.
+
+        Raises:
+            ValueError: a recording has no truth, or there is no such filter.
+        """
+        squares = self.errors(node, name).reshape(-1, len(self.states)) ** 2
+        return dict(zip(self.states, np.sqrt(squares.mean(axis=0)).tolist(), strict=True))
+
+    def to_xarray(self) -> "xr.Dataset":
+        """Labelled arrays: dimensions run, time, node, filter, state; `Record.from_xarray` has the record again.
+
+        Raises:
+            ModuleNotFoundError: without xarray (extra "results").
+        """
+        return record_dataset(self)
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> "Record":
+        """The record in a dataset that `to_xarray` made, or in a part of one that keeps its dimensions.
+
+        Raises:
+            ValueError: no such dataset.
+        """
+        return record_from(dataset)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """A table: a row for each time (and run), columns (node, filter, quantity, component, other).
+
+        Quantities: truth, measurement, mean, "covariance (CLAIM)" of component and other, saturated, symbols.
+
+        Raises:
+            ModuleNotFoundError: without pandas (extra "results").
+        """
+        return record_frame(self)
+
+    @classmethod
+    def from_pandas(cls, frame: "pd.DataFrame") -> "Record":
+        """The record in a table that `to_pandas` made; units are not in it.
+
+        Raises:
+            ValueError: no such table.
+        """
+        return record_of_frame(frame)
+
+    def apart(self) -> list[str]:
+        """What is saved apart."""
+        there = {"smoothed": self.smoothed is not None, "reports": bool(self.reports)}
+        return [name for name, is_there in there.items() if is_there]
+
+    def plot(
+        self,
+        node: str | None = None,
+        filters: Sequence[str] | None = None,
+        states: Sequence[str] | None = None,
+        axes: "Axes | Sequence[Axes] | None" = None,
+        run: int = 0,
+        sigmas: float = 2.0,
+    ) -> "list[Axes]":
+        """Draw estimates with bands of +-`sigmas` claimed deviations, and the truth where known: one axes a state.
+
+        `axes` to draw on, as many as states; new ones unless given. Of the first node, all its filters and all states
+        unless told; `run` of Monte Carlo runs.
+
+        Raises:
+            ValueError: a node, filter, state or run that there is not, another number of axes.
+            ModuleNotFoundError: without matplotlib (extra "report").
+        """
+        return plot_record(self, node, filters, states, axes, run, sigmas)
+
+    def failures(self) -> list[str]:
+        """One line for each filter whose estimate became non-finite or whose bound lost positive semidefiniteness.
+
+        The line names the node, the filter, the first step, and in how many runs; nothing is repaired. One line more
+        for each uplink that saturated. Smoothed estimates likewise, after "smoothed".
+        """
+        lines = [] if self.smoothed is None else [f"smoothed {line}" for line in self.smoothed.failures()]
+        for node, filters in self.estimates.items():
+            for name, estimate in filters.items():
+                bad = ~is_sound(estimate)
+                if np.any(bad):
+                    by_time = bad.reshape(-1, bad.shape[-1])
+                    step = int(np.argmax(by_time.any(axis=0)))
+                    runs = int(by_time.any(axis=1).sum())
+                    what = "mean" if estimate.claim == "none" else "covariance"
+                    lines.append(f"{node}/{name}: no valid {what} from step {step} in {runs} of {len(by_time)} runs")
+        for name, uplink in self.uplinks.items():
+            for i, node in enumerate(uplink.nodes):
+                saturated = uplink.saturated[..., i, :]
+                if np.any(saturated):
+                    counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
+                    lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
+        return lines
+
+
+def is_sound(estimate: Estimate) -> np.ndarray:
+    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+    if estimate.claim == "none":
+        return finite
+    bound = np.asarray(estimate.covariance)
+    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
+    safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
+    unit = own_units(safe)
+    correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
+    result: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
+    return result

@@ -1,0 +1,133 @@
+"""What is kept of simulated runs: reduced block by block inside the compiled scan."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Generic, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.model.estimate import Claim, Estimate
+from heliograph.numerics.check import fail
+from heliograph.numerics.module import Module
+from heliograph.numerics.readable import readable
+from heliograph.simulation.network import Network
+from heliograph.simulation.results.by_name import by_name, measurements_of, reports_by_name, uplinks_by_name
+from heliograph.simulation.results.record import Record
+
+Result = TypeVar("Result")
+
+
+@readable
+class OfStep(NamedTuple):
+    """What is kept of one step of one run: what is summed over runs, in which runs it was ever so, what is collected.
+
+    Numbers, truths, anything; each step's results are stacked, and of `ever` there is one for all steps.
+    """
+
+    sums: PyTree = ()
+    ever: PyTree = ()
+    collected: PyTree = ()
+
+
+@readable
+class AbstractReducer(Module, Generic[Result]):
+    """What is kept of a block of runs: a carry that is summed over blocks, and a part that is collected.
+
+    A block is {"truth": (run, time, n), "measurements": (run, time, node, received) of each group of nodes,
+    "estimates": of each kind an `Estimate` with mean (run, time, filter, node, n), "fused": estimates by name,
+    "uplinks"}, as `Network` has groups and kinds. What all runs share, a covariance say, has length 1 along the runs.
+    """
+
+    def initial(self, shapes: PyTree) -> PyTree:
+        """The carry before the first block; `shapes` are those of a block."""
+        raise NotImplementedError
+
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
+        """Next carry and collected part of a block, inside the compiled scan; runs that are not valid are padding."""
+        raise NotImplementedError
+
+    def of_step(self, step: PyTree) -> OfStep:
+        """What is kept of one step of one run, for native code, which has no blocks.
+
+        `step` is as a block without its axes of runs and time. A reducer that has none is computed by XLA.
+        """
+        raise NotImplementedError
+
+    def summed(self, sums: OfStep, common: OfStep, count: np.ndarray) -> PyTree:
+        """The carry after all runs, from sums by batch (time, ..., batch) over `count` runs each.
+
+        `common` says of each part whether it is the same in all runs: it stands in the sums as of one run, (time, ...).
+        """
+        return ()
+
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Result:
+        """Make the result; collected parts are joined along the run axis, without padding."""
+        raise NotImplementedError
+
+    def joined(self, results: Sequence[Result], network: Network) -> Result:
+        """The result of a network from those of its parts, each of some of its nodes with the same plant and runs."""
+        raise NotImplementedError
+
+    def others(self, result: Result, smoothed: Result, claims: Mapping[str, Mapping[str, Claim]]) -> Result:
+        """The result with the one made of smoothed estimates, whose claims these are, beside it.
+
+        Raises:
+            ValueError: a reducer that keeps nothing of smoothed estimates.
+        """
+        raise fail("keep", "Statistics() or Trajectories(), to keep smoothed estimates", type(self).__name__)
+
+
+class Trajectories(AbstractReducer[Record]):
+    """Keep everything; memory grows with the number of runs."""
+
+    def initial(self, shapes: PyTree) -> PyTree:
+        """Nothing is summed."""
+        return ()
+
+    def reduce(self, carry: PyTree, batch: PyTree, runs: jax.Array, valid: jax.Array) -> tuple[PyTree, PyTree]:
+        """Collect the block; each run gets its copy of what they share."""
+        return carry, jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (len(runs), *leaf.shape[1:])), batch)
+
+    def of_step(self, step: PyTree) -> OfStep:
+        """All of it."""
+        return OfStep(collected=step)
+
+    def finish(self, carry: PyTree, collected: PyTree, network: Network) -> Record:
+        """Make the record; its time is the step, starting at 1."""
+        time = np.arange(1, collected["truth"].shape[1] + 1, dtype=np.float64)
+        return trajectories_record(network, collected, time)
+
+    def joined(self, results: Sequence[Record], network: Network) -> Record:
+        """All nodes, in the network's order."""
+        measurements = {name: z for result in results for name, z in result.measurements.items()}
+        estimates = {name: filters for result in results for name, filters in result.estimates.items()}
+        return replace(
+            results[0],
+            measurements={name: measurements[name] for name in network.names},
+            estimates={name: estimates[name] for name in network.names},
+        )
+
+    def others(self, result: Record, smoothed: Record, claims: Mapping[str, Mapping[str, Claim]]) -> Record:
+        """As `Record.smoothed`, for the last steps if there are fewer."""
+        estimates = {
+            node: {name: replace(filter_, claim=claims[node][name]) for name, filter_ in filters.items()}
+            for node, filters in smoothed.estimates.items()
+        }
+        time = result.time[-len(smoothed.time) :]
+        return replace(result, smoothed=replace(smoothed, time=time, estimates=estimates))
+
+
+def trajectories_record(network: Network, batch: PyTree, time: np.ndarray) -> Record:
+    """Record from the scan's output; nodes in the network's order."""
+    measurements = measurements_of(network, batch["measurements"])
+    mean = by_name(network, batch, lambda e: np.asarray(e.mean), -3)
+    covariance = by_name(network, batch, lambda e: np.asarray(e.covariance), -4)
+    estimates = {
+        node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
+        for node, claims in network.claims().items()
+    }
+    uplinks, reports = uplinks_by_name(network, batch["uplinks"]), reports_by_name(network, batch["reports"])
+    return Record(time, network.states, batch["truth"], measurements, estimates, uplinks, reports=reports)

@@ -1,0 +1,130 @@
+"""Datasets in files: NetCDF or Zarr, whole or not at all, every name as it was."""
+
+import warnings
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+
+from heliograph.disk.output_file import check_output
+from heliograph.disk.output_folder import check_replaceable, whole_folder
+from heliograph.disk.quoting import from_file, in_file
+from heliograph.disk.whole_file import whole_file
+from heliograph.numerics.check import fail, file_path
+
+if TYPE_CHECKING:  # an extra
+    import xarray as xr
+
+NETCDF, ZARR = ".nc", ".zarr"
+MARK = "zarr.json"  # what a Zarr folder has, and nothing else
+
+
+class Saved:
+    """What a dataset holds, and so a file: `to_xarray` and `from_xarray` are its own, `save` and `open` follow."""
+
+    def to_xarray(self) -> "xr.Dataset":
+        """It as labelled arrays."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_xarray(cls, dataset: "xr.Dataset") -> Self:
+        """It again."""
+        raise NotImplementedError
+
+    def apart(self) -> list[str]:
+        """What is no part of the dataset, being results of their own."""
+        return []
+
+    def save(self, path: str | Path) -> None:
+        """Write it to a NetCDF file (.nc) or a Zarr folder (.zarr), whole or not at all; `open` has it again.
+
+        Warns of what has to be saved apart, such as `smoothed`.
+
+        Raises:
+            ValueError: another ending, or a place that cannot be written.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        save(self.to_xarray(), path)
+        for name in self.apart():
+            warnings.warn(f"{path}: without `{name}`, which is saved apart", stacklevel=2)
+
+    @classmethod
+    def open(cls, path: str | Path) -> Self:
+        """Read what `save` wrote.
+
+        Raises:
+            ValueError: no such file, or another one.
+            ModuleNotFoundError: without the extra "results", or "sweep" for Zarr.
+        """
+        return cls.from_xarray(opened(path))
+
+
+def save(dataset: "xr.Dataset", path: str | Path) -> None:
+    """Write a dataset to a NetCDF file or a Zarr folder, in the place of an earlier one.
+
+    Raises:
+        ValueError: another ending, a place that cannot be written or that holds something else.
+        ModuleNotFoundError: an extra is not installed.
+    """
+    path = file_path("file of results", path)
+    kind = _kind(path)
+    import_module(kind)
+    plain = dataset.assign_coords({name: (c.dims, _mapped(in_file, c), c.attrs) for name, c in _texts(dataset)})
+    encoding: Any = {name: {"_FillValue": None} for name in plain.variables if plain[name].dtype.kind == "f"}
+    if dataset["time"].dtype.kind == "M":
+        encoding["time"] = {"units": "nanoseconds since 1970-01-01", "dtype": "int64"}
+    if kind == "zarr":
+        check_replaceable(path, MARK)
+        with whole_folder(path) as folder, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that the format's text does not have strings or consolidation yet
+            plain.to_zarr(folder, mode="w", encoding=encoding)
+        return
+    check_output(path, (NETCDF,))
+    with whole_file(path) as partial:
+        plain.to_netcdf(partial, engine="h5netcdf", encoding=encoding)
+
+
+def opened(path: str | Path) -> "xr.Dataset":
+    """Read a dataset into memory.
+
+    Raises:
+        ValueError: no such file, or one that is none.
+        ModuleNotFoundError: an extra is not installed.
+    """
+    path = file_path("file of results", path)
+    kind = _kind(path)
+    import_module(kind)
+    import xarray as xr
+
+    if not path.exists():
+        raise fail(str(path), "a file of results", "nothing of that name")
+    try:
+        with xr.open_dataset(path, engine=kind, decode_timedelta=False) as result:
+            dataset = result.load()
+    except (OSError, ValueError, KeyError) as error:
+        raise fail(str(path), "a file of results that can be read", f"{type(error).__name__}: {error}") from None
+    return dataset.assign_coords({name: (c.dims, _mapped(from_file, c), c.attrs) for name, c in _texts(dataset)})
+
+
+def _kind(path: Path) -> str:
+    """The package that writes the format."""
+    kinds = {NETCDF: "h5netcdf", ZARR: "zarr"}
+    if path.suffix.lower() not in kinds:
+        raise fail(str(path), f"a name that ends in {' or '.join(kinds)}", repr(path.suffix))
+    return kinds[path.suffix.lower()]
+
+
+def _texts(dataset: "xr.Dataset") -> list[tuple[object, "xr.DataArray"]]:
+    """The coordinates that are names."""
+    return [(name, c) for name, c in dataset.coords.items() if c.dtype.kind in "OUT"]
+
+
+def _mapped(change: Callable[[str], str], names: "xr.DataArray") -> np.ndarray:
+    changed = [change(str(name)) for name in names.values]
+    if change is in_file:
+        return np.array(changed, dtype="U")
+    result = np.empty(len(changed), dtype=object)
+    result[:] = changed
+    return result

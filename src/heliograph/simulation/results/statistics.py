@@ -1,0 +1,238 @@
+"""Claimed against actual: RMSE, NEES and the worst direction of the error covariance, each with its uncertainty."""
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from heliograph.model.estimate import Claim, weakest
+from heliograph.numerics.check import fail, instance, items
+from heliograph.numerics.readable import readable
+from heliograph.simulation.centres.uplinks import Uplink
+
+BATCHES = 50  # runs are dealt to this many batches; the spread between batch means gives every standard error
+
+
+@readable
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Sums over the runs of each batch, for one filter of one node; every figure and its error follow from these.
+
+    count (batch,), pairs = sum e_i e_j and claimed_pairs = mean claimed covariance (batch, time, pair i <= j, row by
+    row), nees = sum e' B^-1 e (batch, time), claim as the filter states it; uplink of a fusion that has quantizers.
+    Where no covariance is claimed, what is made of covariances is NaN. failed (time,): in how many runs there was no
+    valid estimate at each step, failed_runs: at some step; then figures are NaN, and say so.
+    """
+
+    count: np.ndarray
+    pairs: np.ndarray
+    claimed_pairs: np.ndarray
+    nees: np.ndarray
+    claim: Claim
+    uplink: Uplink | None = None
+    failed: np.ndarray | None = None
+    failed_runs: int = 0
+
+    @property
+    def failure(self) -> str:
+        """What is wrong with the estimates, in the words of a record's failures; empty if nothing is."""
+        if not self.failed_runs:
+            return ""
+        what = "mean" if self.claim == "none" else "covariance"
+        step = 0 if self.failed is None else int(np.argmax(self.failed > 0))
+        return f"no valid {what} from step {step} in {self.failed_runs} of {self.runs} runs"
+
+    def _tell(self) -> None:
+        if self.failed_runs:
+            warnings.warn(self.failure, stacklevel=3)
+
+    @property
+    def outer(self) -> np.ndarray:
+        """Sums of e e', (batch, time, n, n)."""
+        return matrices(self.pairs)
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """Sums of claimed covariances, (batch, time, n, n)."""
+        result: np.ndarray = matrices(self.claimed_pairs) * self.count[:, None, None, None]
+        return result
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        return int(self.count.sum())
+
+    def actual(self) -> np.ndarray:
+        """E[e e'] over the runs, (time, n, n)."""
+        result: np.ndarray = self.outer.sum(axis=0) / self.runs
+        return result
+
+    def claimed(self) -> np.ndarray:
+        """Mean claimed covariance, (time, n, n)."""
+        result: np.ndarray = self.covariance.sum(axis=0) / self.runs
+        return result
+
+    def mean_trace(self) -> float:
+        """Mean over time of the trace of the claimed covariance."""
+        self._tell()
+        return float(np.trace(self.claimed(), axis1=-2, axis2=-1).mean())
+
+    def rmse(self) -> tuple[float, float]:
+        """Root of the mean over runs and steps of the squared error summed over the state, and its standard error.
+
+        The error of a root: se(mse) / (2 rmse), with se(mse) from the batch means.
+        """
+        self._tell()
+        squared = np.trace(self.outer, axis1=-2, axis2=-1).mean(axis=1)
+        return _root_mean(squared, self.count)
+
+    def rmse_by_state(self) -> tuple[np.ndarray, np.ndarray]:
+        """Root mean squared error of each state over runs and steps, and its standard error: (n,), (n,)."""
+        self._tell()
+        squared = np.diagonal(self.outer, axis1=-2, axis2=-1).mean(axis=1)
+        results = [_root_mean(squared[:, i], self.count) for i in range(squared.shape[1])]
+        return np.array([root for root, _ in results]), np.array([error for _, error in results])
+
+    def deviation_by_state(self) -> np.ndarray:
+        """Root of the mean over runs and steps of each state's claimed variance, (n,)."""
+        self._tell()
+        variance = np.diagonal(self.claimed(), axis1=-2, axis2=-1).mean(axis=0)
+        return np.sqrt(np.where(variance >= 0, variance, np.nan))
+
+    def rmse_over_time(self) -> np.ndarray:
+        """Root mean squared error at each step, (time,)."""
+        self._tell()
+        result: np.ndarray = np.sqrt(np.trace(self.actual(), axis1=-2, axis2=-1))
+        return result
+
+    def nees_per_dimension(self, confidence: float = 0.95) -> tuple[float, float, float]:
+        """Mean over runs and steps of e' B^-1 e / n (1 if the claim is exact), with its confidence interval.
+
+        The interval is from the batch means, so correlation over time within a run does no harm.
+        """
+        self._tell()
+        n = self.outer.shape[-1]
+        mean, error = _batch_mean(self.nees.mean(axis=1) / n, self.count)
+        width = float(stdtrit(max(int(np.count_nonzero(self.count)) - 1, 1), (1 + confidence) / 2)) * error
+        return mean, mean - width, mean + width
+
+    def worst_direction(self) -> "WorstDirection":
+        """Largest ratio d' E[e e'] d / d' E[B] d over steps and directions d, judged on runs that did not choose d.
+
+        The even batches choose step and direction, the odd batches measure the ratio there, and the reverse; so the
+        ratio is not biased by the search. `z` is the excess over 1 in standard errors. NaN where some error or bound is
+        not finite.
+
+        Raises:
+            ValueError: fewer than 4 runs.
+        """
+        if self.runs < 4:
+            raise fail("worst direction", "at least 4 runs", self.runs)
+        broken = ~(np.isfinite(self.outer) & np.isfinite(self.covariance)).all(axis=(0, 2, 3))
+        self._tell()
+        if np.any(broken):
+            none_at_all = np.full(self.outer.shape[-1], np.nan)
+            return WorstDirection(np.nan, np.nan, int(np.argmax(broken)), none_at_all)
+        halves = [self._ratio_on(np.arange(BATCHES) % 2 == side) for side in (0, 1)]
+        return max(halves, key=lambda w: w.ratio)
+
+    def _ratio_on(self, held_out: np.ndarray) -> "WorstDirection":
+        chosen = ~held_out & (self.count > 0)
+        actual, claimed = self.outer[chosen].sum(axis=0), self.covariance[chosen].sum(axis=0)
+        values, directions = _generalised_eigen(actual, claimed)
+        step = int(np.argmax(values[:, -1]))
+        d = directions[step, :, -1]
+        judged = held_out & (self.count > 0)
+        error = np.einsum("i,bij,j->b", d, self.outer[judged, step], d)
+        bound = np.einsum("i,bij,j->b", d, self.covariance[judged, step], d)
+        ratio = float(error.sum() / bound.sum())
+        # Linearised error of a ratio of means: residuals error - ratio bound have mean zero over the batches.
+        weights = self.count[judged]
+        _, residual_error = _batch_mean(error - ratio * bound, weights)
+        scale = bound.sum() / weights.sum()
+        standard_error = float(residual_error / scale)
+        return WorstDirection(ratio, standard_error, step, d / np.linalg.norm(d))
+
+
+def matrices(pairs: np.ndarray) -> np.ndarray:
+    """Symmetric matrices (..., n, n) from their entries i <= j, row by row."""
+    n = (math.isqrt(8 * pairs.shape[-1] + 1) - 1) // 2
+    place = np.zeros((n, n), dtype=int)
+    place[np.triu_indices(n)] = np.arange(pairs.shape[-1])
+    return np.asarray(pairs[..., np.maximum(place, place.T)])
+
+
+def pool(statistics: Sequence[ErrorStatistics]) -> ErrorStatistics:
+    """Statistics of several nodes together, their steps joined: means run over nodes as over steps.
+
+    Runs stay the unit of independence, so errors that nodes share are counted as shared.
+
+    Raises:
+        ValueError: nothing to pool, or statistics of different runs.
+    """
+    parts = items("pooled statistics", statistics, "ErrorStatistics")
+    for part in parts:
+        instance("pooled statistics", part, ErrorStatistics, "ErrorStatistics")
+    if not parts or any(not np.array_equal(s.count, parts[0].count) for s in parts):
+        raise fail("pooled statistics", "statistics of the same runs", f"{len(parts)} that differ")
+    return ErrorStatistics(
+        parts[0].count,
+        np.concatenate([s.pairs for s in parts], axis=1),
+        np.concatenate([s.claimed_pairs for s in parts], axis=1),
+        np.concatenate([s.nees for s in parts], axis=1),
+        weakest([s.claim for s in parts]),
+        failed=np.concatenate([np.zeros(s.nees.shape[1]) if s.failed is None else s.failed for s in parts]),
+        failed_runs=max(s.failed_runs for s in parts),
+    )
+
+
+@readable
+@dataclass(frozen=True)
+class WorstDirection:
+    """Where the actual covariance exceeds the claimed one most: ratio, its standard error, step and unit direction."""
+
+    ratio: float
+    standard_error: float
+    step: int
+    direction: np.ndarray
+
+    @property
+    def z(self) -> float:
+        """Excess of the ratio over 1 in standard errors."""
+        return (self.ratio - 1) / self.standard_error if self.standard_error else 0.0
+
+
+def _batch_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+    """Mean of per-run values from batch sums, and its standard error from the scatter of batch means."""
+    used = count > 0
+    sums, count = sums[used], count[used]
+    mean = float(sums.sum() / count.sum())
+    groups = len(count)
+    if groups < 2:
+        return mean, float("nan")
+    scatter = np.sum((sums - mean * count) ** 2) * groups / (groups - 1)
+    return mean, float(np.sqrt(scatter) / count.sum())
+
+
+def _root_mean(sums: np.ndarray, count: np.ndarray) -> tuple[float, float]:
+    """Root of that mean, and its standard error."""
+    mean, error = _batch_mean(sums, count)
+    root = float(np.sqrt(mean))
+    return root, error / (2 * root) if root else 0.0
+
+
+def _generalised_eigen(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Eigenvalues and vectors of A d = value B d for stacks of symmetric A and positive semidefinite B.
+
+    In units of each component's own B_ii, and where that is zero of its A_ii.
+    """
+    local = [np.sqrt(np.maximum(np.diagonal(m, axis1=-2, axis2=-1), 0.0)) for m in (b, a)]
+    unit = np.where(local[0] > 0, local[0], np.where(local[1] > 0, local[1], 1.0))
+    both = unit[..., :, None] * unit[..., None, :]
+    values, vectors = np.linalg.eigh(b / both)
+    root = vectors / np.sqrt(np.maximum(values, np.finfo(float).eps))[..., None, :]
+    inner, rotated = np.linalg.eigh(np.swapaxes(root, -1, -2) @ (a / both) @ root)
+    return inner, (root @ rotated) / unit[..., None]

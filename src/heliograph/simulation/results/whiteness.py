@@ -1,0 +1,152 @@
+"""Whether a filter's innovations remember: what a link with memory leaves behind in a filter that assumes none."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+from scipy.linalg import toeplitz
+
+from heliograph.filters.base import AbstractFilter
+from heliograph.numerics.check import array, check_count, fail, instance
+from heliograph.numerics.float64 import compiled
+from heliograph.numerics.readable import readable
+from heliograph.numerics.small_matrix import whiten
+from heliograph.numerics.types import Array, ArrayLike, Float, PyTree
+from heliograph.simulation.likelihood import rows
+
+
+@readable
+@dataclass(frozen=True)
+class MemoryTest:
+    """Correlation of innovations at lags 1, 2, ..., its standard error, and what the data say of memory and its cost.
+
+    p_value: of lag 1 if there were none. predictable: what it costs, the share of the innovations' variance that those
+    before them foretell; 0 for the best linear filter. power: mean square of the innovations over what the filter
+    claims, 1 where the claim holds (NaN where no covariance is known), with its standard error.
+
+    Shapes: correlation (lags,), standard_error (lags,).
+    """
+
+    correlation: Float[np.ndarray, " lags"]
+    standard_error: Float[np.ndarray, " lags"]
+    p_value: float
+    predictable: float
+    power: float
+    power_error: float
+
+    @property
+    def result(self) -> bool:
+        """Whether innovations one step apart are correlated, at 1 %."""
+        return self.p_value < 0.01
+
+
+def memory_test(
+    data: ArrayLike, filter: AbstractFilter | None = None, inputs: ArrayLike | None = None, lags: int = 10
+) -> MemoryTest:
+    """Tell from data whether links remember what a filter assumes they forget.
+
+    `data` are the measurements that the filter hears, or without a filter innovations; NaN did not arrive. The best
+    linear filter's innovations are uncorrelated in time, and not independent: bursts come and go with the modes.
+    Standard errors therefore allow for correlation among the products w_k w_(k+t) (Newey and West).
+
+    Shapes: data (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance, too few steps for the lags,
+            innovations that are all zero or missing.
+    Source: Ljung and Box (1978) for white innovations; Newey and West (1987) for the standard errors.
+    """
+    check_count("lags", lags)
+    white = _standardised(data) if filter is None else whitened_innovations(data, filter, inputs)
+    return memory_of(white, lags, claimed=filter is not None)
+
+
+def memory_of(white: Float[np.ndarray, "steps m"], lags: int, claimed: bool) -> MemoryTest:
+    """What whitened innovations say; of their power alone where they are in units of what a filter claims.
+
+    Raises:
+        ValueError: too few steps for the lags, nothing but zeros.
+    """
+    if len(white) < 10 * lags:
+        raise fail("data", f"at least {10 * lags} steps for {lags} lags", len(white))
+    if not np.any(np.nan_to_num(white)):
+        raise fail("data", "innovations of which some are not zero", "nothing but zeros and missing ones")
+    size, size_error = _mean(_by_step(white**2))
+    parts = [_mean(_by_step(white[:-t] * white[t:])) for t in range(1, lags + 1)]
+    correlation, error = (np.array(column) / size for column in zip(*parts, strict=True))
+    p_value = float(2 * stats.norm.sf(abs(correlation[0]) / error[0])) if error[0] > 0 else float(correlation[0] == 0)
+    share = float(correlation @ np.linalg.lstsq(toeplitz([1.0, *correlation[:-1]]), correlation)[0])
+    power = (size, size_error) if claimed else (np.nan, np.nan)
+    return MemoryTest(correlation, error, p_value, share, *power)
+
+
+def _standardised(data: ArrayLike) -> Float[np.ndarray, "steps m"]:
+    """Innovations of unknown covariance, each component in units of its deviation."""
+    values = array("innovations", data, (None,) * max(np.ndim(np.asarray(data)), 1), missing=True)
+    value = values[:, None] if values.ndim == 1 else values
+    largest = np.max(np.nan_to_num(np.abs(value)), axis=0, initial=0.0)  # before the square, which may overflow
+    value = value / np.where(largest > 0, largest, 1.0)
+    deviation = np.sqrt(np.nansum(value**2, axis=0) / np.maximum(np.sum(~np.isnan(value), axis=0), 1))
+    return np.asarray(value / np.where(deviation > 0, deviation, 1.0))
+
+
+def whitened_innovations(
+    data: ArrayLike, filter: AbstractFilter, inputs: ArrayLike | None = None
+) -> Float[np.ndarray, "steps m"]:
+    """Innovations of a recording in units of what the filter claims: white and of variance 1 where the claim holds.
+
+    L^-1 (z - E z), where L L' is the claimed covariance; NaN where nothing arrived, or nothing new could.
+
+    Shapes: data (steps, received), inputs (steps, inputs).
+
+    Raises:
+        ValueError: data or inputs of the wrong shape, a filter that claims no covariance.
+    """
+    instance("filter", filter, AbstractFilter, "a filter, such as kalman_filter(...)")
+    item = filter
+    if item.claim == "none":
+        raise fail("filter", "one that claims a covariance", "one that claims none")
+    z = rows("measurements", data, None, item.received, missing=True)
+    given = np.zeros((len(z), 0)) if inputs is None else inputs
+    return np.asarray(innovations_of(item, z, rows("inputs", given, len(z), len(item.inputs), missing=False))[1])
+
+
+def _by_step(parts: Float[np.ndarray, "steps m"]) -> Float[np.ndarray, " steps"]:
+    """Mean over the components that are there; NaN where none is."""
+    there = np.sum(~np.isnan(parts), axis=1)
+    return np.asarray(np.where(there > 0, np.nansum(parts, axis=1) / np.maximum(there, 1), np.nan))
+
+
+def _mean(values: Float[np.ndarray, " n"]) -> tuple[float, float]:
+    """Mean of what is not NaN, and its standard error by Bartlett's weights over the cube root of the length."""
+    there = ~np.isnan(values)
+    count = max(int(there.sum()), 1)
+    mean = float(values[there].sum() / count)
+    apart = np.where(there, values - mean, 0.0)
+    width = int(np.ceil(len(values) ** (1 / 3)))
+    terms = [apart @ apart, *(2 * (1 - t / (width + 1)) * (apart[:-t] @ apart[t:]) for t in range(1, width + 1))]
+    return mean, float(np.sqrt(max(sum(terms), 0.0)) / count)
+
+
+@compiled
+def innovations_of(
+    item: AbstractFilter, z: Float[Array, "steps m"], u: Float[Array, "steps inputs"]
+) -> tuple[jax.Array, jax.Array]:
+    """Log-likelihood of each step, and L^-1 (z - E z) with L L' the innovation's covariance, by component.
+
+    NaN where it did not arrive, or the components before it determine it.
+    """
+
+    def body(state: PyTree, row: tuple[jax.Array, ...]) -> tuple[PyTree, tuple[jax.Array, jax.Array]]:
+        k, z_k, u_k = row
+        after, innovation = item.correct(item.predict(state, u_k, k), z_k, k)
+        there = ~jnp.isnan(innovation.value)
+        covariance = jnp.where(there[:, None] & there, innovation.covariance, jnp.diag(jnp.where(there, 0.0, 1.0)))
+        white = whiten(covariance, jnp.where(there, innovation.value, 0.0))
+        return after, (jnp.asarray(innovation.log_likelihood), jnp.where(there, white, jnp.nan))
+
+    start = jax.tree.map(jnp.asarray, item.init())
+    result = jax.lax.scan(body, start, (jnp.arange(len(z)), jnp.asarray(z), jnp.asarray(u)))[1]
+    return result[0], result[1]

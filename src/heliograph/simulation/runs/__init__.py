@@ -1,0 +1,1 @@
+"""Engines that simulate many runs: native code, or XLA in lanes."""

@@ -1,0 +1,103 @@
+"""Blocks of runs dealt to lanes that work side by side: threads on a processor, one vectorised axis on other devices.
+
+Block j goes to lane j mod LANES whatever the number of cores, and each lane sums its blocks in order, so that neither
+chunks nor cores change a bit of a result. Several devices share the lanes by JAX's own sharding.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial, reduce
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import PyTree
+
+from heliograph.numerics.float64 import to_numpy
+
+BLOCK = 32  # runs simulated side by side: wide enough for vector units, small enough for the cache
+LANES = 8  # of a processor: at most this many cores are used
+WIDE_LANES = 256  # of other devices, which want thousands of runs at once
+
+Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs and a carry -> carry, what is kept
+
+
+def one_processor() -> bool:
+    """Whether JAX sees nothing but a processor."""
+    return len(jax.devices()) == 1 and jax.default_backend() == "cpu"
+
+
+class Lanes:
+    """The carries of all lanes, and how to advance them over the blocks of a chunk.
+
+    `alone` advances one lane over blocks (count, BLOCK) of runs, `together` all lanes at once, with a leading axis.
+    """
+
+    def __init__(self, alone: Advance, together: Advance, start: Callable[[], PyTree], first_run: int):
+        self.alone, self.together, self.start, self.first_run = alone, together, start, first_run
+        devices, processor = len(jax.devices()), jax.default_backend() == "cpu"
+        self.wide = devices > 1 or not processor
+        self.count = devices * -(-(LANES if processor else WIDE_LANES) // devices)
+        self.carries: PyTree = [None] * self.count  # until a lane is used
+        self.pool: ThreadPoolExecutor | None = None
+
+    def blocks_of(self, runs: int) -> int:
+        """Blocks of a chunk that holds this many runs at least: fewer than there are lanes, or a multiple of them."""
+        blocks = -(-runs // BLOCK)
+        if blocks < self.count and not self.wide:
+            return blocks
+        return self.count * -(-blocks // self.count)
+
+    def advance(self, start: int, blocks: int) -> PyTree:
+        """Simulate `blocks` blocks from number `start` on; returns what is kept of them, run by run, on the host."""
+        numbers = np.arange(start, start + blocks)
+        runs = self.first_run + BLOCK * numbers[:, None] + np.arange(BLOCK)
+        lanes = [np.flatnonzero(numbers % self.count == lane) for lane in range(self.count)]
+        recorded = self._vectorised(runs, lanes) if self.wide else self._threads(runs, lanes)
+        used = np.concatenate(lanes)
+        return jax.tree.map(lambda *parts: _in_order(np.concatenate(parts), used), *recorded)
+
+    def _threads(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+        def go(lane: int) -> PyTree:
+            with jax.enable_x64(True):
+                carry = self.start() if self.carries[lane] is None else self.carries[lane]
+                self.carries[lane], recorded = self.alone(runs[lanes[lane]], carry)
+                return to_numpy(recorded)
+
+        if self.pool is None:
+            self.pool = ThreadPoolExecutor(min(self.count, os.cpu_count() or 1))
+        return list(self.pool.map(go, [lane for lane, mine in enumerate(lanes) if len(mine)]))
+
+    def _vectorised(self, runs: np.ndarray, lanes: list[np.ndarray]) -> list[PyTree]:
+        shared = NamedSharding(Mesh(np.array(jax.devices()), ("lane",)), PartitionSpec("lane"))  # type: ignore[no-untyped-call]
+        if isinstance(self.carries, list):
+            every = jax.tree.map(lambda leaf: np.stack([leaf] * self.count), to_numpy(self.start()))
+            self.carries = jax.device_put(every, shared)
+        dealt = jax.device_put(np.stack([runs[mine] for mine in lanes]), shared)
+        self.carries, recorded = self.together(dealt, self.carries)
+        on_host = to_numpy(recorded)
+        return [jax.tree.map(lambda leaf: leaf[lane], on_host) for lane in range(self.count)]  # noqa: B023
+
+    def total(self) -> PyTree:
+        """The lanes' carries added up, in their order."""
+        if self.pool is not None:
+            self.pool.shutdown()
+        if isinstance(self.carries, list):
+            with jax.enable_x64(True):
+                return to_numpy(reduce(_plus, [carry for carry in self.carries if carry is not None]))
+        return jax.tree.map(lambda leaf: reduce(np.add, np.asarray(leaf)), self.carries)
+
+
+@partial(jax.jit, donate_argnums=0)
+def _plus(total: PyTree, more: PyTree) -> PyTree:
+    """In place: of many nodes these are hundreds of megabytes, which take longer to ask for than to add."""
+    return jax.tree.map(jnp.add, total, more)
+
+
+def _in_order(recorded: np.ndarray, used: np.ndarray) -> np.ndarray:
+    """Blocks (lane by lane, BLOCK, ...) as runs in the order of the blocks."""
+    result = np.empty_like(recorded)
+    result[used] = recorded
+    return result.reshape(-1, *recorded.shape[2:])

@@ -1,0 +1,85 @@
+"""A computation on one run, done for many: side by side in blocks that stay in the cache, on all cores."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+
+from heliograph.codegen.engine import chosen
+from heliograph.numerics.check import check_count, fail, shown
+from heliograph.numerics.compiler import fully_optimised
+from heliograph.numerics.float64 import to_numpy
+from heliograph.numerics.types import PyTree
+
+WIDTH = 128  # runs side by side: what a hundred steps of them retain for a sweep back stays near the core
+
+
+def over_runs(function: Callable[..., PyTree], *arrays: PyTree, width: int = WIDTH) -> PyTree:
+    """Apply a function of one run's arrays to many runs: the leading axis of every array and of every result.
+
+    The function is written with jax.numpy and may step filters under `jax.lax.scan`. It is compiled once for a function
+    and its shapes, so define it once. NumPy arrays come back, and each core takes its share of the runs. Native code
+    computes them, or XLA, `width` runs side by side, what native code does not take (`heliograph.codegen.engine_of`
+    says which).
+
+    Raises:
+        ValueError: no arrays, or arrays with different numbers of runs.
+    """
+    if not callable(function):
+        raise fail("function over runs", "a function of one run's arrays", shown(function))
+    check_count("width", width)
+    values = [_numbers(a) for a in arrays]
+    if not values or any(a.ndim == 0 or len(a) != len(values[0]) or not a.size for a in values):
+        raise fail("arrays over runs", "one leading axis of runs, at least one", [np.shape(a) for a in values])
+    choice = chosen(function, values, [True] * len(values))
+    return choice.results() if choice.code is not None else _by_xla(function, values, width)
+
+
+def _by_xla(function: Callable[..., PyTree], values: list[np.ndarray], width: int) -> PyTree:
+    """The same as a program of XLA, `width` runs side by side."""
+    runs, cores = len(values[0]), os.cpu_count() or 1
+    width = min(width, runs)
+    share = -(-runs // (width * cores))  # blocks of each core
+    width = -(-runs // (share * cores))  # no wider than it need be: few runs are left to fill up
+
+    def work(core: int) -> PyTree:
+        first, last = core * share * width, min((core + 1) * share * width, runs)
+        parts = [_filled(a[first:last], share * width).reshape(share, width, *a.shape[1:]) for a in values]
+        with jax.enable_x64(True):
+            result = to_numpy(_blocks(function, parts))
+        return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[: last - first], result)
+
+    with ThreadPoolExecutor(cores) as pool:
+        result = list(pool.map(work, range(-(-runs // (share * width)))))
+        whole = jax.tree.map(lambda leaf: np.empty((runs, *leaf.shape[1:]), leaf.dtype), result[0])
+
+        def place(core: int) -> None:  # copied by all cores too: large results take their time
+            into, part = jax.tree.leaves(whole), jax.tree.leaves(result[core])
+            for target, leaf in zip(into, part, strict=True):
+                target[core * share * width :][: len(leaf)] = leaf
+
+        list(pool.map(place, range(len(result))))
+    return whole
+
+
+def _numbers(value: PyTree) -> np.ndarray:
+    try:
+        values = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        raise fail("arrays over runs", "arrays of numbers", shown(value)) from None
+    if values.dtype.kind not in "biufc":
+        raise fail("arrays over runs", "arrays of numbers", shown(value))
+    return values
+
+
+def _filled(part: np.ndarray, count: int) -> np.ndarray:
+    """As many runs as the program wants; the last one again where there are fewer."""
+    missing = count - len(part)
+    return part if not missing else np.concatenate([part, np.repeat(part[-1:], missing, axis=0)])
+
+
+@fully_optimised
+def _blocks(function: Callable[..., PyTree], parts: list[PyTree]) -> PyTree:
+    return jax.lax.map(lambda block: jax.vmap(function)(*block), parts)

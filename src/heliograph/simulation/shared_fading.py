@@ -1,0 +1,76 @@
+"""Channels in a run: their draws, and those of the memories that several of them may share."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+
+from heliograph.model.channel import Channel
+from heliograph.model.over_time import at
+from heliograph.random_affine.base import AbstractRandomAffine, advance, apply, begin, distinct, memories
+from heliograph.random_affine.delay import sent
+from heliograph.simulation.draws import (
+    CHANNEL,
+    CHANNEL_START,
+    MEMORY,
+    MEMORY_START,
+    Number,
+    checksum,
+    draw_key,
+)
+
+Places = jax.Array | np.ndarray | tuple[()]  # uint32, one for each memory of a channel
+
+
+def memory_places(channels: Mapping[str, Channel]) -> dict[str, np.ndarray]:
+    """The places of each channel's memories among all keys: by their names, or by the first channel that holds them.
+
+    Raises:
+        ValueError: one name for memories that differ.
+    """
+    held = {name: memories(channel) for name, channel in channels.items()}
+    distinct(memory for item in held.values() for memory in item.values())
+    results: dict[str, int] = {}
+    for name, item in held.items():
+        for i, (identity, memory) in enumerate(item.items()):
+            results.setdefault(identity, checksum(f"memory {i} of {name}" if memory.name is None else identity))
+    return {name: np.array([results[identity] for identity in item], dtype=np.uint32) for name, item in held.items()}
+
+
+class Late(NamedTuple):
+    """A late channel's own state, and what was sent before, the last first."""
+
+    channel: PyTree
+    line: jax.Array
+
+
+def start(channel: Channel, key: jax.Array, place: Number, shared: Places) -> PyTree:
+    """A channel's state before the first step."""
+    now, local = at(channel, 0), draw_key(key, 0, place, CHANNEL_START)
+    keys = [draw_key(key, 0, memory, MEMORY_START) for memory in shared]
+    state = begin(now, local, keys) if len(shared) else now.init(local)
+    return Late(state, jnp.zeros(now.past * sent(now))) if now.past else state
+
+
+def deliver(
+    channel: Channel, state: PyTree, y: jax.Array, key: jax.Array, k: jax.Array, place: Number, shared: Places
+) -> tuple[PyTree, jax.Array]:
+    """The state that follows, and what the channel makes of y at step k; a late one also of what was sent before."""
+    now, local = at(channel, k), draw_key(key, k, place, CHANNEL)
+    if now.past:
+        line = jnp.concatenate([y, state.line])
+        after, h = _drawn(now, state.channel, key, k, local, shared)
+        return Late(after, line[: -len(y)]), apply(h, line)
+    state, h = _drawn(now, state, key, k, local, shared)
+    return state, apply(h, y)
+
+
+def _drawn(
+    now: AbstractRandomAffine, state: PyTree, key: jax.Array, k: jax.Array, local: jax.Array, shared: Places
+) -> tuple[PyTree, jax.Array]:
+    if not len(shared):
+        return now.draw(state, local)
+    return advance(now, state, local, [draw_key(key, k, memory, MEMORY) for memory in shared])

@@ -1,0 +1,219 @@
+"""Precise sensors: what is left of a wide prior keeps its digits, against rational arithmetic."""
+
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import heliograph as hg
+
+A, C = [[1, 1], [0, 1]], [[1, 0]]
+STEPS = 4
+
+
+def exact(transition, noise, measured, start):
+    """Diagonals of P_1 ... P_STEPS in fractions, for one measured component with this variance."""
+    a, q, p = ([[Fraction(x) for x in row] for row in m] for m in (transition, noise, start))
+    r, results = Fraction(measured), []
+    for _ in range(STEPS):
+        moved = [[sum(a[i][k] * p[k][j] for k in range(2)) for j in range(2)] for i in range(2)]
+        p = [[sum(moved[i][k] * a[j][k] for k in range(2)) + q[i][j] for j in range(2)] for i in range(2)]
+        total = p[0][0] + r
+        p = [[p[i][j] - p[i][0] * p[0][j] / total for j in range(2)] for i in range(2)]
+        results.append([float(p[0][0]), float(p[1][1])])
+    return np.array(results)
+
+
+def claimed(item):
+    """The same of a filter."""
+    state, results = item.init(), []
+    for k in range(STEPS):
+        state, _ = item.correct(item.predict(state, (), k), [0.0], k)
+        results.append(np.diag(np.asarray(item.estimate(state).covariance)))
+    return np.array(results)
+
+
+@pytest.mark.parametrize(("wide", "precise"), [(1e4, 1e-9), (1e8, 1e-12), (1e6, 1e-3), (1e2, 1.0)])
+def test_a_precise_sensor_leaves_as_much_as_it_says(wide, precise):
+    """A difference P - K C P is 1e-16 P wrong: 7e4 times what is left in the second case.
+
+    What remains is the rounding of a prior with correlation 1 - 1e-11, of 1e-16 / 1e-11 at the second step.
+    """
+    start, noise = [[wide, 0.0], [0.0, wide / 10]], [[1e-3, 2e-3], [2e-3, 5e-3]]
+    plant, sensor = hg.LinearPlant(A, noise, [0.0, 0.0], start), hg.LinearSensor(C, [[precise]])
+    expected = exact(A, noise, precise, start)
+    for item in (hg.kalman_filter(plant, sensor), hg.linear_filter(plant, sensor, hg.perfect(1))):
+        np.testing.assert_allclose(claimed(item), expected, rtol=2e-5)
+    system = hg.linear.lifted_system(plant, sensor, hg.perfect(1), 1, STEPS)
+    covariance = hg.linear.lmmse(system).gains.covariance
+    np.testing.assert_allclose(np.diagonal(covariance, axis1=1, axis2=2), expected, rtol=2e-5)
+
+
+def test_a_run_takes_the_form_that_its_own_numbers_ask_for():
+    """Beside a precise one or alone, a run's bits are the same."""
+    plant = hg.LinearPlant(A, 0.01, [0.0, 0.0], [[1e4, 0.0], [0.0, 1.0]])
+
+    def variance(noise):
+        item = hg.linear_filter(plant, hg.LinearSensor(C, noise), hg.perfect(1))
+        return item.correct(item.predict(item.init()), np.zeros(1))[0].covariance
+
+    with jax.enable_x64(True):
+        together = jax.jit(jax.vmap(variance))(np.array([[[1e-9]], [[1.0]]]))
+        apart = jax.jit(jax.vmap(variance))(np.array([[[1.0]], [[1.0]]]))
+    np.testing.assert_array_equal(together[1], apart[1])
+    assert together[0][0, 0] == pytest.approx(1e-9, rel=1e-6)
+
+
+def test_derivatives_pass_before_and_after_runs_are_put_side_by_side():
+    """The gradient of a sum over runs is each run's gradient, to rounding."""
+    item = hg.linear_filter(hg.LinearPlant(A, 0.01, [0.0, 0.0], 1.0), hg.LinearSensor(C, 0.1), hg.perfect(1))
+
+    def moved(z):
+        return item.correct(item.predict(item.init()), z)[0].mean.sum()
+
+    z = np.array([[1.0], [2.0]])
+    with jax.enable_x64(True):
+        together = jax.jit(jax.grad(lambda z: jax.vmap(moved)(z).sum()))(z)
+        items = jax.jit(jax.vmap(jax.grad(moved)))(z)
+    np.testing.assert_allclose(together, items, rtol=1e-14)
+
+
+WIDE, PRECISE = 10.0 ** np.arange(0, 15, 2), 10.0 ** np.arange(-14, 1, 2)
+
+
+def test_what_rounding_leaves_of_a_variance_is_right_or_is_said_to_be_lost():
+    """A wide prior ties position and velocity to the last digit: after the second position no digit may be left.
+
+    A variance that is told is right to a twentieth; where the sensor's is 1e-11 of the prior's, it is told to 1e-3.
+    """
+    noise = [[1e-9, 0.0], [0.0, 1e-9]]
+    lost = 0
+    for wide in WIDE:
+        plant = hg.LinearPlant(A, noise, [0.0, 0.0], wide)
+        for precise in PRECISE:
+            expected = exact(A, noise, precise, [[wide, 0.0], [0.0, wide]])
+            item = hg.linear_filter(plant, hg.LinearSensor(C, precise), hg.perfect(1))
+            result = claimed(item)
+            if precise + 1e-9 >= 1e-11 * wide:
+                np.testing.assert_allclose(result, expected, rtol=1e-3, err_msg=f"{wide} {precise}")
+            known = ~np.isnan(result)
+            lost += np.sum(~known)
+            np.testing.assert_allclose(result[known], expected[known], rtol=0.05, err_msg=f"{wide} {precise}")
+    assert 0 < lost < WIDE.size * PRECISE.size * STEPS
+
+
+@pytest.mark.parametrize("tied", [0.0, 0.9])
+def test_gains_of_two_precise_outputs_that_say_nearly_the_same(tied):
+    """The condition of S is 1e9, its solution is that many times rounding off; one after another they are not.
+
+    Of contradicting outputs the estimate is as wrong as the gain. K = P H' S^-1 in fractions.
+    """
+    h, noise = [[1.0, 1.0], [1.0, 1.0001]], [[1e-12, tied * 1e-12], [tied * 1e-12, 1e-12]]
+    a, n = [[Fraction(x) for x in row] for row in h], [[Fraction(x) for x in row] for row in noise]
+    s = [[sum(a[i][k] * a[j][k] for k in range(2)) + n[i][j] for j in range(2)] for i in range(2)]
+    determinant = s[0][0] * s[1][1] - s[0][1] * s[1][0]
+    inverse = [[s[1][1], -s[0][1]], [-s[1][0], s[0][0]]]
+    exact_gain = [[sum(a[k][i] * inverse[k][j] for k in range(2)) / determinant for j in range(2)] for i in range(2)]
+    item = hg.kalman_filter(hg.LinearPlant(np.eye(2), 0.0, [0.0, 0.0], 1.0), hg.LinearSensor(h, noise))
+    gain = [np.asarray(item.estimate(item.correct(item.init(), z)[0]).mean) for z in np.eye(2)]
+    np.testing.assert_allclose(np.transpose(gain), np.array(exact_gain, dtype=float), rtol=1e-10)
+
+
+@pytest.mark.parametrize("outputs", [1, 2])
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_free_outputs_of_states_that_are_tied_together(outputs, seed):
+    """x = v a with one unknown a: the first output tells it, a second that contradicts has nothing left to say.
+
+    Of P what remains is the square of the rounding of the mean, (5 eps |v|)^2 and what K adds to it.
+    """
+    random = np.random.default_rng(seed)
+    v, h = random.normal(size=3), random.normal(size=(outputs, 3))
+    plant = hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), np.outer(v, v))
+    item = hg.kalman_filter(plant, hg.LinearSensor(h, np.zeros((outputs, outputs))))
+    estimate = item.estimate(item.correct(item.init(), np.arange(1.0, 1 + outputs))[0])
+    np.testing.assert_allclose(estimate.mean, v / (h[0] @ v), rtol=1e-12)
+    assert 0 <= np.diagonal(estimate.covariance).max() < 1e-28
+
+
+def test_more_precise_outputs_than_are_unrolled():
+    """P+ = (1 + H'H / d)^-1 and K = P+ H' / d, for a prior of 1: both well conditioned, whatever d."""
+    h, d = np.random.default_rng(0).normal(size=(9, 3)), 1e-14
+    item = hg.kalman_filter(hg.LinearPlant(np.eye(3), 0.0, np.zeros(3), 1.0), hg.LinearSensor(h, d * np.eye(9)))
+    z = np.arange(9.0)
+    estimate = item.estimate(item.correct(item.init(), z)[0])
+    left = d * np.linalg.inv(d * np.eye(3) + h.T @ h)
+    np.testing.assert_allclose(estimate.covariance, left, rtol=1e-9, atol=1e-12 * left.max())
+    np.testing.assert_allclose(estimate.mean, left @ h.T @ z / d, rtol=1e-9)
+
+
+def test_a_noise_free_output_has_a_gradient():
+    """dx/dP of x = P z / (P + 0) is 0, and of the state that is not heard too."""
+
+    def mean(wide):
+        plant = hg.LinearPlant(A, 0.0, [0.0, 0.0], wide * jnp.eye(2))
+        item = hg.linear_filter(plant, hg.LinearSensor(C, 0.0), hg.perfect(1))
+        return item.correct(item.init(), jnp.ones(1))[0].mean.sum()
+
+    with jax.enable_x64(True):
+        assert float(jax.jit(jax.grad(mean))(2.0)) == pytest.approx(0.0, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("channel", "left"), [(hg.perfect(1), 1e-28), (hg.hop(hg.Discrete([0.5, 1.0], [0.5, 0.5]), 1e-9), 1.0)]
+)
+def test_a_premise_about_the_mean_is_not_used_where_the_law_is_known(channel, left):
+    """Then nothing hangs on it: the same numbers, and of a noise-free reading no rounding of the prior either."""
+    plant, sensor = hg.LinearPlant([[-1.2]], 1e-5, [-7e-4], 5e-6), hg.LinearSensor([[-6.5e-3]], 0.0)
+    results = []
+    for update in (None, hg.filters.ZeroMean()):
+        item = hg.cubature_filter(plant, sensor, channel, update)
+        results.append(item.estimate(item.correct(item.predict(item.init()), [4e-6])[0]))
+    np.testing.assert_array_equal(results[0].mean, results[1].mean)
+    np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
+    assert 0 <= results[1].covariance[0, 0] < left * (1.2**2 * 5e-6 + 1e-5)  # of the prediction
+
+
+@pytest.mark.parametrize("noise", [[[1.0, 1.0], [1.0, 1.0]], [[0.1, 0.3], [0.3, 0.9]]])
+def test_a_combination_free_of_noise_is_known(noise):
+    """z_2 - z_1 = x, or 3 z_1 - z_2 = x: the state is known to the rounding of the mean, and no less than nothing.
+
+    That is (n + 2)^2 eps^2 of its variance; of what is smoothed too. Its error is a few roundings of states of size 5.
+    """
+    plant, sensor = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0), hg.LinearSensor([[1.0], [2.0]], noise)
+    items = {"linear": hg.linear_filter(plant, sensor, hg.perfect(2)), "kalman": hg.kalman_filter(plant, sensor)}
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(2), items)})
+    outcome = hg.monte_carlo(network, horizon=15, runs=20, key=1, smooth=hg.smoothing.FixedInterval())
+    for record in (outcome, outcome.smoothed):
+        assert record.failures() == []
+        for name, estimate in record.estimates["a"].items():
+            assert estimate.claim == "exact"
+            assert np.all(estimate.covariance >= 0) and np.all(estimate.covariance < 1e-29)
+            assert np.abs(record.errors("a", name)).max() < 1e-14
+
+
+def test_where_noise_is_none_a_little_more_of_it_is_known_to_matter():
+    """d P+ / d N at N = 0 of a combination without noise, against a difference of second order in 1e-5: 1e-4."""
+    plant = hg.LinearPlant([[0.9]], 0.16, [0.0], 3.0)
+
+    def variance(n):
+        noise = jnp.array([[1.0, 1.0], [1.0, 1.0]]) + n * jnp.diag(jnp.array([0.0, 1.0]))
+        item = hg.linear_filter(plant, hg.LinearSensor([[1.0], [2.0]], noise), hg.perfect(2))
+        return item.correct(item.predict(item.init()), jnp.zeros(2))[0].covariance[0, 0]
+
+    with jax.enable_x64(True):
+        slope = jax.grad(variance)(0.0)
+        np.testing.assert_allclose(slope, variance(1e-5) / 1e-5, rtol=1e-4)
+
+
+def test_data_without_noise_leave_a_variance_above_the_rounding_of_the_mean():
+    """Of a state that moves and is seen without noise the claim covers what rounding leaves, smoothed too."""
+    plant = hg.LinearPlant([[0.9]], 0.0, [0.0], 1.034)
+    sensor, channel = hg.LinearSensor([[0.349], [-0.639]], np.zeros((2, 2))), hg.perfect(2)
+    network = hg.Network(plant, {"a": hg.Node(sensor, channel, {"f": hg.linear_filter(plant, sensor, channel)})})
+    record = hg.monte_carlo(network, 12, 200, 1, smooth=hg.smoothing.FixedInterval())
+    for part in (record, record.smoothed):
+        squared = (part.estimates["a"]["f"].mean - record.truth) ** 2
+        assert (squared.mean(axis=0)[:, 0] <= np.reshape(part.estimates["a"]["f"].covariance, (-1, 12))[0]).all()
+        assert squared.max() < 1e-30  # a few units of rounding of a state of size 1, squared

@@ -1,0 +1,95 @@
+"""A planned filter is the filter itself on complete data."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.filters.linear.plan import PlannedFilter, followed
+
+STEPS = 7
+PLANT = hg.LinearPlant([[0.95, 0.2], [-0.2, 0.9]], 0.05, [1.0, -0.5], [[0.5, 0.1], [0.1, 0.4]], [[0.0], [1.0]])
+STILL = hg.LinearPlant(PLANT.matrix, 0.05, PLANT.initial_mean, PLANT.initial_covariance)
+SENSORS = hg.model.over_time([hg.LinearSensor([[1.0, 0.1 * k], [0.5, 1.0]], 0.02) for k in range(STEPS)])
+FADING = hg.amplify_and_forward(
+    [hg.hop(hg.Rayleigh(0.8), 0.1, dimension=2), hg.hop(hg.random_affine.bernoulli(0.85), 0.01, dimension=2)]
+)
+SURE = hg.hop(0.7, hg.Gaussian([[0.2, 0.1], [0.1, 0.3]], [0.5, -1.0]))
+UNSURE = hg.hop(hg.Discrete([0.2, 1.3], [0.4, 0.6], 0.05), 0.1, dimension=2)
+SENSOR = hg.LinearSensor([[1.0, 0.2], [0.5, 1.0]], 0.02)
+ORIGINALS = {
+    "linear": hg.linear_filter(PLANT, SENSORS, FADING),
+    "linear, uncertain": hg.linear_filter(PLANT, SENSORS, UNSURE),
+    "Kalman": hg.kalman_filter(PLANT, SENSORS, initial_covariance=3.0),
+    "cubature": hg.cubature_filter(PLANT, SENSORS, SURE),
+    "tighter": hg.cubature_filter(PLANT, SENSORS, SURE, hg.filters.ZeroMean()),
+    "system": hg.filters.LinearSystemFilter(hg.linear.lifted_system(STILL, SENSOR, FADING, 1, STEPS)),
+    "quadratic": hg.polynomial_filter(STILL, SENSOR, SURE, STEPS),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_its_steps_are_the_originals(name):
+    original, draw = ORIGINALS[name], np.random.default_rng(3)
+    inputs, data = draw.normal(size=(STEPS, len(original.inputs))), 3 * draw.normal(size=(STEPS, 2))
+    planned = original.planned(inputs)
+    assert planned.claim == original.claim and planned is not original
+    a, b = original.init(), planned.init()
+    for k, (z, u) in enumerate(zip(data, inputs, strict=True)):
+        predicted = [item.estimate(item.predict(s, u, k)) for item, s in ((original, a), (planned, b))]
+        received = [item.correct(item.predict(s, u, k), z, k)[1] for item, s in ((original, a), (planned, b))]
+        (a, left), (b, right) = original.step(a, z, u, k), planned.step(b, z, u, k)
+        for expected, single in ((left, right), predicted, received, (left, planned.estimate(b))):
+            for x, y in zip(jax.tree.leaves(expected), jax.tree.leaves(single), strict=True):
+                np.testing.assert_allclose(y, x, rtol=0, atol=1e-12 * max(1.0, np.abs(x).max()))
+
+
+@pytest.mark.parametrize("name", ["linear", "Kalman", "cubature", "tighter"])
+def test_covariances_are_not_differentiated(name, monkeypatch):
+    """With respect to a mean or a measurement they are constant: their kernels have no part in the derivatives."""
+    item, of, jvp = ORIGINALS[name], set(), jax.jvp
+    monkeypatch.setattr(
+        jax, "jvp", lambda kernel, *given: (of.add(getattr(kernel, "__name__", "a part")), jvp(kernel, *given))[1]
+    )
+    with jax.enable_x64(True):
+        z, u = np.zeros(item.received), np.zeros(len(item.inputs))
+        jax.make_jaxpr(lambda state: followed(item, state, jax.numpy.asarray(z), u, 1))(item.init())
+    assert of and of <= {"moved", "used", "_use", "log_density"}
+
+
+def test_what_depends_on_data_stays_as_it_is():
+    nonlinear = hg.Plant(lambda x, u: x - 0.1 * x**3, 0.1 * np.eye(2), [1.0, 0.0], np.eye(2))
+    for item in (hg.cubature_filter(STILL, SENSOR, FADING), hg.extended_filter(nonlinear, SENSOR, SURE)):
+        assert item.planned(np.zeros((3, 0))) is item
+
+
+def test_it_is_made_inside_a_compiled_function_for_nodes_side_by_side():
+    items = [hg.linear_filter(PLANT, SENSOR, hg.hop(hg.Rayleigh(s), 0.1, dimension=2)) for s in (0.5, 1.0)]
+    inputs, z = np.ones((STEPS, 1)), np.array([0.3, -0.2])
+    stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *(eqx.filter(i, eqx.is_array) for i in items))
+
+    @eqx.filter_jit
+    def first(arrays):
+        def single(part):
+            planned = eqx.combine(part, eqx.filter(items[0], eqx.is_array, inverse=True)).planned(inputs)
+            assert isinstance(planned, PlannedFilter)
+            return planned.step(planned.init(), z, inputs[0], 0)[1].mean
+
+        return jax.vmap(single)(arrays)
+
+    with jax.enable_x64(True):
+        values = np.asarray(first(stacked))
+    expected = [item.step(item.init(), z, inputs[0], 0)[1].mean for item in items]
+    np.testing.assert_allclose(values, expected, rtol=0, atol=1e-13)
+
+
+def test_missing_data_is_seen():
+    planned = ORIGINALS["Kalman"].planned(np.zeros((STEPS, 1)))
+    assert np.all(np.isnan(planned.step(planned.init(), [np.nan, 0.0], [0.0])[1].mean))
+
+
+def test_inputs_of_another_size_are_refused():
+    with pytest.raises(ValueError, match=r"inputs: expected shape \(any, 1\), got shape \(7, 2\)"):
+        ORIGINALS["Kalman"].planned(np.zeros((STEPS, 2)))

@@ -1,0 +1,75 @@
+"""What is kept of an object: worked out once, closed, forgotten with the object, and never what is traced."""
+
+import gc
+import weakref
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from heliograph.numerics.caching import cached
+
+CALLS: list[float] = []
+
+
+class Holder(eqx.Module):
+    value: float | jax.Array | np.ndarray
+
+    @cached
+    def power(self, order: int) -> np.ndarray:
+        """The value as often."""
+        CALLS.append(order)
+        return self.value * np.ones(order)
+
+
+@cached
+def refusing(item: object) -> None:
+    """Says no."""
+    raise ValueError("no")
+
+
+def test_each_answer_is_worked_out_once_for_each_object_and_question() -> None:
+    CALLS.clear()
+    item, other = Holder(2.0), Holder(2.0)
+    assert item.power(2) is item.power(2)
+    assert item.power(3).shape == (3,) and item.power(order=3).shape == (3,)
+    assert other.power(2) is not item.power(2)
+    assert CALLS == [2, 3, 3, 2]
+
+
+def test_what_others_have_too_cannot_be_written_to() -> None:
+    with pytest.raises(ValueError, match="read-only"):
+        Holder(1.0).power(2)[0] = 5.0
+
+
+def test_what_is_traced_is_not_kept() -> None:
+    item = Holder(1.0)
+    result = jax.jit(lambda x: Holder(x).power(2) + item.power(2))(3.0)
+    assert np.asarray(result).tolist() == [4.0, 4.0]
+    assert np.asarray(jax.grad(lambda x: Holder(x).power(2).sum())(1.0)) == 2.0
+    assert item.power(2).tolist() == [1.0, 1.0]
+
+
+def test_nothing_keeps_the_object_alive() -> None:
+    item = Holder(1.0)
+    item.power(2)
+    gone = weakref.ref(item)
+    del item
+    gc.collect()
+    assert gone() is None
+
+
+def test_what_cannot_be_kept_is_refused_in_its_own_words() -> None:
+    for item in (3, "text", None, Holder(1.0)):
+        with pytest.raises(ValueError, match="no"):
+            refusing(item)
+
+
+def test_it_is_called_as_the_function_is() -> None:
+    item = Holder(2.0)
+    assert Holder.power(self=item, order=2) is item.power(order=2)
+    with pytest.raises(TypeError, match="missing 1 required positional argument: 'item'"):
+        refusing()
+    with pytest.raises(ValueError, match="no"):
+        refusing(item=item)

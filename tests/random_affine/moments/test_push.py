@@ -1,0 +1,70 @@
+"""Moments pushed through a map against the map's own moment matrices."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.random_affine.moments.monomials import count, exponents, monomials
+from heliograph.random_affine.moments.push import Tabulated, push, push_known, second_moments
+from heliograph.random_affine.noise import noise_vector
+from tests.random_affine.test_contract import CHANNELS
+
+
+def atoms_moments(dimension, order, seed=0):
+    """Moments of a law of three points, so that they belong together."""
+    g = np.random.default_rng(seed)
+    points, chance = g.normal(size=(3, dimension)), g.dirichlet(np.ones(3))
+    return chance @ np.array([monomials(p, order) for p in points])
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+@pytest.mark.parametrize("name", CHANNELS)
+def test_pushed_moments_are_those_of_the_matrix(name, order):
+    channel = CHANNELS[name]
+    before = atoms_moments(channel.inputs, order)
+    expected = channel.moments(order).expect(before)
+    np.testing.assert_allclose(push(channel, order, before), expected, rtol=0, atol=1e-12 * np.abs(expected).max())
+
+
+def test_lifted_maps_are_pushed_by_their_matrix():
+    square = hg.random_affine.square(CHANNELS["discrete"])
+    point = monomials(np.array([0.3, -0.7]), 2)[:-1]
+    before = monomials(point, 2)
+    np.testing.assert_allclose(push(square, 2, before), square.moments(2).expect(before), rtol=1e-14)
+
+
+def test_a_known_map_moves_points():
+    matrix = np.array([[1.0, 2.0, 0.5], [0.0, -1.0, 3.0], [0.0, 0.0, 1.0]])
+    y = np.array([0.4, -0.2])
+    for order in (1, 2, 3, 4):
+        pushed = push_known(matrix, order, monomials(y, order))
+        np.testing.assert_allclose(pushed, monomials((matrix @ [*y, 1.0])[:-1], order), rtol=1e-13)
+
+
+def test_second_moments_are_gathered_from_the_vector():
+    y = np.array([0.4, -0.2, 1.5])
+    lifted = monomials(y, 2)
+    np.testing.assert_allclose(second_moments(monomials(y, 4), 4, 2), np.outer(lifted, lifted), rtol=1e-14)
+
+
+def test_a_table_knows_what_the_law_knows():
+    law = hg.random_affine.Shaped(
+        [[1.0, 0.5], [0.0, 2.0]], hg.random_affine.FiniteSupport([[1.0, 0.0], [-1.0, 2.0]], [0.25, 0.75])
+    )
+    table = Tabulated(law, 4)
+    np.testing.assert_array_equal(noise_vector(table, 4), noise_vector(law, 4))
+    assert all(table.moment(a) == law.moment(a) for k in range(5) for a in exponents(2, k))
+
+
+def test_a_large_order_needs_no_large_matrix():
+    """16 states, order 4: the vector has 4845 entries; the matrix that is not formed has 23 million."""
+    plant = hg.random_affine.GainAndNoise(hg.random_affine.Constant(1.0), 0.5 * np.eye(16), 0.3)
+    gaussian = noise_vector(hg.Gaussian(np.eye(16)), 4)
+    assert len(gaussian) == count(17, 4) == 4845
+    expected = noise_vector(hg.Gaussian((0.25 + 0.3) * np.eye(16)), 4)
+    np.testing.assert_allclose(push(plant, 4, gaussian), expected, rtol=1e-12)
+
+
+def test_moments_of_the_wrong_length_are_refused():
+    with pytest.raises(ValueError, match=r"moments of order 2: expected shape \(6,\), got shape \(5,\)"):
+        push(CHANNELS["known"], 2, np.zeros(5))
