@@ -7,8 +7,8 @@ import pytest
 
 import heliograph as hg
 from heliograph.model import silent
+from heliograph.model.estimate import is_sound
 from heliograph.numerics.check import covariance
-from heliograph.simulation.results.record import is_sound
 from tests.follow import last
 
 CART = hg.LinearPlant([[0.9]], 0.1, [0.0], 1.0)

@@ -17,6 +17,10 @@ def command() -> NoReturn:
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+    try:
+        sys.stdout.flush()
+    except OSError:  # it was said; the interpreter would say it again, in its own words, when it leaves
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done: an interpreter that leaves would die of it otherwise
     sys.exit(code)
 

@@ -1,5 +1,6 @@
 """The command's options, hints, and what it says of itself; what it loads for that."""
 
+import os
 import subprocess
 import sys
 
@@ -70,6 +71,21 @@ def test_an_output_that_takes_nothing_is_named(capsys, monkeypatch):
         with pytest.raises(OSError, match="No space"):
             full.close()
     assert capsys.readouterr().err == "heliograph: standard output: No space left on device\n"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("arguments", [["--version"], ["run", "--help"]])
+@pytest.mark.parametrize("buffered", [True, False])
+def test_a_process_whose_output_takes_nothing_says_so_once(arguments, buffered):
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    if not buffered:
+        environment["PYTHONUNBUFFERED"] = "1"
+    with open("/dev/full", "wb") as full:
+        made = subprocess.run(
+            [sys.executable, "-m", "heliograph", *arguments], stdout=full, stderr=subprocess.PIPE, env=environment
+        )
+    assert made.stderr == b"heliograph: standard output: No space left on device\n"
+    assert made.returncode == cli.BAD_INPUT
 
 
 @pytest.mark.parametrize(

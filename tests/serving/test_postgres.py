@@ -1,8 +1,10 @@
 """The same store in PostgreSQL, where there is one to start."""
 
+import json
 from pathlib import Path
 
 import pytest
+from sqlalchemy import text
 
 from heliograph.serving.service import Service
 from heliograph.serving.storage.database import engine_at
@@ -55,3 +57,39 @@ def test_processes_share_a_store_in_postgresql(tmp_path, database):
 
 def test_parts_are_leased_in_postgresql(database):
     test_sharing.shared(engine_at(database))
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        "body = substring(body from 1 for length(body) / 2)",
+        "body = set_byte(body, 40, get_byte(body, 40) # 1)",
+        "body = null",
+        "version = version + 1",
+        "version = null",
+        "checksum = null",
+    ],
+)
+def test_a_damaged_plant_is_refused_by_name_in_postgresql(database, how):
+    """The other goes on with what it knew; after --anew the damaged one begins anew."""
+    network = stepping()
+    mine, sent = identity(fleet(network)), lines(messages(2, 24, seed=11, whole=True))
+    half = len(sent) // 2
+    begun = Service(fleet(network), Store(database, mine))
+    begun.published(begun.take(sent[:half]))
+    known = begun.store.load(["p0"])["p0"].body
+    begun.store.close()
+    engine = engine_at(database)
+    with engine.begin() as connection:
+        connection.execute(text(f"update plants set {how} where name = 'p1'"))
+    engine.dispose()
+    store = Store(database, mine)
+    assert list(store.damaged) == ["p1"]
+    assert store.load(["p0"])["p0"].body == known
+    service = Service(fleet(network), store)
+    refused = [json.loads(item.body) for item in service.take(sent[half:]) if item.kind == "refused"]
+    assert {item["plant"] for item in refused if item["reason"] == "damaged"} == {"p1"}
+    assert all("plant 'p1': expected" in item["detail"] for item in refused if item["reason"] == "damaged")
+    store.begin_anew(["p1"])
+    assert store.damaged == {}
+    store.close()

@@ -1,5 +1,6 @@
 """The command line as a function: from arguments to an exit code."""
 
+import errno
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,6 +24,7 @@ from heliograph.numerics.extras import EXTRAS, how_to_install
 from heliograph.simulation.runs.compilation_cache import keep_compilations
 
 BAD_INPUT = 2
+FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO  # files name themselves, what is printed does not
 
 # In the order of the help.
 COMMANDS = new, run, fit, serve, replay, export, demo, example, reproduce, sweep, explore, design, completion
@@ -54,6 +56,7 @@ def _command(arguments: Sequence[str] | None) -> int:
     try:
         command, bound, _ = app.parse_args(arguments, exit_on_error=False, print_error=False, verbose=False)
         code: int | None = command(*bound.args, **bound.kwargs)
+        sys.stdout.flush()
         return code or 0
     except CycloptsError as error:
         return _refuse(str(error))
@@ -64,7 +67,7 @@ def _command(arguments: Sequence[str] | None) -> int:
             raise
         return _refuse(str(error))
     except OSError as error:
-        what = error.filename or ("standard output" if _output_is_lost() else None)
+        what = error.filename or ("standard output" if error.errno in FULL or _output_is_lost() else None)
         return _refuse(f"{what}: {error.strerror or error}" if what else str(error))
     except ModuleNotFoundError as error:
         extra = EXTRAS.get((error.name or "").partition(".")[0])

@@ -13,6 +13,7 @@ from heliograph.cli.app import place
 
 if TYPE_CHECKING:
     from heliograph.files.recording import Recording
+    from heliograph.model.estimate import Estimate
     from heliograph.simulation.network import Network
     from heliograph.simulation.results.record import Record
     from heliograph.smoothing.modes import AbstractSmoothing
@@ -106,12 +107,18 @@ def _filtered(
 def _written(record: "Record", out: Path | None, report: Path | None) -> list[str]:
     """What was written where, a line each."""
     filters = [
-        f"{node}/{name} ({estimate.claim})"
+        f"{node}/{name} ({_claim(estimate)})"
         for node, estimates in record.estimates.items()
         for name, estimate in estimates.items()
     ]
     places = [path for path in (out, report and report / "report.html") if path is not None]
     return [f"{place}: {len(record.time)} rows of {', '.join(filters)}" for place in places]
+
+
+def _claim(estimate: "Estimate") -> str:
+    """What is claimed, and of how many rows nothing is."""
+    lost = int((estimate.claims == "none").sum())
+    return estimate.claim if estimate.claim == "none" or not lost else f"{estimate.claim}, none of {lost} rows"
 
 
 def _check_places(measurements: Path, out: Path | None, report: Path | None) -> None:

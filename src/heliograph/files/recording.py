@@ -10,12 +10,12 @@ import numpy as np
 
 from heliograph.files.columns import TIME, columns_of
 from heliograph.files.table import write_table
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Estimate, is_sound
 from heliograph.numerics.check import backwards, backwards_text, fail, instance
 from heliograph.numerics.dates import seconds_between
 from heliograph.numerics.readable import readable
 from heliograph.simulation.network import Network
-from heliograph.simulation.results.record import Record, is_sound
+from heliograph.simulation.results.record import Record
 
 TIME_STEP = "dt"  # an input of this name is filled with the time since the previous row when there is no such column
 

@@ -14,7 +14,7 @@ from heliograph.filters.smoother_step.base import AbstractSmootherStep
 from heliograph.fusion.rules import Fusion
 from heliograph.live.history import History, NetworkStep, at_step, interval
 from heliograph.live.static import Static, cast
-from heliograph.model.estimate import Claim, Estimate
+from heliograph.model.estimate import Claim, Estimate, with_sound_claim
 from heliograph.numerics.check import InputError, fail
 from heliograph.numerics.compiler import understood
 from heliograph.numerics.module import Module
@@ -181,7 +181,7 @@ class Sweeper:
 
 
 def _estimate_of(outputs: Estimate, claim: Claim, where: tuple[int, ...]) -> Estimate:
-    return Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim)
+    return with_sound_claim(Estimate(np.asarray(outputs.mean)[where], np.asarray(outputs.covariance)[where], claim))
 
 
 def _of(network: Network, kind: int, name: str) -> AbstractFilter:

@@ -14,7 +14,7 @@ from heliograph.live.identity import Identity, check_same, short_name, versions
 from heliograph.live.snapshot import packed, unpacked
 from heliograph.live.static import cast
 from heliograph.live.stepper import NativeStepper, XlaStepper, by_xla, natively
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.limits import LimitsLike, limits_of
 from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
@@ -70,7 +70,7 @@ class Stream:
         if outside is not None:
             self.dropped += outside
         result: Estimate = placed.estimate.unflatten(stepper.estimate)
-        return result
+        return with_sound_claim(result) if np.isnan(stepper.judgement[0]) else result
 
     def _refuse(self, z: np.ndarray, u: np.ndarray) -> None:
         """Refuse what is implausible, or take the step that was flagged.

@@ -15,7 +15,7 @@ from heliograph.live.identity import check_same
 from heliograph.live.player import player
 from heliograph.live.rows import BEFORE, HeldRow, Rows
 from heliograph.live.snapshot import packed, row_arrays, rows_from, unpacked
-from heliograph.model.estimate import Estimate
+from heliograph.model.estimate import Estimate, with_sound_claim
 from heliograph.model.over_time import steps_covered
 from heliograph.numerics.check import check_count, fail, instance, scalar, shown
 from heliograph.numerics.float64 import to_numpy
@@ -328,6 +328,9 @@ class Timeline:
         mean = by_name(self.network, result, lambda part: np.asarray(part.mean), -3)
         covariance = by_name(self.network, result, lambda part: np.asarray(part.covariance), -4)
         return {
-            node: {name: Estimate(mean[node][name], covariance[node][name], claim) for name, claim in claims.items()}
+            node: {
+                name: with_sound_claim(Estimate(mean[node][name], covariance[node][name], claim))
+                for name, claim in claims.items()
+            }
             for node, claims in self._player.claims.items()
         }

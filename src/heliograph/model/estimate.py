@@ -3,8 +3,9 @@
 from typing import Literal
 
 import equinox as eqx
+import numpy as np
 
-from heliograph.numerics.check import fail, items, shown
+from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, items, own_units, shown
 from heliograph.numerics.module import Module
 from heliograph.numerics.readable import readable
 from heliograph.numerics.types import Array, Float
@@ -20,12 +21,20 @@ class Estimate(Module):
     claim: "exact" if `covariance` is E[(x - mean)(x - mean)'], "upper" if it dominates it, "nominal" if it is only what
     the filter's approximations say, "none" if no covariance is claimed: then `covariance` is NaN.
 
+    All is up to the rounding of the mean. `claim` is what the filter claims of a sound estimate; of many, `claims` says
+    where it holds.
+
     Shapes: mean (..., n), covariance (..., n, n).
     """
 
     mean: Float[Array, "... n"]
     covariance: Float[Array, "... n n"]
     claim: Claim = eqx.field(static=True)
+
+    @property
+    def claims(self) -> np.ndarray:
+        """The claim of each estimate, (...): "none" where mean or covariance are no numbers, or the latter is none."""
+        return np.where(is_sound(self), self.claim, "none")
 
 
 @readable
@@ -57,3 +66,24 @@ def weakest(claims: list[Claim]) -> Claim:
         if not isinstance(claim, str) or claim not in STRENGTH:
             raise fail("claim", f"one of {', '.join(STRENGTH)}", shown(claim))
     return min(claims, key=STRENGTH.__getitem__)
+
+
+def is_sound(estimate: Estimate) -> np.ndarray:
+    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
+    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
+    if estimate.claim == "none":
+        return finite
+    bound = np.asarray(estimate.covariance)
+    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
+    safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
+    unit = own_units(safe)
+    correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
+    result: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
+    return result
+
+
+def with_sound_claim(estimate: Estimate) -> Estimate:
+    """One estimate with the claim that it can have: "none" of what is no number, or of a covariance that is none."""
+    if estimate.claim == "none" or is_sound(estimate).all():
+        return estimate
+    return Estimate(estimate.mean, estimate.covariance, "none")

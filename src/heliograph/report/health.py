@@ -110,7 +110,8 @@ def examine(
         lags = min(LAGS, len(z) // 10)
         enough = white is not None and lags > 0 and np.count_nonzero(~np.isnan(white)) > LAGS
         test = memory_of(white, lags, claimed=True) if white is not None and enough else None
-        filters.append(Listening(node, name, item.claim, white, test))
+        lost = np.any(record.estimates[node][name].claims == "none")
+        filters.append(Listening(node, name, "none" if lost else item.claim, white, test))
     return Health(record, links, filters)
 
 

@@ -1,5 +1,7 @@
 """Estimates and refusals as lines of JSON."""
 
+from math import isfinite
+
 from pydantic_core import to_json
 
 from heliograph.filters.plausibility import in_words
@@ -26,7 +28,9 @@ class Teller:
     def _filter(self, place: Place, outputs: list[float]) -> dict[str, object]:
         n, mean, begin, judged = self._n, place.mean, place.covariance, place.judgement
         covariance = None if place.claim == "none" else [outputs[i : i + n] for i in range(begin, begin + n * n, n)]
-        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": place.claim}
+        numbers = all(map(isfinite, (*outputs[mean : mean + n], *outputs[begin : begin + n * n])))
+        claim = place.claim if numbers else "none"
+        results: dict[str, object] = {"mean": outputs[mean : mean + n], "covariance": covariance, "claim": claim}
         if judged is None:
             return results
         if outputs[judged.reason] > 0:

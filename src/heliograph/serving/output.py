@@ -23,7 +23,7 @@ class FilterOutput(BaseModel):
 
     mean: list[float | None]
     covariance: list[list[float | None]] | None = Field(description="Null of a filter that claims none.")
-    claim: Claim = Field(description="What the covariance is: exact, upper, nominal, or none.")
+    claim: Claim = Field(description="What the covariance is: exact, upper, nominal; none also where it is no number.")
     nis: float | None = Field(None, description="Normalised innovation squared of what was heard; null if nothing was.")
     received: int = Field(0, description="How many numbers were heard: what nis should be on average.")
     implausible: str = Field("", description="Why this filter alone did not use what was heard, where it did not.")

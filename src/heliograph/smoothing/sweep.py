@@ -118,19 +118,26 @@ def swept_over_lag(steps: AbstractSmootherStep, lag: int | Int[Array, ""]) -> Es
     """Each step's state given the data of up to `lag` later steps: as many short sweeps, side by side."""
     last = len(steps.mean) - 1
     items = jnp.arange(last + 1)
-    newest = jax.vmap(lambda step: step.end())(rows_of(steps, jnp.minimum(items + lag, last)))
+    ends = rows_of(steps, jnp.minimum(items + lag, last))
+    newest = jax.vmap(lambda step: step.end())(ends)
+    start = newest, jax.vmap(lambda step, later: step.smoothed(later))(ends, newest)
 
-    def body(done: jax.Array, later: PyTree) -> PyTree:
+    def body(done: jax.Array, carry: tuple[PyTree, Moments]) -> tuple[PyTree, Moments]:
         """From after the step that is `lag` - done ahead to after the one before it, unless the data end before."""
+        later, known = carry
         ahead = items + lag - done
         place = jnp.minimum(ahead, last)
-        before = jnp.maximum(place - 1, 0)
-        earlier = jax.vmap(lambda step, *rest: step.back(*rest))(
-            rows_of(steps, place), later, steps.mean[before], steps.covariance[before]
+        here, before = rows_of(steps, place), rows_of(steps, jnp.maximum(place - 1, 0))
+        earlier = jax.vmap(lambda step, *rest: step.back(*rest))(here, later, before.mean, before.covariance)
+        moments = jax.vmap(lambda step, *rest: step.before(*rest))(here, before, earlier, known)
+        both: tuple[PyTree, Moments] = jax.tree.map(
+            lambda a, b: jnp.where(_column(ahead <= last, a), a, b), (earlier, moments), carry
         )
-        return jax.tree.map(lambda a, b: jnp.where(_column(ahead <= last, a), a, b), earlier, later)
+        return both
 
-    return _estimates_from(steps, jax.lax.fori_loop(0, lag, body, newest))
+    _, outcome = jax.lax.fori_loop(0, lag, body, start)
+    result: Estimate = jax.vmap(lambda step, moments: step.estimate_from(moments))(steps, outcome)
+    return result
 
 
 def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
@@ -145,11 +152,6 @@ def carried_ahead(steps: AbstractSmootherStep, step: int) -> Estimate:
     first = Moments(start.mean, start.covariance)
     whole = jax.tree.map(lambda item, rest: jnp.concatenate([item[None], rest]), first, outcome)
     result: Estimate = jax.vmap(start.estimate_from)(whole)
-    return result
-
-
-def _estimates_from(steps: AbstractSmootherStep, later: PyTree) -> Estimate:
-    result: Estimate = jax.vmap(lambda step, later: step.estimate_from(step.smoothed(later)))(steps, later)
     return result
 
 

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects
 from heliograph.filters.gaussian.belief import AbstractBeliefFilter, Belief, predicted, prior_of
 from heliograph.filters.gaussian.correction import Signal
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature, Linearization, linear_transform
 from heliograph.filters.gaussian.update import AbstractUpdate, Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
@@ -57,7 +58,9 @@ class GaussianFilter(AbstractBeliefFilter):
         """Use the measurement; the points are redrawn from the prediction for both sides of the cross covariance."""
         signal = signal_of(at(self.plant, k), at(self.sensor, k), self.transform, state)
         unknown = signal.about_mean() if self.linear else signal
-        return corrected(state, signal, at(self.channel, k), self.update, jnp.asarray(z), self.observed_angles, unknown)
+        size = initial_size(self.initial_mean, self.initial_covariance)
+        link, z = at(self.channel, k), jnp.asarray(z)
+        return corrected(state, signal, link, self.update, z, size, self.observed_angles, unknown)
 
     def smoother_step(
         self, before: Belief, prior: Belief, after: Belief, innovation: Innovation, z: ArrayLike, u: ArrayLike, k: Step
@@ -97,17 +100,20 @@ def corrected(
     channel: SecondOrder,
     update: AbstractUpdate,
     z: jax.Array,
+    size: jax.Array,
     angles: Angles = (),
     unknown: Signal | None = None,
 ) -> tuple[Belief, Innovation]:
     """One update with the components of z that arrived; a measurement of which nothing arrived changes nothing.
 
+    `size`: E[x_i^2] at the start, (n,), of which the rounding stays unknown.
     `unknown`: what of the signal decides gain and covariance, where that is less than all.
     """
     unknown = signal if unknown is None else unknown
     expected = channel.mean_gain @ signal.mean + channel.offset
     z = nearest(z, expected, angles)
     gain, bound = update.correct(prior.covariance, unknown, channel, ~jnp.isnan(z))
+    bound = above_rounding(bound, prior.covariance, size)
     after = _use(prior, gain, bound, signal.mean, channel, z)
     return after, gaussian_innovation(z, expected, innovation_covariance(unknown, channel))
 

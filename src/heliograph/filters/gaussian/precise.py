@@ -11,9 +11,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from heliograph.numerics.small_matrix import (
+    PIVOT_TOLERANCE,
+    diagonal,
     diagonal_of,
     identity,
     root,
+    rounding,
     sum_of_squares,
     summed,
     times,
@@ -28,12 +31,13 @@ LEFT = 100  # times its rounding: a variance below has lost its digits
 class Component(NamedTuple):
     """One component of T z, whose rows make their noises uncorrelated.
 
-    Shapes: number e_j (m,) and row T H of it (n,), the noise's variance (), least variance that is not rounding (); or
-    of all components, one more axis first. Runs last.
+    Shapes: number e_j (m,), row T H of it and size |T| |H|, of which it is a difference (n,), the noise's variance (),
+    least variance that is not rounding (); or of all components, one more axis first. Runs last.
     """
 
     number: jax.Array
     row: jax.Array
+    size: jax.Array
     variance: jax.Array
     least: jax.Array
 
@@ -42,11 +46,13 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     """K (n, m) and P+ of z = H x + v, Cov v = N, by its components one after another; of runs that are last.
 
     f = R' h', s = f' f + d, k = R f / s, R+ = R (I - f f' / (s + root(s d))); with K of all
-    P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. A component of
-    which nothing but rounding is unknown is left out. The prior itself is known to eps |P|, with which P+ is
-    eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a variance, as where a wide prior
-    or a singular noise ties states together to the last digit, it has no digits, and P+ is NaN. Where no more is left
-    than the square of the mean's own rounding, as of tied states behind a noise-free output, the state is known.
+    P+ = (I - K H) P (I - K H)' + K N K', a sum of squares, which an error dK changes by dK S dK' alone. The mean itself
+    is known to its rounding alone, (n + 2) eps of each deviation: a component of which nothing else is unknown still
+    corrects that, or it would grow, step by step, where P says that the state is known. The prior itself is known to
+    eps |P|, with which P+ is eps |I - K H| |P| |I - K H|' off: where less than a hundred times that is left of a
+    variance, as where a wide prior or a singular noise ties states together to the last digit, it has no digits, and P+
+    is NaN. Where no more is left than the square of the mean's own rounding, as of tied states behind a noise-free
+    output, the state is known.
 
     Source: Potter, in Battin, Astronautical guidance (1964); Bucy and Joseph,
     Filtering for stochastic processes (1968).
@@ -55,11 +61,15 @@ def precise_update(prior: jax.Array, output: jax.Array, noise: jax.Array) -> tup
     runs = jnp.broadcast_shapes(prior.shape[2:], output.shape[2:], noise.shape[2:])
     start = root(prior)
     turn, components = _components(start, output, noise)
-    begin = jnp.broadcast_to(start, (n, n, *runs)), jnp.zeros((n, m, *runs), start.dtype)
-    gain = times(jax.lax.scan(_use_component, begin, components)[0][1], turn)
+    nothing = jnp.zeros((n, m, *runs), start.dtype)
+    unit = (n + 2) * float(np.finfo(start.dtype).eps)
+    mean = jnp.broadcast_to(diagonal(unit * jnp.sqrt(jnp.maximum(diagonal_of(prior), 0.0))), (n, n, *runs))
+    begin = _Taken(jnp.broadcast_to(start, (n, n, *runs)), mean, nothing, nothing)
+    taken = jax.lax.scan(_use_component, begin, components)[0]
+    gain = times(taken.gain, turn)
     after = sum_of_squares(prior, start, gain, output, noise)
     remaining = jnp.asarray(identity(n, gain)) - times(gain, output)
-    return gain, jnp.where(_has_digits(prior, start, remaining, after), after, jnp.nan)
+    return times(taken.whole, turn), jnp.where(_has_digits(prior, start, remaining, after), after, jnp.nan)
 
 
 def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[jax.Array, Component]:
@@ -68,9 +78,10 @@ def _components(start: jax.Array, output: jax.Array, noise: jax.Array) -> tuple[
     ones = jnp.broadcast_to(identity(m, output), (m, m, *output.shape[2:]))
     turned, variance = uncorrelated(noise, jnp.concatenate([ones, output], axis=1))
     turn, rows = turned[:, :m], turned[:, m:]
-    reach = times(jnp.abs(turn), times(jnp.abs(output), jnp.abs(start)))
-    least = ((n + 2) * float(np.finfo(start.dtype).eps)) ** 2 * summed(reach * reach, 1)
-    return turn, Component(jnp.asarray(identity(m, output)), rows, variance, least)
+    size = times(jnp.abs(turn), jnp.abs(output))
+    reach = times(size, jnp.abs(start))
+    least = ((n + 2) * float(np.finfo(start.dtype).eps) * LEFT) ** 2 * summed(reach * reach, 1)
+    return turn, Component(jnp.asarray(identity(m, output)), rows, size, variance, least)
 
 
 def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after: jax.Array) -> jax.Array:
@@ -82,9 +93,21 @@ def _has_digits(prior: jax.Array, start: jax.Array, remaining: jax.Array, after:
     return jnp.all((LEFT * eps * lost <= left) | (left <= (4 * (n + 2) * eps) ** 2 * of_mean), axis=0)
 
 
-def _use_component(state: tuple[jax.Array, jax.Array], item: Component) -> tuple[tuple[jax.Array, jax.Array], None]:
-    """Root R (n, n) and gain G (n, m), m + G (T z - T H m), with one component more."""
-    before, gain = state
+class _Taken(NamedTuple):
+    """After some components: the root R (n, n) of P, that of the mean's rounding (n, n), and two gains of T z (n, m).
+
+    gain: of components of which more than rounding was unknown, which P+ is made of; whole: of all.
+    """
+
+    root: jax.Array
+    rounded: jax.Array
+    gain: jax.Array
+    whole: jax.Array
+
+
+def _use_component(state: _Taken, item: Component) -> tuple[_Taken, None]:
+    """With one component more."""
+    before, rounded, gain, whole = state
     f = times_vector(transpose(before), item.row)
     total = summed(f * f, 0) + item.variance
     used = total > item.least
@@ -95,4 +118,11 @@ def _use_component(state: tuple[jax.Array, jax.Array], item: Component) -> tuple
     both = jnp.where(noisy, jnp.sqrt(jnp.where(noisy, safe * item.variance, 1.0)), 0.0)
     turned = f * jnp.where(used, 1 / (safe + both), 0.0)
     news = item.number - times_vector(transpose(gain), item.row)
-    return (before - shared[:, None] * turned[None], gain + column[:, None] * news[None]), None
+    # A component of which P leaves nothing unknown corrects the mean's rounding, by the root of that alone.
+    g, reach = times_vector(transpose(rounded), item.row), times_vector(transpose(jnp.abs(rounded)), item.size)
+    size, least = summed(g * g, 0), rounding(PIVOT_TOLERANCE, g) * summed(reach * reach, 0)
+    corrects = ~used & (size > least)
+    step = jnp.where(corrects, times_vector(rounded, g) / jnp.where(corrects, size, 1.0), column)
+    rounded = rounded - step[:, None] * g[None]
+    whole = whole + step[:, None] * (item.number - times_vector(transpose(whole), item.row))[None]
+    return _Taken(before - shared[:, None] * turned[None], rounded, gain + column[:, None] * news[None], whole), None

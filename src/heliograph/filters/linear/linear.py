@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.correction import Signal, known_gain_covariance
 from heliograph.filters.gaussian.gaussian import describe
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
 from heliograph.filters.linear.plan import plan
@@ -30,7 +31,7 @@ from heliograph.model.sensor import AnySensor, check_linear
 from heliograph.numerics.check import fail
 from heliograph.numerics.float64 import in_float64
 from heliograph.numerics.over_runs import runs_last
-from heliograph.numerics.small_matrix import congruence, diagonal, diagonal_of, times, times_vector, transpose
+from heliograph.numerics.small_matrix import congruence, times, times_vector, transpose
 from heliograph.numerics.types import Array, ArrayLike, Float
 from heliograph.random_affine.base import as_maps
 from heliograph.random_affine.moments.second_moments import SecondOrder, has_known_mean
@@ -81,7 +82,7 @@ class LinearFilter(AbstractFilter):
         plant, u = at(self.plant, k), jnp.asarray(u)
         shift, noise = jnp.asarray(plant.input_matrix) @ u + plant.noise_mean(), plant.noise_covariance(u)
         error, local = (moved(*part, plant.matrix, shift, noise) for part in (state[:2], state[2:]))
-        return LinearBelief(*error, *local)
+        return LinearBelief(*error, *within_range(*local))
 
     @corrects
     def correct(self, state: LinearBelief, z: ArrayLike, k: Step = 0) -> tuple[LinearBelief, Innovation]:
@@ -90,8 +91,9 @@ class LinearFilter(AbstractFilter):
         y = signal(state[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
-        # No variance is below the rounding of the mean itself, however often noise-free data say the same again.
-        bound = above_rounding(bound, state.state_mean, state.state_covariance)
+        start = at(self.plant, 0)
+        size = initial_size(start.initial_mean, start.initial_covariance)
+        bound = above_rounding(bound, state.covariance, size)
         mean, covariance, expected = used(
             state.mean,
             state.covariance,
@@ -148,16 +150,17 @@ def moved(
     return times_vector(matrix, mean) + shift, congruence(matrix, spread) + noise
 
 
-@runs_last
-def above_rounding(covariance: jax.Array, state_mean: jax.Array, state_covariance: jax.Array) -> jax.Array:
-    """P + diag(((n + 2) eps)^2 E[x_i^2]) where P_ii is not zero: what a mean of such a size cannot say.
+def within_range(mean: jax.Array, covariance: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Moments that stay finite numbers: those before any data of an unstable plant, which only its inputs hold, do not.
 
-    Data without noise would else shrink P at each step by eps^2, to where a smoother divides the rounding of an
-    innovation by it.
+    Behind a known gain nothing depends on them.
     """
-    unit = (len(covariance) + 2) * float(np.finfo(covariance.dtype).eps)
-    second = diagonal_of(state_covariance) + state_mean**2
-    return covariance + diagonal(jnp.where(diagonal_of(covariance) > 0, unit**2 * second, 0.0))
+    largest = float(np.finfo(covariance.dtype).max) ** 0.5
+    return _clipped(mean, largest**0.5), _clipped(covariance, largest)
+
+
+def _clipped(a: jax.Array, largest: float) -> jax.Array:
+    return jnp.maximum(jnp.minimum(a, largest), -largest)
 
 
 @runs_last

@@ -27,10 +27,12 @@ def receive(
     mode: jax.Array,
     weight: jax.Array,
     z: jax.Array,
+    size: jax.Array,
     angles: Angles = (),
 ) -> tuple[Belief, jax.Array, Innovation]:
     """Each belief corrected in its mode, its weight after z and after what arrived of it, and the mixture's innovation.
 
+    `size`: E[x_i^2] at the start, (n,).
     weight+ ~ weight P(what arrives | mode) N(z; ...): the likelihood of the innovation is that of z given what arrives.
     """
     kind = pattern_of(channel, ~jnp.isnan(z)) if len(channel.present) > 1 else 0
@@ -42,7 +44,7 @@ def receive(
         law = QuadraticMap(spread, jnp.zeros_like(spread))
         none = QuadraticMap(jnp.zeros_like(spread), jnp.zeros_like(spread))
         link = SecondOrder(mean[:, :-1], mean[:, -1], law, none, none, law, False)
-        return corrected(separate, sent, link, Polytope(), z, angles)
+        return corrected(separate, sent, link, Polytope(), z, size, angles)
 
     result, received = jax.vmap(single)(belief, signal, mean, spread)
     possible = prior > 0  # a mode in which this cannot arrive has no map for it

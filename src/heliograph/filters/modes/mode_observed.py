@@ -9,9 +9,10 @@ import jax
 import jax.numpy as jnp
 
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
+from heliograph.filters.gaussian.rounding import above_rounding, initial_size
 from heliograph.filters.gaussian.update import Polytope
 from heliograph.filters.innovation import gaussian_innovation, innovation_covariance
-from heliograph.filters.linear.linear import LinearBelief, moved, signal, used
+from heliograph.filters.linear.linear import LinearBelief, moved, signal, used, within_range
 from heliograph.filters.modes.modal import claim_of_modes
 from heliograph.filters.modes.side_information import with_flag
 from heliograph.model.channel import Channel, check_link
@@ -94,17 +95,20 @@ class ModeObservedFilter(AbstractFilter):
         z, published = observed[:m], observed[m:]
         known = ~jnp.any(jnp.isnan(published)) | (~state.begun if self.late else False)
         certain = jnp.nan_to_num(published)
+        start = at(self.plant, 0)
+        size = initial_size(start.initial_mean, start.initial_covariance)
         if self.late:
             last = jnp.maximum(jnp.asarray(k) - 1, 0)
-            redone = _use(state.before, at(self.sensor, last), _given(at(self.channel, last), certain), state.z)[0]
+            then = _given(at(self.channel, last), certain)
+            redone = _use(state.before, at(self.sensor, last), then, state.z, size)[0]
             redone = _over(redone, state.move)
             prior = jax.tree.map(lambda a, b: jnp.where(known & state.begun, a, b), redone, state.belief)
-            then, start = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
-            described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, start)
+            then, begins = _following(at(self.channel, last), channel, certain), _following(None, channel, certain)
+            described = jax.tree.map(lambda a, b: jnp.where(state.begun, a, b), then, begins)
         else:
             prior, described = state.belief, _given(channel, certain)
         usable = jnp.where(known, z, jnp.nan)
-        after, expected, covariance = _use(prior, sensor, described, usable)
+        after, expected, covariance = _use(prior, sensor, described, usable, size)
         innovation = gaussian_innovation(z, expected, covariance)
         value, spread = innovation.value, jnp.asarray(innovation.covariance)
         for item in published:
@@ -123,16 +127,18 @@ def _over(belief: LinearBelief, move: Moved) -> LinearBelief:
     matrix, shift, noise = move
     pairs = ((belief.mean, belief.covariance), (belief.state_mean, belief.state_covariance))
     error, local = (moved(mean, spread, matrix, shift, noise) for mean, spread in pairs)
-    return LinearBelief(*error, *local)
+    return LinearBelief(*error, *within_range(*local))
 
 
 def _use(
-    prior: LinearBelief, sensor: LinearSensor, described: SecondOrder, z: jax.Array
+    prior: LinearBelief, sensor: LinearSensor, described: SecondOrder, z: jax.Array, size: jax.Array
 ) -> tuple[LinearBelief, jax.Array, jax.Array]:
     """The update, what was expected and the innovation's covariance."""
     of = jnp.asarray(sensor.matrix), jnp.asarray(sensor.noise.mean)
-    y = signal(prior[1:], *of, jnp.asarray(sensor.noise.covariance))
+    noise = jnp.asarray(sensor.noise.covariance)
+    y = signal(prior[1:], *of, noise)._replace(matrix=of[0], noise=noise)
     gain, bound = Polytope().correct(prior.covariance, y, described, ~jnp.isnan(z))
+    bound = above_rounding(bound, prior.covariance, size)
     through = jnp.asarray(described.mean_gain), jnp.asarray(described.offset)
     mean, covariance, expected = used(prior.mean, prior.covariance, gain, bound, *of, *through, z)
     after = LinearBelief(mean, covariance, prior.state_mean, prior.state_covariance)

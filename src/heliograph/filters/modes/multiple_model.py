@@ -12,6 +12,7 @@ import numpy as np
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.merging import (
     AbstractMerging,
@@ -83,9 +84,9 @@ class MultipleModelFilter(AbstractFilter):
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*state[:2])
 
         belief, signal = jax.tree.map(lambda leaf: leaf[i], (Belief(*state[:2]), signals))
-        after, weight, mixed = receive(
-            belief, signal, channel, jnp.asarray(j), state.weight[i, j], z, self.observed_angles
-        )
+        start, chance = at(self.plant, 0), state.weight[i, j]
+        size = initial_size(start.initial_mean, start.initial_covariance)
+        after, weight, mixed = receive(belief, signal, channel, jnp.asarray(j), chance, z, size, self.observed_angles)
         posterior = weight[:, None] * (j[:, None] == np.arange(len(self.initial)))
         (mean, spread), law = merged(together(plant, after.mean, weight), after.covariance, posterior)
         return ModalBeliefs(mean, spread, jnp.diag(law), state.moved), mixed

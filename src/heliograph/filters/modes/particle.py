@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief, predicted
 from heliograph.filters.gaussian.gaussian import signal_of
+from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.modes.merging import merged
 from heliograph.filters.modes.mode_observations import describe_modes, receive
@@ -88,9 +89,13 @@ class ParticleFilter(AbstractFilter):
         """Hear z with each particle, weigh them by it, and draw them anew where half of them weigh next to nothing."""
         (plant, sensor, channel), z = at((self.plant, self.sensor, self.channel), k), jnp.asarray(z)
         belief = Belief(state.mean, state.covariance)
+        start = at(self.plant, 0)
+        size = initial_size(start.initial_mean, start.initial_covariance)
         signals = jax.vmap(lambda *local: signal_of(plant, sensor, self.transform, Belief(*local)))(*belief)
 
-        after, weight, mixed = receive(belief, signals, channel, state.mode, state.weight, z, self.observed_angles)
+        after, weight, mixed = receive(
+            belief, signals, channel, state.mode, state.weight, z, size, self.observed_angles
+        )
         after = after._replace(mean=together(plant, after.mean, weight))
         key = _folded(state.key, z)
         chosen = _systematic(weight, jax.random.uniform(key, (), weight.dtype))

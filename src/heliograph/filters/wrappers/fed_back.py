@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from heliograph.filters.base import AbstractFilter, Step, corrects, predicts
 from heliograph.filters.gaussian.belief import Belief
 from heliograph.filters.gaussian.gaussian import GaussianFilter, corrected, gaussian_filter, signal_of
+from heliograph.filters.gaussian.rounding import initial_size
 from heliograph.filters.gaussian.transform import AbstractTransform, Cubature
 from heliograph.filters.gaussian.update import AbstractUpdate
 from heliograph.model.channel import Channel
@@ -68,7 +69,8 @@ class FedBackFilter(AbstractFilter):
         y = signal_of(at(base.plant, k), at(base.sensor, k), base.transform, prior)
         left = y.mean - state.reference
         sent = y._replace(mean=left, second=y.covariance + jnp.outer(left, left))
-        after, innovation = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z))
+        size = initial_size(base.initial_mean, base.initial_covariance)
+        after, innovation = corrected(prior, sent, at(base.channel, k), base.update, jnp.asarray(z), size)
         return FedBackBelief(*after, state.reference), innovation
 
     @in_float64

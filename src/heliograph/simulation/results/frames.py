@@ -110,7 +110,7 @@ def _summary(item: "ErrorStatistics", states: Sequence[str]) -> Mapping[str, obj
     rmse, error = item.rmse()
     by_state = zip(states, *item.rmse_by_state(), item.deviation_by_state(), strict=True)
     total = {
-        "claim": item.claim,
+        "claim": "none" if item.failed_runs else item.claim,
         "runs": item.runs,
         "failed runs": item.failed_runs,
         "rmse": rmse,

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from heliograph.model.estimate import Estimate
-from heliograph.numerics.check import DEFINITENESS_TOLERANCE, fail, own_units
+from heliograph.model.estimate import Estimate, is_sound
+from heliograph.numerics.check import fail
 from heliograph.numerics.readable import readable
 from heliograph.simulation.centres.uplinks import SentReports, Uplink
 from heliograph.simulation.network import FUSED
@@ -172,17 +172,3 @@ class Record(Saved):
                     counted = f"{np.count_nonzero(saturated)} of {saturated.size} samples"
                     lines.append(f"{FUSED}/{name}: the quantizer of node {node} saturated in {counted}")
         return lines
-
-
-def is_sound(estimate: Estimate) -> np.ndarray:
-    """Whether each mean is finite and, where a covariance is claimed, positive semidefinite (to rounding)."""
-    finite: np.ndarray = np.isfinite(np.asarray(estimate.mean)).all(axis=-1)
-    if estimate.claim == "none":
-        return finite
-    bound = np.asarray(estimate.covariance)
-    finite = finite & np.isfinite(bound).all(axis=(-1, -2))
-    safe = np.where(finite[..., None, None], bound, np.eye(bound.shape[-1]))
-    unit = own_units(safe)
-    correlations = (safe + np.swapaxes(safe, -1, -2)) / (2 * unit[..., :, None] * unit[..., None, :])
-    result: np.ndarray = finite & (np.linalg.eigvalsh(correlations)[..., 0] >= -DEFINITENESS_TOLERANCE)
-    return result

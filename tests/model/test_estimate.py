@@ -1,0 +1,52 @@
+"""What an estimate claims: nothing where it is no number, or where its covariance is none."""
+
+import numpy as np
+import pytest
+
+import heliograph as hg
+from heliograph.model import Estimate
+from heliograph.model.estimate import with_sound_claim
+
+MEAN = np.zeros((4, 2))
+COVARIANCE = np.array([np.eye(2), np.full((2, 2), np.nan), np.diag([1.0, -1.0]), np.diag([1.0, 0.0])])
+
+
+@pytest.mark.parametrize("claim", ["exact", "upper", "nominal"])
+def test_a_claim_holds_where_mean_and_covariance_are_numbers(claim):
+    result = Estimate(MEAN, COVARIANCE, claim)
+    assert result.claims.tolist() == [claim, "none", "none", claim]
+    lost = Estimate(np.where([[True], [False], [False], [False]], np.nan, MEAN), COVARIANCE, claim)
+    assert lost.claims.tolist() == ["none", "none", "none", claim]
+    assert [with_sound_claim(Estimate(m, p, claim)).claim for m, p in zip(MEAN, COVARIANCE, strict=True)] == list(
+        result.claims
+    )
+
+
+def test_of_no_covariance_nothing_is_claimed():
+    assert Estimate(MEAN, COVARIANCE, "none").claims.tolist() == ["none"] * 4
+
+
+def lost():
+    """Two states tied to the last digit by a prior of 1e14: after the second position no digit is left."""
+    plant = hg.LinearPlant([[1, 1], [0, 1]], 1e-9, [0.0, 0.0], 1e14)
+    sensor = hg.LinearSensor([[1, 0]], 1e-14)
+    return plant, sensor, hg.linear_filter(plant, sensor, hg.perfect())
+
+
+def test_a_record_says_of_each_row_what_is_claimed():
+    plant, sensor, item = lost()
+    record = hg.monte_carlo(hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": item})}), 4, 3, 1)
+    result = record.estimates["a"]["f"]
+    known = ~np.isnan(result.covariance).any(axis=(-1, -2))
+    assert not known.all()
+    np.testing.assert_array_equal(result.claims == "exact", known & ~np.isnan(result.mean).any(axis=-1))
+    assert record.failures()
+
+
+def test_a_table_of_statistics_claims_nothing_of_what_failed():
+    plant, sensor, item = lost()
+    network = hg.Network(plant, {"a": hg.Node(sensor, hg.perfect(), {"f": item})})
+    with pytest.warns(UserWarning, match="no valid covariance"):
+        frame = hg.monte_carlo(network, 4, 64, 1, keep=hg.Statistics()).to_pandas()
+        hg.monte_carlo(network, 4, 64, 1, keep=hg.Statistics())["a"]["f"].rmse()
+    assert frame["claim"].tolist() == ["none"]
