@@ -17,7 +17,7 @@ EXCESS = 1.05  # times the expected NIS: less does little harm
 
 @in_float64
 def nis_sums(steps: AbstractSmootherStep) -> Float[Array, "5"]:
-    """Sums over blocks of one run, with s the sum of e' S^-1 e and h the number of components: of s, h, s^2, s h, h^2."""
+    """Sums over blocks of one run, s the sum of e' S^-1 e and h the number of components: s, h, s^2, s h, h^2."""
     if steps.nis is None or steps.received is None:
         return jnp.zeros(5)
     time = len(steps.mean)
