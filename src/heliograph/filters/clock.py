@@ -27,7 +27,7 @@ from heliograph.numerics.types import ArrayLike, Bool, Float, Int
 from heliograph.random_affine.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
-SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of none tells nothing of when it was
+SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
 SHARE = 1e-3  # of what the outputs say of an offset: with less left when all other states may be anything, it is none
 RANK = 1e-12  # of the largest eigenvalue: directions below are not seen at all
 

@@ -181,8 +181,8 @@ def gaussian_filter(
     channel: Channel,
     transform: AbstractTransform,
     update: AbstractUpdate | None = None,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
     """Gaussian filter on its channel's second moments, with any transform (`Cubature()`, `PolynomialMoments(2)`, ...).
 
@@ -213,8 +213,8 @@ def cubature_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
     """Cubature Kalman filter on its channel's second moments.
 
@@ -243,8 +243,8 @@ def extended_filter(
     sensor: AnySensor,
     channel: Channel,
     update: AbstractUpdate | None = None,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
     """Extended Kalman filter on its channel's second moments; Jacobians by automatic differentiation.
 
@@ -270,8 +270,8 @@ def mean_gain_filter(
     plant: AnyPlant,
     sensor: AnySensor,
     channel: Channel,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
     """Cubature filter that takes the mean gain for the gain: the naive filter, as a baseline.
 

@@ -87,7 +87,7 @@ def h_infinity_filter(
     sensor: AnySensor,
     system: GrowthSystem,
     design: HInfinityDesign,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
 ) -> HInfinityFilter:
     """H-infinity filter with designed gains, over the steps of the system.
 

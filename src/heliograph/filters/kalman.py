@@ -13,8 +13,8 @@ from heliograph.numerics.types import ArrayLike, Float
 def kalman_filter(
     plant: AnyPlant,
     sensor: AnySensor,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> GaussianFilter:
     """Kalman filter of a linear plant whose linear sensor is received directly.
 

@@ -284,7 +284,7 @@ def memoryless_filter(
     Source: De Koning (1984), for multiplicative noise that is independent over time.
     """
     item = linear_filter(plant, sensor, without_memory(channel), update)
-    assert isinstance(item, LinearFilter)  # what does not remember has no other
+    assert isinstance(item, LinearFilter)  # a channel without memory has no other
     return replace(item, claim="nominal") if memory_matters(channel) else item
 
 
@@ -307,5 +307,5 @@ def as_current_filter(
     Source: the usual mistake; De Koning (1984), with y_k in place of y_{k-d}.
     """
     item = linear_filter(plant, sensor, without_memory(as_current(channel)), update)
-    assert isinstance(item, LinearFilter)  # what is neither late nor remembers has no other
+    assert isinstance(item, LinearFilter)  # a channel without delay or memory has no other
     return replace(item, claim="nominal") if first(channel).past else item

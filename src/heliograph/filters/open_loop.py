@@ -32,8 +32,8 @@ class OpenLoop(AbstractBeliefFilter):
 
 def open_loop_filter(
     plant: AnyPlant,
-    initial_mean: "Float[ArrayLike, ' n'] | None" = None,
-    initial_covariance: "Float[ArrayLike, 'n n'] | None" = None,
+    initial_mean: Float[ArrayLike, " n"] | None = None,
+    initial_covariance: Float[ArrayLike, "n n"] | None = None,
 ) -> OpenLoop:
     """Prediction by cubature points without any measurement.
 

@@ -127,7 +127,7 @@ def judge(
     """
     (before, prior, after), value = estimates, jnp.asarray(innovation.value)
     z, covariance = jnp.asarray(z), jnp.asarray(innovation.covariance)
-    z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter that does not listen
+    z = z if len(z) == len(value) else jnp.full_like(value, jnp.nan)  # a filter without measurements
     # Squared distance of each component given those before it, and which are determined.
     present, expected = ~jnp.isnan(value), z - value
     size = jnp.where(jnp.isfinite(expected), jnp.abs(z) + jnp.abs(expected), 0.0)

@@ -236,7 +236,7 @@ def with_flag(covariance: jax.Array, flag: jax.Array) -> tuple[jax.Array, jax.Ar
 
 
 def side_information_filter(
-    plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: "Float[ArrayLike, 'modes flags'] | None" = None
+    plant: AnyPlant, sensor: AnySensor, channel: Channel, flags: Float[ArrayLike, "modes flags"] | None = None
 ) -> SideInformationFilter:
     """Linear filter with side information on the modes: which packets arrived, and a flag with each.
 

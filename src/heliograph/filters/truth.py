@@ -47,7 +47,7 @@ def true_error(
     sensor: AnySensor,
     channel: Channel,
     horizon: int,
-    inputs: "Float[ArrayLike, 'horizon inputs'] | None" = None,
+    inputs: Float[ArrayLike, "horizon inputs"] | None = None,
 ) -> TrueError:
     """E[(x - xhat)(x - xhat)'] of a linear filter in a world that may differ from its model, exactly.
 

@@ -83,10 +83,10 @@ class EscapeQuantizer(AbstractQuantizer):
     def __init__(
         self,
         levels: int,
-        amplitude: "Float[ArrayLike, '*n']",
-        decay: "Float[ArrayLike, '*n']",
-        growth: "Float[ArrayLike, '*n']",
-        smallest: "Float[ArrayLike, '*n']",
+        amplitude: Float[ArrayLike, "*n"],
+        decay: Float[ArrayLike, "*n"],
+        growth: Float[ArrayLike, "*n"],
+        smallest: Float[ArrayLike, "*n"],
         interval: int | None = None,
     ):
         self.levels = levels_of(levels)

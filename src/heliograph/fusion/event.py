@@ -41,7 +41,7 @@ class EventSending(AbstractQuantizer):
     threshold: Float[Array, "..."]
     announced: bool = eqx.field(static=True, default=True)
 
-    def __init__(self, threshold: "Float[ArrayLike, '*n']", announced: bool = True):
+    def __init__(self, threshold: Float[ArrayLike, "*n"], announced: bool = True):
         self.threshold = array("threshold", threshold, () if rank("threshold", threshold) == 0 else (None,))
         if np.any(self.threshold <= 0):
             raise fail("threshold", "positive numbers", threshold)

@@ -38,7 +38,7 @@ class ReportLink(Module):
     delay: Float[np.ndarray, " ages"]
     every: int = eqx.field(static=True)
 
-    def __init__(self, channel: Channel | None = None, delay: "Float[ArrayLike, '*ages']" = 0, every: int = 1):
+    def __init__(self, channel: Channel | None = None, delay: Float[ArrayLike, "*ages"] = 0, every: int = 1):
         self.channel, self.every = channel, check_count("every", every)
         if channel is not None:
             instance("channel of a report link", first(channel), AbstractRandomAffine, "a random affine map")

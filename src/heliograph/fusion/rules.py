@@ -145,7 +145,7 @@ class FixedIntersection(AbstractFusion):
 
     weights: Float[Array, "count"]
 
-    def __init__(self, weights: "Float[ArrayLike, ' count']"):
+    def __init__(self, weights: Float[ArrayLike, " count"]):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:
@@ -178,7 +178,7 @@ class WeightedFusion(AbstractFusion):
 
     weights: Float[Array, "count"]
 
-    def __init__(self, weights: "Float[ArrayLike, ' count']"):
+    def __init__(self, weights: Float[ArrayLike, " count"]):
         self.weights = probabilities("fusion weights", weights)
 
     def check(self, count: int) -> None:

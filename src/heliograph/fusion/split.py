@@ -36,7 +36,7 @@ class SplitIntersection(AbstractFusion):
 
     known: Float[Array, "node n node n"]
 
-    def __init__(self, known: "Float[ArrayLike, 'node n *joint']"):
+    def __init__(self, known: Float[ArrayLike, "node n *joint"]):
         values = array("known part", known, (None,) * rank("known part", known))
         # Independent parts: the blocks of a block-diagonal P^a.
         if values.ndim == 3 and values.shape[1] == values.shape[2]:

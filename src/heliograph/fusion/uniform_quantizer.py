@@ -33,7 +33,7 @@ class UniformQuantizer(AbstractQuantizer):
     amplitude: Parameter
     scale: Parameter
 
-    def __init__(self, levels: int, amplitude: "Float[ArrayLike, '*n']", scale: "Float[ArrayLike, '*n']" = 1.0):
+    def __init__(self, levels: int, amplitude: Float[ArrayLike, "*n"], scale: Float[ArrayLike, "*n"] = 1.0):
         self.levels = levels_of(levels)
         self.amplitude, self.scale = positive("amplitude", amplitude), positive("scale", scale)
         check_range("amplitude times scale", self.amplitude, self.scale, self.levels)

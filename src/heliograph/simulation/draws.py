@@ -5,7 +5,7 @@ from zlib import crc32
 import jax
 import numpy as np
 
-# What a key is for: folded in last, so that each use has its own stream.
+# What a key is for: folded in last, so that uses have separate streams.
 INITIAL, PROCESS, SENSOR, CHANNEL, CHANNEL_START, MEMORY, MEMORY_START = range(7)
 WORLD = 0  # the plant's place among the checksums of names
 

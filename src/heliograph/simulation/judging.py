@@ -12,7 +12,7 @@ from heliograph.simulation.network import FUSED, Network
 from heliograph.simulation.stepping import AllFilters
 from heliograph.simulation.uplinks import Drawn
 
-Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and what is found
+Stepped = tuple[PyTree, dict[str, PyTree]]  # the filters' states after a step, and their results
 
 
 def implausible(result: Mapping[str, PyTree]) -> jax.Array:

@@ -149,7 +149,7 @@ class Slots(AbstractMedium):
     relays: RelayNetwork
     local: tuple[tuple[int, int, int], ...] = eqx.field(static=True)  # kind, filter and node of each relay's estimate
     groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)  # listeners of each group
-    memories: dict[str, np.ndarray]  # places of what each remembering hop's links hold
+    memories: dict[str, np.ndarray]  # places of the memories of each hop that has some
 
     def init(self, key: jax.Array) -> Relayed:
         """Return the initial mean as every relay's estimate, and the hops' initial states."""

@@ -129,7 +129,7 @@ def received_names(outputs: tuple[str, ...], received: int) -> tuple[str, ...]:
 
 def check_received(name: str, item: AbstractFilter, received: int) -> None:
     """Refuse a filter of another number of components than arrive, unless it uses no measurements."""
-    if item.received not in (0, received):  # 0: it does not listen
+    if item.received not in (0, received):  # 0: it uses no measurements
         raise fail(name, f"one that hears the {received} numbers that arrive", f"one that hears {item.received}")
 
 
