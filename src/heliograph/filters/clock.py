@@ -28,8 +28,8 @@ from heliograph.random_affine.second_moments import SecondOrder
 
 Observe = Callable[[jax.Array], jax.Array]
 SIGNIFICANT = 9.0  # variances: a motion within three standard deviations of zero gives no information on time
-SHARE = 1e-3  # of what the outputs say of an offset: with less left when all other states may be anything, it is none
-RANK = 1e-12  # of the largest eigenvalue: directions below are not seen at all
+SHARE = 1e-3  # of the outputs' derivatives by an offset: with less unexplained by other states, it is unobservable
+RANK = 1e-12  # of the largest eigenvalue: directions below are unobservable
 
 
 class ClockBelief(NamedTuple):
@@ -196,7 +196,7 @@ def clock_filter(
     names = [f"{name}_offset" for name in items("clocks", clocks, "names of nodes")]
     if not names or any(name not in states for name in names):
         raise fail("clocks", f"some whose offsets are among the states {list(states)}", list(clocks))
-    # The joint Gaussian filter, on which the test of observability is put.
+    # The joint Gaussian filter, to which the test of observability is added.
     chosen = PolynomialMoments(2) if transform is None else transform
     base = gaussian_filter(plant, sensor, channel, chosen, Polytope())
     # Schmidt's update needs the moments of the channel themselves, not bounds.

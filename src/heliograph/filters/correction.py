@@ -104,7 +104,7 @@ def young_correction(
     both = present[:, None] & present[None, :]
     mean_part = jnp.where(both, congruence(channel.mean_gain, signal.covariance), 0.0)
     cross = _cross(signal, channel, present)
-    # Omega = (1 + 1/beta_1) Delta + ... of the bound, at the scalars of least trace.
+    # Omega = spread + (1/beta_1 + 1/beta_2) shift + (1 + beta_2) M Cov(y) M', at the scalars of least trace.
     base = channel.spread(w, present) + absent(present)
     shift, power = channel.shift(w, present), times(cross, transpose(cross))
 

@@ -107,7 +107,7 @@ def h_infinity_filter(
     """
     instance("system", system, GrowthSystem, "a GrowthSystem, as growth_system makes it")
     instance("design", design, HInfinityDesign, "a design, as recursive_design makes it")
-    # A design without a level guarantees nothing.
+    # An infeasible design guarantees nothing.
     if not design.feasible:
         smallest = "" if design.smallest_level is None else f"; the smallest level found is {design.smallest_level:.6g}"
         raise fail("design", "one that is feasible", f"{design.status} at level {design.level:g}{smallest}")
@@ -122,7 +122,7 @@ def h_infinity_filter(
     if len(first(sensor).outputs) != inputs:
         raise fail("sensor", f"the system's {inputs} outputs", len(first(sensor).outputs))
     mean = start.initial_mean if initial_mean is None else array("filter's initial mean", initial_mean, (n,))
-    # E[G], what the filter subtracts h(xhat) with.
+    # E[G], by which the filter predicts z.
     expected = np.array([link.mean[:, :inputs] for link in system.channel])
     return HInfinityFilter(
         plant=plant,

@@ -102,7 +102,7 @@ class LinearFilter(AbstractFilter):
         y = y._replace(matrix=jnp.asarray(sensor.matrix), noise=jnp.asarray(sensor.noise.covariance))
         # K = C' S^-1 and P - K S K', or their bound behind an uncertain channel.
         gain, bound = self.update.correct(state.covariance, y, channel, ~jnp.isnan(z))
-        # No variance is below the rounding of the mean itself, however often noise-free data say the same again.
+        # No variance is below the rounding of the mean itself, however often noise-free data repeat it.
         bound = above_rounding(bound, state.state_mean, state.state_covariance)
         # m + K (z - M (C m + E v) - b).
         mean, covariance, expected = used(
@@ -141,7 +141,6 @@ class LinearFilter(AbstractFilter):
             cross = before.covariance @ transition.T
             return moments_smoother_step(after, prior, cross, "nominal")
         total = innovation.covariance
-        # Innovation covariance of the worst law, for which the gain was made.
         if channel.uncertain:  # the gain was made for the worst law, not for the nominal one
             y = signal(prior[1:], sensor.matrix, sensor.noise.mean, sensor.noise.covariance)
             total = known_gain_covariance(y, channel, ~jnp.isnan(z))

@@ -126,7 +126,7 @@ class MixtureFilter(AbstractFilter):
         likelihood, certain, moved, known, value, total = jax.vmap(condition)(c.gain, c.offset, c.noise)
         # Posterior probabilities p_a N(z; ...), as they were if every combination excludes z.
         weighed = sharpest(likelihood, certain) + jnp.log(prior)
-        excluded = jnp.max(weighed) == -jnp.inf  # no combination leaves such a value: it says nothing
+        excluded = jnp.max(weighed) == -jnp.inf  # no combination can produce such a value
         weight = jax.nn.softmax(jnp.where(excluded, jnp.log(prior), weighed))
         # Moments of the mixture: P - sum_a w_a K_a S_a K_a' + spread of the means.
         shift = weight @ moved

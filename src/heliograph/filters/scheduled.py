@@ -50,7 +50,7 @@ class ScheduledFilter(AbstractFilter):
 
     Args:
         schedule: gains and covariances for each step.
-        states: names of the states; x1, x2, ... by default.
+        states: names of the states; x0, x1, ... by default.
 
     Shapes: covariances (2 horizon + 1, q, q), before and after each correction.
     """
@@ -142,7 +142,7 @@ class LinearSystemFilter(AbstractFilter):
     Args:
         system: matrices and noise covariances of each step.
         claim: what the covariance is; "exact" by default.
-        states: names of the states; x1, x2, ... by default.
+        states: names of the states; x0, x1, ... by default.
     """
 
     steps: OverTime

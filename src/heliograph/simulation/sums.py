@@ -58,7 +58,6 @@ class Statistics(AbstractReducer[StatisticsByName]):
 
     def initial(self, shapes: PyTree) -> Sums:
         """Return sums of zero."""
-        # Sizes: parts with covariances by run first, then those with a common one.
         _, steps, n = shapes["truth"].shape
         parts, order, local = _parts(shapes)
         # Parts with covariances by run first, then those with a common one.
