@@ -16,7 +16,7 @@ from heliograph.numerics.types import Bool, Float
 class ModalBeliefs(NamedTuple):
     """A Gaussian for each of M components, and weight[i, j], the probability of component i and present mode j.
 
-    Shapes: mean (M, n), covariance (M, n, n), weight (M, M). `moved` is false until the chain has made a transition.
+    Shapes: mean (M, n), covariance (M, n, n), weight (M, M). `moved` is true from the first prediction on.
     """
 
     mean: Float[jax.Array, "M n"]

@@ -53,7 +53,7 @@ class Components(Module):
 class MixtureBelief(NamedTuple):
     """One Gaussian for the state, and the modes' probabilities.
 
-    Shapes: mean (n,), covariance (n, n), law (M,). `moved` is false until the chain has made a transition.
+    Shapes: mean (n,), covariance (n, n), law (M,). `moved` is true from the first prediction on.
     """
 
     mean: Float[jax.Array, " n"]
@@ -98,7 +98,7 @@ class MixtureFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: MixtureBelief, u: ArrayLike = (), k: Step = 0) -> MixtureBelief:
-        """A m + B u + E w and A P A' + Q; the modes make a transition, except before their first use."""
+        """A m + B u + E w and A P A' + Q; the modes make a transition, except at the first prediction."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         spread = plant.matrix @ state.covariance @ plant.matrix.T + plant.noise_covariance(u)
         law = jnp.where(state.moved, state.law @ jnp.asarray(at(self.components, k).transition), state.law)

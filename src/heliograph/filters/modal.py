@@ -50,8 +50,8 @@ class ObservationModel(Module):
 class ModalBelief(NamedTuple):
     """Estimate of zeta, mode by mode, its error covariance, and E[x~ x~' 1{mode}] before any data.
 
-    centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is false
-    until the chain has made a transition.
+    centre c = E[x] before data; P(mode) c is part of the mean, whose sum over the modes is that of x. `moved` is true
+    from the first prediction on.
 
     Shapes: with N = M (n + 1): mean (N,), covariance (N, N), moments (M, n + 1, n + 1), centre (n,).
     """
@@ -91,7 +91,7 @@ class ModalFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: ModalBelief, u: ArrayLike = (), k: Step = 0) -> ModalBelief:
-        """Move x~ by the plant and the mode by the chain; before its first transition the mode has its initial law.
+        """Move x~ by the plant and the mode by the chain; at the first prediction the mode has its initial law.
 
         Cov(zeta+ - F zeta)[j, l] = sum_i (delta_jl Pi_ij - Pi_ij Pi_il) A~ E_i A~' + delta_jl P(j) Q~.
         """

@@ -60,7 +60,7 @@ class MultipleModelFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: ModalBeliefs, u: ArrayLike = (), k: Step = 0) -> ModalBeliefs:
-        """Move the chain, then the plant in each component; before its first use the chain has its initial law."""
+        """Move the chain, then the plant in each component; at the first prediction the chain has its initial law."""
         plant, u = at(self.plant, k), jnp.asarray(u)
         rows = jnp.where(state.moved, jnp.asarray(at(self.channel, k).transition), jnp.eye(len(self.initial)))
         state = self.merging.moved(state, rows)

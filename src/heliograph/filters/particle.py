@@ -31,8 +31,8 @@ NODES = 9  # modes that stand for a gain that drifts: they cost no more than few
 class Particles(NamedTuple):
     """Gaussian, present mode and weight of each particle, and the key of the next random numbers.
 
-    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,). `moved` is false until the chain has
-    made a transition.
+    Shapes: mean (N, n), covariance (N, n, n), mode (N,), weight (N,), key (2,). `moved` is true from the first
+    prediction on.
     """
 
     mean: Float[jax.Array, "N n"]

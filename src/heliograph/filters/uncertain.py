@@ -42,8 +42,8 @@ from heliograph.numerics.types import Array, ArrayLike, Bool, Float
 class UncertainBelief(NamedTuple):
     """Estimate of zeta, a bound on its error covariance, E[x~ x~'], and bounds on the modes' probabilities.
 
-    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is false until the chain has made a
-    transition.
+    x~ = (x - c, 1) with the centre c = E[x], as in `ModalBelief`. `moved` is true from the first
+    prediction on.
 
     Shapes: mean (N,), covariance (N, N), second (n + 1, n + 1), centre (n,), law, low and high (M,).
     """
@@ -82,7 +82,7 @@ class UncertainModalFilter(AbstractFilter):
 
     @predicts
     def predict(self, state: UncertainBelief, u: ArrayLike = (), k: Step = 0) -> UncertainBelief:
-        """Propagate the bound on Sigma-; before its first transition the mode has its initial law."""
+        """Propagate the bound on Sigma-; at the first prediction the mode has its initial law."""
         channel = at(self.channel, k)
         move, noise, centre = moved_about(at(self.plant, k), u, state.centre)
         modes = len(state.law)

@@ -20,7 +20,7 @@ from heliograph.simulation.centre import Together
 from heliograph.simulation.network import Network
 from heliograph.simulation.stepping import AllFilters, plan
 
-REGULAR = 1e-6  # least eigenvalue of the independent part of a node's error, relative to the error: then U has an inverse
+REGULAR = 1e-6  # least eigenvalue of the independent part of an error, relative to the error: then U has an inverse
 
 
 @readable

@@ -21,7 +21,7 @@ BLOCK = 32  # runs simulated side by side: wide enough for vector units, small e
 LANES = 8  # of a processor: at most this many cores are used
 WIDE_LANES = 256  # of other devices, which want thousands of runs at once
 
-Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs and a carry -> carry, collected results
+Advance = Callable[[np.ndarray, PyTree], tuple[PyTree, PyTree]]  # blocks of runs, carry -> carry, collected results
 
 
 def one_processor() -> bool:
